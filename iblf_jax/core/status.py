@@ -38,7 +38,8 @@ class Status(enum.IntFlag):
     made, its metrics are NaN."""
     INACCURATE = 128
     """The estimated error of the positions is more than 0.5 % of the width of the tube
-    (`error_estimate.TOLERANCE`): take a smaller dt."""
+    (`error_estimate.TOLERANCE`): take a smaller dt.  In a loop that rounds a reading or a torque
+    it may be the error by another code (`error_growth`), which a finer resolution reduces."""
     GUARD_STAYED = 256
     """The guard was active after the first instant: there the loop ran with a softer barrier than
     the requested one."""
@@ -113,7 +114,9 @@ WORDS = {
     Status.TORQUE_SATURATED: "the torque was saturated",
     Status.GUARD_ACTIVE: "the guard at the bound was active",
     Status.INADMISSIBLE_DRAW: "a drawn parameter was inadmissible, so the run was not made",
-    Status.INACCURATE: "the positions are inaccurate: the time step is too large",
+    Status.INACCURATE: (
+        "the positions are inaccurate: the time step is too large, or a rounded signal may differ"
+    ),
     Status.GUARD_STAYED: "the guard stayed active beyond the first instant",
     Status.SAMPLING_TOO_SLOW: "the law is sampled too slowly",
     Status.VELOCITY_VIOLATED: "a velocity bound was violated",
@@ -134,7 +137,8 @@ WORDS_OF_LEVELS = WORDS | {
     Status.TORQUE_SATURATED: "the input was saturated",
     Status.VELOCITY_VIOLATED: "a bound of the second level was violated",
     Status.INACCURATE: (
-        "the components of the first level are inaccurate: the time step is too large"
+        "the components of the first level are inaccurate: the time step is too large, or a"
+        " rounded signal may differ"
     ),
     Status.ALPHA_INFEASIBLE: "a virtual control left the bounds of its level",
 }

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from iblf_jax.core.optional import OptionalMembers
 from iblf_jax.engine.metric_folds import begun
-from iblf_jax.simulation import error_estimate, stability
+from iblf_jax.simulation import error_estimate, error_growth, stability
 from iblf_jax.simulation.closed_loop import (
     LoopState,
     evaluate,
@@ -92,11 +92,12 @@ def start(inputs: Inputs, method: str, jacobian: jax.Array) -> Carry:
     sample = _blank_sample(inputs, state)
     blank = begun(inputs.folds, sample)
     constant, jacobian = jax.lax.stop_gradient((state, jacobian))
+    growth = error_growth.begin(inputs.scenario, constant, jacobian)
     if inputs.scenario.sampling is not None:
         jacobian = stability.period_map_as_rate(
             jax.lax.stop_gradient(inputs.scenario), constant, jacobian
         )
-    estimate = error_estimate.begin(method, jacobian, constant)
+    estimate = error_estimate.begin(method, jacobian, constant)._replace(growth=growth)
     return Carry(
         state,
         blank,

@@ -22,6 +22,7 @@ from iblf_jax.core.units import POSITION, VELOCITY
 from iblf_jax.engine.limiting_term import limiting_term
 from iblf_jax.engine.step_size import comfortable_dt, find_dt, limited
 from iblf_jax.simulation.error_estimate import ERROR, RELATIVE, TOLERANCE
+from iblf_jax.simulation.error_growth import BOUND
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.metrics import VIOLATION_TIMES
 from iblf_jax.simulation.results import Rollout
@@ -475,6 +476,16 @@ def _inaccurate(result: Rollout, status: Status, steps: int) -> str:
         return (
             f"{estimate}: a loop whose deviation grows from one period to the next magnifies every"
             " error, whatever dt is."
+        )
+    if np.max(result.metrics.get(BOUND, 0.0)) > TOLERANCE:
+        return (
+            f"{estimate}. The loop rounds a reading or a torque, has a dead zone or play, or holds"
+            " commands until an event. At one sample at least the error of this run is so large"
+            " that a code or an event may differ from that of the exact solution; the motions then"
+            " differ by up to that bound, whatever dt is. Statistics of many such runs are not"
+            " concerned. Refine the resolution, such as sensor.counts or actuator.step, to reduce"
+            f" the bound, or compare this run with one at dt={float(result.dt) / 10.0:g}: where"
+            " its codes are certain, it has no such bound."
         )
     step = _smaller_step(result, steps)
     if not step:

@@ -13,7 +13,7 @@ from iblf_jax.core.status import Status, flag, has_flag
 from iblf_jax.engine.carry import Carry, Inputs
 from iblf_jax.engine.linearization import Linearization, fastest_mode
 from iblf_jax.engine.metric_folds import finished
-from iblf_jax.simulation import error_estimate, integrators, stability
+from iblf_jax.simulation import error_estimate, error_growth, integrators, stability
 from iblf_jax.world import plants
 
 
@@ -44,6 +44,10 @@ def outcome_of(
     """
     scenario = inputs.scenario
     estimate = error_estimate.with_unresolved(carry.accuracy, unresolved)
+    rounding: dict[str, jax.Array] = {}
+    if estimate.growth != ():
+        bounds = _bounds_of_growth(inputs, carry, instants)
+        estimate, rounding = error_growth.with_growth(estimate, bounds, unresolved.width)
     modes = jax.vmap(partial(fastest_mode, inputs.scenario))(instants)
     mode = jnp.max(jnp.where(jnp.isfinite(modes), modes, 0.0))
     limit = integrators.tableau(method).stability
@@ -68,9 +72,22 @@ def outcome_of(
     if inputs.scenario.sampling is not None:
         radii, growth = jax.lax.stop_gradient(_sampling_radii(inputs, carry, instants))
         metrics[stability.RADIUS] = jnp.max(jnp.where(jnp.isfinite(radii), radii, 0.0))
+        metrics |= rounding
         status |= flag(jnp.any(growth > 1.0), Status.SAMPLING_TOO_SLOW)
     metrics |= finished(inputs.folds, carry.accumulators)
     return Outcome(None, metrics, status, mode)
+
+
+def _bounds_of_growth(inputs: Inputs, carry: Carry, instants: Linearization) -> jax.Array:
+    """The largest bound (A.4) of the position error, (n,) [rad]; infinite for a continuous loop."""
+    sampling: Any = inputs.scenario.sampling
+    if sampling is None:
+        return jnp.full_like(carry.accuracy.error, jnp.inf)
+    derivatives = stability.resolved_jacobian(instants.jacobian, sampled=True)
+    periods = inputs.dt * inputs.steps / sampling.period
+    bound = partial(error_growth.bound, inputs.scenario, carry.accuracy.growth, carry.state)
+    found = jax.vmap(bound, in_axes=(0, None))(derivatives, periods)
+    return jax.lax.stop_gradient(jnp.max(found, axis=0))  # type: ignore[no-any-return]
 
 
 def _sampling_radii(

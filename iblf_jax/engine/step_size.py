@@ -25,7 +25,7 @@ from iblf_jax.core.status import Status, has_flag
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.single_run import run_one
 from iblf_jax.engine.thresholds import STEP_SIZE_CHUNK
-from iblf_jax.simulation import discontinuities, error_estimate
+from iblf_jax.simulation import discontinuities, error_estimate, error_growth
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.levels import levels_on_reference
@@ -163,6 +163,7 @@ def _one_step(scenario: Scenario, times: jax.Array, dt: jax.Array, pair: Pair, m
         width,
         restarts=restarts,
         too_many_jumps=too_many_jumps,
+        absolute=error_growth.rounds_continuously(scenario),
     )
     near = jnp.max(jnp.abs(xi_of_fine))
     nearest = jax.tree.map(
@@ -308,7 +309,10 @@ def _find_part(
         fitted = with_history(scenario, period / parts)
         found = run_one(fitted, (), dt, RunRequest(periods * parts, method, parts), noise)
         q, width = found.records[0]["q"], found.records[0]["upper"] - found.records[0]["lower"]
-        poor = has_flag(int(found.status), Status.STEP_TOO_LARGE | Status.INACCURATE)
+        poor = has_flag(int(found.status), Status.STEP_TOO_LARGE)
+        # A step of any size leaves the error that a different code makes.
+        if not float(found.metrics.get(error_growth.BOUND, 0.0)) > error_estimate.TOLERANCE:
+            poor |= has_flag(int(found.status), Status.INACCURATE)
         if method in NOISY_PHASES:
             poor |= float(dt) * float(found.fastest_mode) > NOISY_PHASES[method]
         if (

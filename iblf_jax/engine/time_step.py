@@ -37,7 +37,13 @@ from iblf_jax.engine.step_pieces import (
     later_pieces,
 )
 from iblf_jax.engine.step_start import continuous_start, sampled_start
-from iblf_jax.simulation import delays, discontinuities, error_estimate
+from iblf_jax.simulation import (
+    delays,
+    discontinuities,
+    error_estimate,
+    error_growth,
+    sampling,
+)
 from iblf_jax.simulation.closed_loop import (
     LoopState,
     evaluate,
@@ -224,8 +230,20 @@ def _concluded(
     estimate = carry.accuracy
     if inputs.scenario.process_noise is None:
         estimate = error_estimate.update(
-            estimate, method, inputs.dt, index, parts, width, is_sampled, restarts, too_many_jumps
+            estimate,
+            method,
+            inputs.dt,
+            index,
+            parts,
+            width,
+            is_sampled,
+            restarts,
+            too_many_jumps,
+            error_growth.rounds_continuously(inputs.scenario),
         )
+        if estimate.growth != ():
+            grown = _grown_error(method, inputs, carry, index, parts, before, width)
+            estimate = estimate._replace(growth=grown)
     after, raised = later
     status = carry.status | sample_status(sample)
     if raised is not None:
@@ -238,6 +256,37 @@ def _concluded(
         lost = jnp.any(jnp.stack([has_no_input(slope) for slope in stages]))
         status |= flag(lost & goes_on, Status.SINGULAR_GAIN)
     return keep_if(valid & goes_on, after, before), status, nearest, estimate
+
+
+def _grown_error(
+    method: str,
+    inputs: Inputs,
+    carry: Carry,
+    index: jax.Array,
+    parts: list,
+    state: LoopState,
+    width: jax.Array,
+) -> error_growth.ErrorGrowth:
+    """The error after a step of a loop whose feedback is interrupted; arguments as `_concluded`."""
+    scenario, dt = inputs.scenario, inputs.dt
+    now = None
+    if scenario.sampling is not None:
+        now = sampling.instant(scenario.sampling, dt, index)
+    local_error = error_estimate.local_error_of_state(
+        method, parts, partial(error_growth.rate_at_end, scenario, dt, index, now, state)
+    )
+    return error_growth.update(
+        carry.accuracy.growth,
+        scenario,
+        dt,
+        index,
+        now,
+        inputs.noise,
+        carry.state,
+        state,
+        local_error,
+        width,
+    )
 
 
 def recorded(folds: Any, found: Advanced):

@@ -23,9 +23,10 @@ dt |k_3 - k_2| |dt A|^2 / 30. That of Heun's method is dt |k_2 - k_1| |dt A| / 6
 |k_2 - k_1| / |k_1|. The same factor of ten applies. J is the one-period map expressed as a rate.
 
 The stages cannot resolve a reference or a disturbance with whole periods between them;
-`unresolved_signals` measures these separately. A step is divided at the jump times of a scenario
-(`discontinuities`). Differences are not taken across a jump: the stages of that step give its
-error.
+`unresolved_signals` measures these separately. Errors of a loop that rounds a reading or a torque
+do not decay as above; `error_growth` has their estimate. A step is divided at the jump times of a
+scenario (`discontinuities`). Differences are not taken across a jump: the stages of that step give
+its error.
 
 Under process noise there is no estimate, and the results are NaN (`unknown`).
 
@@ -43,6 +44,7 @@ from typing import Any, NamedTuple, TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 
 from iblf_jax.core.linalg import matvec, solve, solve_spd
 from iblf_jax.core.time import as_at
@@ -91,6 +93,8 @@ class Accuracy(NamedTuple):
     """Largest position error so far, (n,) [rad]."""
     relative: jax.Array
     """Largest position error so far, relative to the width of its tube, () [1]."""
+    growth: Any = ()
+    """The `error_growth.ErrorGrowth` of a loop whose feedback is interrupted; `()` of others."""
 
 
 # --- the watched numbers and their response ------------------------------------------------------
@@ -193,6 +197,7 @@ def update(
     sampled: bool = False,
     restarts: Any = None,
     too_many_jumps: Any = None,
+    absolute: bool = False,
 ) -> Accuracy:
     """The estimate after one more step.
 
@@ -208,6 +213,8 @@ def update(
         () bool; None for scenarios without jumps.
       too_many_jumps: whether jumps lie at more times than a step is divided at, () bool; None where
         this cannot happen.
+      absolute: whether the absolute values of the local errors are summed, for a continuous loop
+        whose input jumps within the steps.
     """
     table = tableau(method)
     if too_many_jumps is not None:
@@ -218,7 +225,7 @@ def update(
     width = jax.lax.stop_gradient(width)
     if sampled:
         return _update_by_stages(accuracy, table, dt, pieces, width, restarts)
-    return _update_by_differences(accuracy, table, dt, index, pieces, width, restarts)
+    return _update_by_differences(accuracy, table, dt, index, pieces, width, restarts, absolute)
 
 
 def _update_by_differences(
@@ -229,6 +236,7 @@ def _update_by_differences(
     pieces: StepSlopes,
     width: jax.Array,
     restarts: Any,
+    absolute: bool,
 ) -> Accuracy:
     """The estimate of a continuous loop: differences of rates over several steps.
 
@@ -246,6 +254,8 @@ def _update_by_differences(
         rate = partial(_rate, accuracy)
         by_stages = sum(_error_by_stages(rate, table, length, each) for length, each in pieces)
         added = jnp.where(restarts, by_stages, added)
+    if absolute:
+        added = jnp.abs(added)
     drift = (1.0 - SLOWEST_RATE * dt) * accuracy.drift + added
     pending = [
         x + newest_first[per_step * (k + 1)] * here
@@ -289,7 +299,11 @@ def _update_by_stages(
 
 
 def _error_by_stages(
-    rate: Callable, table: Tableau, length: jax.Array, slopes: list[LoopState]
+    rate: Callable,
+    table: Tableau,
+    length: jax.Array,
+    slopes: list[LoopState],
+    ratio_of: Callable | None = None,
 ) -> jax.Array:
     """Local error of one step of this length from the slopes of its stages, in terms of `rate` of a
     slope.
@@ -305,10 +319,58 @@ def _error_by_stages(
     if table.halfway:
         early, fraction = jax.tree.map(jnp.subtract, slopes[1], slopes[0]), 2.0
     tiny = jnp.finfo(length.dtype).tiny
-    ratio = fraction * _size(later) / jnp.maximum(_size(early), tiny)
+    if ratio_of is None:
+        ratio = fraction * _size(later) / jnp.maximum(_size(early), tiny)
+    else:
+        ratio = fraction * ratio_of(later, early, tiny)
     dt_A = jnp.minimum(ratio, 2.0)
     factor = dt_A**2 / 3.0 if table.halfway else dt_A * 5.0 / 3.0
     return jax.lax.stop_gradient(length) * (rate(later) * factor)
+
+
+def local_error_of_state(
+    method: str, pieces: StepSlopes, rate_at_end: Callable[[], LoopState]
+) -> jax.Array:
+    """The local error of a step, of the flat `integrated_part`.
+
+    Args:
+      method: the integrator.
+      pieces: of the step.
+      rate_at_end: gives the rate at the end of a step of Euler's method, whose local error is
+        dt (F(x + dt F) - F(x)) / 2.
+    """
+
+    def flat(slope: LoopState) -> jax.Array:
+        slope = slope._replace(delayed=())
+        return jax.lax.stop_gradient(ravel_pytree(slope)[0])
+
+    table = tableau(method)
+    if len(table.c) == 1:
+        length, slopes = pieces[0]
+        return 0.5 * jax.lax.stop_gradient(length) * (flat(rate_at_end()) - flat(slopes[0]))
+    total: Any = 0.0
+    for length, slopes in pieces:
+        total = total + _error_by_stages(flat, table, length, slopes, _ratio_by_levels)
+    return total  # type: ignore[no-any-return]
+
+
+def _ratio_by_levels(later: LoopState, early: LoopState, tiny: jax.Array) -> jax.Array:
+    """Ratio of two differences of slopes, () [1].
+
+    Each level drives the other, so the geometric mean of the ratios of position and velocity is
+    dt |A| whatever their units are; the states of other parts have a ratio of their own.
+    """
+
+    def ratio(of: Callable) -> jax.Array:
+        return _size(of(later)) / jnp.maximum(_size(of(early)), tiny)  # type: ignore[no-any-return]
+
+    def others(slope: LoopState) -> tuple:
+        return slope.controller, slope.observer, slope.actuator, slope.higher
+
+    levels = jnp.sqrt(ratio(lambda slope: slope.q) * ratio(lambda slope: slope.dq))
+    if not jax.tree.leaves(others(later)):
+        return levels
+    return jnp.maximum(levels, ratio(others))
 
 
 def _size(slope: LoopState) -> Any:
@@ -322,10 +384,9 @@ def _with_drift(
     """The estimate with a new accumulated error."""
     n = width.size
     size = jnp.maximum(jnp.abs(drift[:n]), jnp.abs(drift[n:]))
-    return Accuracy(
-        pending,
-        drift,
-        accuracy.response,
+    return accuracy._replace(
+        pending=pending,
+        drift=drift,
         error=jnp.maximum(accuracy.error, size),
         relative=jnp.maximum(accuracy.relative, jnp.max(size / width)),
     )

@@ -40,7 +40,7 @@ from iblf_jax.core.status import Status
 from iblf_jax.core.units import INPUT
 from iblf_jax.engine import Outcome, RunRequest, run_batch
 from iblf_jax.engine.simulate import simulate
-from iblf_jax.simulation.error_estimate import RELATIVE
+from iblf_jax.simulation.error_growth import errors_by_step
 from iblf_jax.simulation.metrics import (
     AboveGravity,
     Fold,
@@ -336,7 +336,7 @@ def _trials_of(
             found.metrics["effort_above_gravity"],
             found.status,
             found.fastest_mode,
-            found.metrics[RELATIVE],
+            np.asarray(errors_by_step(found.metrics)),
         )
         return Trials(*(np.asarray(x)[: len(factors)] for x in results))
 

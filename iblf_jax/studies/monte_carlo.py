@@ -10,9 +10,11 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from typing import Any
 
+import numpy as np
+
 from iblf_jax.core import checks, notices
 from iblf_jax.core.progress import announced, bar
-from iblf_jax.simulation.error_estimate import RELATIVE
+from iblf_jax.simulation.error_growth import errors_by_step
 from iblf_jax.simulation.metrics import Fold
 from iblf_jax.simulation.noise import has_noise
 from iblf_jax.simulation.scenario import Scenario
@@ -101,7 +103,7 @@ def monte_carlo(
     checks.fits_memory("runs", options.runs, case_bytes(prepared))
     with bar(progress, options.runs) as shown:
         results = run_all_cases(prepared, executor, shown.update)
-    errors = results.metrics[RELATIVE]
+    errors = np.asarray(errors_by_step(results.metrics))
     warn_of_step(results.status, results.fastest_mode, errors, options.dt, method)
     warn_of_sampling(results.status, results.metrics.get(RADIUS))
     return Study.of(prepared, results)

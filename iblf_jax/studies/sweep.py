@@ -21,7 +21,7 @@ import numpy as np
 from iblf_jax.core import checks, notices
 from iblf_jax.core.progress import announced, bar
 from iblf_jax.engine import cases_per_unit, whole_blocks
-from iblf_jax.simulation.error_estimate import RELATIVE
+from iblf_jax.simulation.error_growth import errors_by_step
 from iblf_jax.simulation.metrics import Fold, metric_units
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.simulation.signals import dimension_names
@@ -151,9 +151,8 @@ def sweep(
         result = _in_memory(prepared, config, executor, progress)
     else:
         result = _into_store(prepared, config, executor, progress, store_options)
-    status, modes, errors = (
-        np.ravel(result[name]) for name in ("status", "fastest_mode", RELATIVE)
-    )
+    status, modes = (np.ravel(result[name]) for name in ("status", "fastest_mode"))
+    errors = np.ravel(errors_by_step(result))
     warn_of_step(status, modes, errors, options.dt, method)
     radii = np.ravel(result[RADIUS]) if RADIUS in result else None
     warn_of_sampling(status, radii)

@@ -12,7 +12,8 @@ from iblf_jax.core import checks, notices
 from iblf_jax.core.progress import announced
 from iblf_jax.core.status import LOST, Status, has_flag
 from iblf_jax.engine import block_size, step_size
-from iblf_jax.simulation.error_estimate import RELATIVE, TOLERANCE
+from iblf_jax.simulation.error_estimate import TOLERANCE
+from iblf_jax.simulation.error_growth import errors_by_step
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.simulation.stability import growth_in_words
@@ -96,7 +97,7 @@ def _dt_for_all(
     lost_before = None
     for _ in range(MAX_TRIES):
         results = first_block(dt)
-        errors = results.metrics[RELATIVE]
+        errors = np.asarray(errors_by_step(results.metrics))
         needed = _dt_to_try(results.status, results.fastest_mode, errors, dt, method)
         if needed is None:
             return dt
@@ -158,12 +159,12 @@ def needed_dt(
 
     Args:
       status, modes, errors: flags, fastest mode [1/s] and estimated error relative to the tube of
-        each run.
+        each run (`errors_by_step`).
       dt: their time step [s].
       method: the integrator.
     """
     stiff = has_flag(status, Status.STEP_TOO_LARGE)
-    inaccurate = has_flag(status, Status.INACCURATE) & ~stiff
+    inaccurate = has_flag(status, Status.INACCURATE) & ~stiff & (errors != 0.0)
     needed = []
     if np.any(stiff):
         needed.append(step_size.comfortable_dt(float(np.max(modes[stiff])), method))

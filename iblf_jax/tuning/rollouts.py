@@ -14,7 +14,7 @@ import numpy as np
 from iblf_jax.core import programs
 from iblf_jax.engine import RunRequest, run_batch
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
-from iblf_jax.simulation.error_estimate import RELATIVE
+from iblf_jax.simulation.error_growth import errors_by_step
 from iblf_jax.simulation.metrics import Torque
 from iblf_jax.simulation.noise import noise_values
 from iblf_jax.simulation.paths import get, with_parameters
@@ -128,8 +128,9 @@ def rollouts(
     """
     folds = (*fold_of(objective, dt.dtype, request.steps * dt), Torque())
     outcome = run_batch(scenario, varied, folds, dt, request)
-    smooth, exact, peak_torque, error = (
-        outcome.metrics[name] for name in ("tuning_smooth", "tuning_exact", "peak_torque", RELATIVE)
+    smooth, exact, peak_torque = (
+        outcome.metrics[name] for name in ("tuning_smooth", "tuning_exact", "peak_torque")
     )
+    error = errors_by_step(outcome.metrics)
     radius = outcome.metrics.get(RADIUS, jnp.full_like(error, jnp.nan))
     return Rollouts(smooth, exact, peak_torque, error, outcome.status, outcome.fastest_mode, radius)

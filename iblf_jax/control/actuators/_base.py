@@ -41,6 +41,11 @@ class Actuator(Protocol):
       computed with it.
     - `smooth`: an actuator with the same state, without a dead zone, play and rounding.  The
       fastest mode of every loop is computed with it.
+    - `deviation`: where it has `smooth`, the width of the interval in which the difference of both
+      torques lies, () or (n,) [N m].  The numerical error of a run is bounded with it.
+    - `resolution`, the distance between two levels, () or (n,) [N m], of an actuator that rounds;
+      with it `distance_to_jump(command, dq, state)`, the distance of the command to the next jump
+      of the torque, (n,) [N m].
     - `at(t)`: the actuator at time t [s], if it changes with time, such as a drive that fails.
     - `jump_times()`: the times (m,) [s] at which it is discontinuous in time.  Steps of a run are
       divided there, as for disturbances.
@@ -61,7 +66,14 @@ class Actuator(Protocol):
         ...
 
 
-actuator_member = OptionalMembers(unlimited=None, smooth=None, input_delay=None, with_history=None)
+actuator_member = OptionalMembers(
+    unlimited=None,
+    smooth=None,
+    deviation=None,
+    resolution=None,
+    input_delay=None,
+    with_history=None,
+)
 """Reads optional members of an actuator.  Only `Delay` and a `Chain` with a `Delay` have the last
 two: `input_delay` is that `Delay`, and `with_history(dt)` is the actuator with a history that is
 long enough for steps dt [s]."""

@@ -38,6 +38,11 @@ class Backlash:
         """The same actuator without the gap."""
         return dataclasses.replace(self, gap=jnp.zeros_like(self.gap))
 
+    @property
+    def deviation(self) -> Leaf:
+        """`gap`: the torque stays within half of it of the torque without the gap."""
+        return self.gap
+
     def init(self, tau: jax.Array) -> jax.Array:
         """The state y: the torque itself, (n,) [N m]."""
         return tau

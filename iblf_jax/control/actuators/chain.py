@@ -70,6 +70,37 @@ class Chain:
         return dataclasses.replace(self, parts=tuple(map(smooth, self.parts)))
 
     @property
+    def deviation(self) -> Any:
+        """The sum of those of all parts; None if a part with a dead zone, play or rounding has
+        none.
+        """
+        parts = [part for part in self.parts if smooth(part) is not part]
+        widths = [actuator_member(part, "deviation") for part in parts]
+        if any(width is None for width in widths):
+            return None
+        return sum(widths)
+
+    @property
+    def resolution(self) -> Any:
+        """Of the first part that rounds; None without one."""
+        found = [actuator_member(part, "resolution") for part in self.parts]
+        return next((step for step in found if step is not None), None)
+
+    def distance_to_jump(self, command: jax.Array, dq: jax.Array, state: Any) -> jax.Array:
+        """The smallest distance of all parts that round, (n,) [N m]; 0 behind a part with a state,
+        whose torque passes the levels between two samples.
+        """
+        torque, moves = command, False
+        distance = jnp.full(command.shape, jnp.inf)
+        for part, state_of_part in zip(self.parts, state, strict=True):
+            if actuator_member(part, "resolution") is not None:
+                own = part.distance_to_jump(torque, dq, state_of_part)  # type: ignore[attr-defined]
+                distance = jnp.minimum(distance, jnp.zeros_like(own) if moves else own)
+            moves = moves or bool(jax.tree.leaves(state_of_part))
+            torque = part.deliver(torque, dq, state_of_part).tau
+        return distance
+
+    @property
     def input_delay(self) -> Any:
         """The `Delay` of the first part; None without one."""
         return input_delay(self.parts[0])

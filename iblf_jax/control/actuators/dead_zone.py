@@ -48,6 +48,11 @@ class DeadZone:
         zero = jnp.zeros_like(self.upper)
         return dataclasses.replace(self, lower=zero, upper=zero)
 
+    @property
+    def deviation(self) -> jax.Array:
+        """The width slope (upper - lower)."""
+        return self.slope * (self.upper - self.lower)
+
     def init(self, tau: jax.Array) -> tuple[()]:
         """No state."""
         return ()

@@ -39,6 +39,20 @@ class Quantiser:
         """An actuator without rounding."""
         return Ideal()
 
+    @property
+    def resolution(self) -> Leaf:
+        """`step`."""
+        return self.step
+
+    @property
+    def deviation(self) -> Leaf:
+        """`step`: the rounding error is at most half of it in both directions."""
+        return self.step
+
+    def distance_to_jump(self, command: jax.Array, dq: jax.Array, state: tuple[()]) -> jax.Array:
+        """The distance of the command to the nearest limit between two levels, (n,) [N m]."""
+        return 0.5 * self.step - jnp.abs(rounded(command, self.step) - command)
+
     def init(self, tau: jax.Array) -> tuple[()]:
         """No state."""
         return ()

@@ -24,7 +24,7 @@ import numpy as np
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import component
 from iblf_jax.core.status import Status, has_flag
-from iblf_jax.simulation.error_estimate import RELATIVE
+from iblf_jax.simulation.error_growth import errors_by_step
 from iblf_jax.simulation.noise import NOISE_NAME, noise_values
 from iblf_jax.studies import statistics
 from iblf_jax.studies.blocks import BlockResults
@@ -154,7 +154,7 @@ class NormalSpace:
         self.runs += len(z)
         self.status.append(results.status)
         self._modes.append(results.fastest_mode)
-        self._errors.append(results.metrics[RELATIVE])
+        self._errors.append(np.asarray(errors_by_step(results.metrics)))
         margins = statistics.worst_joint(results.metrics, self.metric).astype(float) - self.limit
         margins = np.nan_to_num(margins, nan=0.0, posinf=np.inf, neginf=-np.inf)
         diverged = has_flag(results.status, Status.NOT_FINITE)

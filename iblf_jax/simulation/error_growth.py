@@ -1,0 +1,565 @@
+"""Growth of the numerical error in a loop whose feedback is interrupted.
+
+The reading of an encoder and the torque of a quantiser are piecewise constant functions. While all
+of them keep their values, a small error of the state does not act back on the torque, and it grows
+as in the open loop. `error_estimate` assumes that errors decay, so such loops have an estimate of
+their own. The same holds inside a dead zone or a backlash, and while an event trigger holds the
+command.
+
+Without a jump. A method of one step with the map Phi and the local error l has the global error
+
+    e_(k+1) = Phi(x_k + e_k) - Phi(x_k) + l_k.                                            (A.1)
+
+Phi is the real loop, with open dead zones and held codes. To first order in e and in dt,
+
+    Phi(x + e) - Phi(x) = e + dt [F(x + s d, u + s du) - F(x, u)] |e| / s,   d = e / |e|,  (A.2)
+
+with the rate F and a small s, and at a sample the law runs once more at the state x + s d. This
+gives the errors of the command u and of the states of law, observer and sensor. The torque behind
+a quantiser has no error, nor has a command that follows from rounded readings. A level that is
+measured without rounding besides rounded ones is neglected, as its feedback damps the error. The
+local error is that of the stages of the step, which is ten times that of a smooth loop, and the
+rounding error of the numbers is added to it.
+
+With a jump. A code may differ between the run and the exact solution if the error reaches the next
+edge:
+
+    |e_i| >= step_i / 2 - |round(y_i) - y_i|   at any sample, or the same for the command. (A.3)
+
+After that (A.2) does not hold. Both solutions are then those of the loop without rounding, driven
+by rounding errors w with |w_i| <= step_i / 2 each, so their difference z satisfies
+
+    z_(k+1) = Phi_s z_k + G (w_k - w'_k),   |w_i - w'_i| <= step_i,
+    |z| <= sum_j |Phi_s^j G| step,                                                        (A.4)
+
+with Phi_s the map of the smooth loop over a period (`stability.period_map`). The deviation of a
+dead zone, a backlash or an event trigger from the smooth loop is bounded too, with its width in
+the place of the step. Of an event trigger it is 2 (relative max |u| + absolute). (A.4) does not
+depend on the time step. It holds with or without a jump, as far as the states at which the loop is
+linearised (start, end, nearest to a bound) stand for the run.
+
+The stated error is the smaller one of the largest e and (A.4) before a jump, and (A.4) after it.
+In a continuous loop a quantiser jumps within the steps. The quadrature of a step across a jump of
+the torque by `step` is wrong by up to dt step / 3 (rk4), and the differences of `error_estimate`
+sum to 16/18 of dt step in absolute value. There the absolute values are summed, because those of
+different jumps need not cancel. (A.4) is not computed, and the bound is not rigorous there: it was
+compared with runs at a sixteenth of the step.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+
+from iblf_jax.control.actuators import _base as actuators
+from iblf_jax.control.controllers._base import state_of_levels
+from iblf_jax.control.sensors._base import sensor_member, unrounded
+from iblf_jax.core.linalg import matmul_in_order
+from iblf_jax.core.time import as_at
+from iblf_jax.simulation.closed_loop import (
+    LoopState,
+    evaluate,
+    integrated_part,
+    run_sampled_law,
+    with_integrated_part,
+)
+from iblf_jax.simulation.error_estimate import RELATIVE, Accuracy
+from iblf_jax.simulation.levels import sensor_state
+from iblf_jax.simulation.noise import normals
+from iblf_jax.simulation.sampling import Instant, step_torques
+from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.simulation.stability import flow, period_map
+
+BOUND = "relative_rounding_error"
+"""Name of the bound (A.4), relative to the width of the tube, among the metrics of a sampled run
+whose feedback is interrupted; 0 where no code may have differed."""
+SUMMED_PERIODS, DOUBLINGS = 256, 8
+"""Periods over which the sum of (A.4) is exact, and the number of times it is doubled."""
+ARITHMETIC = 4.0
+"""Rounding error of a reading or a command, in units of its last place."""
+
+
+class ErrorGrowth(NamedTuple):
+    """The error of (A.1) between two steps."""
+
+    error: Any
+    """Of the `_variables` of the state."""
+    jumped: jax.Array
+    """1 if a code may have differed at a sample so far, else 0, ()."""
+    largest: jax.Array
+    """Largest position error before a jump, (n,) [rad]."""
+    relative: jax.Array
+    """The same relative to the width of the tube, () [1]."""
+    peak: Any
+    """Largest command so far, (n,) [N m], in a loop with an event trigger; `()` in others."""
+
+
+def is_interrupted(scenario: Scenario) -> bool:
+    """Whether a part of the loop does not pass on every small difference: it rounds, has a dead
+    zone or play, or holds commands until an event.
+    """
+    sampling, smooth = scenario.sampling, actuators.smooth(scenario.actuator)
+    if sampling is None:
+        return smooth is not scenario.actuator and not rounds_continuously(scenario)
+    if sampling.trigger is not None or smooth is not scenario.actuator:
+        return True
+    return _rounds_readings(scenario)
+
+
+def rounds_continuously(scenario: Scenario) -> bool:
+    """Whether the input of a continuous loop may jump within every step, or is delayed and passes
+    an interrupted actuator.
+    """
+    actuator = scenario.actuator
+    if scenario.sampling is not None or actuators.smooth(actuator) is actuator:
+        return False
+    if actuators.input_delay(actuator) is not None:
+        return True
+    return _rounds_torque(scenario)
+
+
+def _rounds_readings(scenario: Scenario) -> bool:
+    """Whether the sensor rounds."""
+    return unrounded(scenario.sensor) is not scenario.sensor
+
+
+def _rounds_torque(scenario: Scenario) -> bool:
+    """Whether the actuator rounds."""
+    return actuators.actuator_member(scenario.actuator, "resolution") is not None
+
+
+def _variables(scenario: Scenario, state: LoopState) -> Any:
+    """The part of the state that has an error: of a loop with a sampled law the plant and the
+    actuator, then law, observer and sensor, the commands in transit and the one sent last; only the
+    first of these where the readings are rounded.
+    """
+    if scenario.sampling is None:
+        return state
+    if _rounds_readings(scenario):
+        return (integrated_part(state),)
+    sampled: Any = state.sampled
+    memory = (state.controller, state.observer, sampled.sensor)
+    return integrated_part(state), memory, sampled.commands, sampled.sent
+
+
+def begin(scenario: Scenario, state: LoopState, derivative: jax.Array) -> Any:
+    """The error before the first step, 0; `()` for a loop that is not interrupted.
+
+    Args:
+      scenario: the scenario.
+      state: at the start.
+      derivative: of `closed_loop.perturbed_rate` there, (M, M).
+    """
+    if not is_interrupted(scenario):
+        return ()
+    zero = jnp.zeros_like(state.q)
+    peak: Any = ()
+    jumped = zero[0]
+    if scenario.sampling is not None and scenario.sampling.trigger is not None:
+        peak = zero
+    if _rounds_twice(scenario):
+        jumped = jnp.where(_reads_without_rounding(scenario, state, derivative), 1.0, jumped)
+    none = jax.tree.map(jnp.zeros_like, _variables(scenario, state))
+    return ErrorGrowth(none, jumped, zero, zero[0], peak)
+
+
+def _rounds_twice(scenario: Scenario) -> bool:
+    """Whether a loop with rounded readings has a rounded torque or an event trigger too."""
+    if scenario.sampling is None or not _rounds_readings(scenario):
+        return False
+    has_trigger = scenario.sampling.trigger is not None
+    return has_trigger or _rounds_torque(scenario)
+
+
+def _reads_without_rounding(
+    scenario: Scenario, state: LoopState, derivative: jax.Array
+) -> jax.Array:
+    """Whether the law depends on a level without rounding, () bool.
+
+    The error of its command is not followed then, so any of its codes may differ.
+    """
+    plant = ravel_pytree(integrated_part(state))[0].size
+    by_level = [
+        jnp.where(step == 0, derivative[plant:, rows], 0.0)
+        for rows, step in zip(_rows_of_levels(state), _resolution(scenario, state.x), strict=True)
+    ]
+    return jnp.any(jnp.stack(by_level) != 0.0)
+
+
+def _rows_of_levels(state: LoopState) -> list[slice]:
+    """Where each level lies in the flat `integrated_part`: the states of the actuator follow the
+    second one.
+    """
+    n = state.q.size
+    after = sum(x.size for x in jax.tree.leaves(state.actuator))
+    starts = [k * n + (after if k > 1 else 0) for k in range(len(state.x))]
+    return [slice(start, start + n) for start in starts]
+
+
+# --- a step --------------------------------------------------------------------------------------
+
+
+def _moved(x: Any, by: Any, factor: Any) -> Any:
+    """A pytree x + factor by; leaves that are no floats stay."""
+
+    def one(a: jax.Array, b: jax.Array) -> jax.Array:
+        return a + factor * b if jnp.issubdtype(a.dtype, jnp.floating) else a
+
+    return jax.tree.map(one, x, by)
+
+
+def _scales(error: Any) -> tuple[jax.Array, jax.Array]:
+    """The factors s / |e|, by which an error becomes a small difference, and |e| / s."""
+    leaves = [x for x in jax.tree.leaves(error) if jnp.issubdtype(x.dtype, jnp.floating)]
+    size = jnp.sum(jnp.stack([jnp.sum(jnp.abs(x)) for x in leaves]))
+    small = jnp.finfo(size.dtype).eps ** 0.5
+    size = jnp.maximum(size, jnp.finfo(size.dtype).eps ** 2)
+    return small / size, size / small
+
+
+def update(
+    growth: ErrorGrowth,
+    scenario: Scenario,
+    dt: jax.Array,
+    index: jax.Array,
+    now: Instant | None,
+    noise: Any,
+    before: LoopState,
+    state: LoopState,
+    local_error: jax.Array,
+    width: jax.Array,
+) -> ErrorGrowth:
+    """The error after one more step.
+
+    Args:
+      growth: before it.
+      scenario: the scenario.
+      dt: time step, () [s].
+      index: number of the step, () int.
+      now: its position between samples; None for a continuous loop.
+      noise: the key of the random numbers.
+      before, state: the state at the start of the step, before and after the law has run.
+      local_error: of the step, of the flat `integrated_part`.
+      width: of the tube, (n,) [rad].
+    """
+    scenario, before, state, local_error, width = jax.lax.stop_gradient(
+        (scenario, before, state, local_error, width)
+    )
+    t = index.astype(dt.dtype) * dt
+    torque_error: Any = None
+    torque: Any = None
+    if now is not None:
+        growth = jax.lax.cond(
+            now.phase == 0,
+            lambda old: _at_sample(old, scenario, t, now, noise, before, state),
+            lambda old: old,
+            growth,
+        )
+        torque, torque_error = _torques(scenario, dt, now, state, growth)
+    part = growth.error
+    if now is not None:
+        part = part[0]  # of the `_variables`
+    moving = (part, torque_error)
+    small, back = _scales(moving)
+    base = integrated_part(state)
+    plain = _rate(scenario, t, state, base, dt, torque)
+    if torque is not None:
+        torque = torque + small * torque_error
+    shifted = _rate(scenario, t, state, _moved(base, part, small), dt, torque)
+    flat, unflatten = ravel_pytree(part)
+    grown = flat + dt * back * (ravel_pytree(shifted)[0] - ravel_pytree(plain)[0])
+    rounding = jnp.finfo(dt.dtype).eps * jnp.abs(ravel_pytree(base)[0])
+    grown = grown + local_error
+    grown = grown + jnp.where(grown < 0, -rounding, rounding)
+    grown = jnp.where(growth.jumped > 0, 0.0, grown)
+    error = unflatten(grown)
+    if now is not None:
+        error = (error, *growth.error[1:])
+    size = jnp.where(growth.jumped > 0, 0.0, jnp.abs(grown[: width.size]))
+    return growth._replace(
+        error=error,
+        largest=jnp.maximum(growth.largest, size),
+        relative=jnp.maximum(growth.relative, jnp.max(size / width)),
+    )
+
+
+def rate_at_end(
+    scenario: Scenario, dt: jax.Array, index: jax.Array, now: Instant | None, state: LoopState
+) -> LoopState:
+    """The rate at the end of a step of Euler's method from a state."""
+    t, torque = index.astype(dt.dtype) * dt, None
+    if now is not None:
+        sampling: Any = scenario.sampling
+        torque = step_torques(sampling, dt, now, state.sampled.commands).torque
+    part = integrated_part(state)
+    end = _moved(part, _rate(scenario, t, state, part, dt, torque), dt)
+    return _rate(scenario, t + dt, state, end, dt, torque)
+
+
+def _rate(
+    scenario: Scenario,
+    t: jax.Array,
+    state: LoopState,
+    part: LoopState,
+    dt: jax.Array,
+    torque: Any,
+) -> LoopState:
+    """The rate of the `integrated_part` of a state."""
+    arguments = () if torque is None else (torque,)
+    return evaluate(scenario, t, with_integrated_part(state, part), dt, *arguments)[0]
+
+
+def _torques(
+    scenario: Scenario, dt: jax.Array, now: Instant, state: LoopState, growth: ErrorGrowth
+) -> tuple[jax.Array, jax.Array]:
+    """The command at the actuator at the start of a step, (n,), and its mean error over the
+    step.
+    """
+    sampling: Any = scenario.sampling
+    torque = step_torques(sampling, dt, now, state.sampled.commands).torque
+    is_cut = _rounds_readings(scenario) or _rounds_torque(scenario)
+    if is_cut:
+        return torque, jnp.zeros_like(torque)
+    errors = step_torques(sampling, dt, now, growth.error[2])
+    mean = errors.arrival * errors.torque + (1.0 - errors.arrival) * errors.next
+    return torque, jnp.where(errors.arrives, mean, errors.torque)
+
+
+def _at_sample(
+    growth: ErrorGrowth,
+    scenario: Scenario,
+    t: jax.Array,
+    now: Instant,
+    noise: Any,
+    before: LoopState,
+    state: LoopState,
+) -> ErrorGrowth:
+    """The errors after the law has run, and whether a code may differ (A.3)."""
+    normal = normals(noise, now.sample, scenario.sensor.draws, scenario.n).astype(state.q.dtype)
+    if _rounds_readings(scenario):
+        reaches = _reaches_code(growth.error[0].x, scenario, before, normal)
+        return growth._replace(jumped=jnp.where(reaches, 1.0, growth.jumped))
+    return _after_law(growth, scenario, t, normal, before, state)
+
+
+def _reaches_code(
+    error: jax.Array, scenario: Scenario, state: LoopState, normal: jax.Array
+) -> jax.Array:
+    """Whether an error of the levels, (r, n), reaches the next code of a reading, () bool."""
+    step = _resolution(scenario, state.x)
+    rounded, plain = (
+        _reading(sensor, scenario, state, normal)
+        for sensor in (scenario.sensor, unrounded(scenario.sensor))
+    )
+    distance = 0.5 * step - jnp.abs(rounded - plain)
+    blur = ARITHMETIC * jnp.finfo(step.dtype).eps * jnp.abs(rounded)
+    return jnp.any((step > 0) & (jnp.abs(error) + blur >= distance))
+
+
+def _after_law(
+    growth: ErrorGrowth,
+    scenario: Scenario,
+    t: jax.Array,
+    normal: jax.Array,
+    before: LoopState,
+    state: LoopState,
+) -> ErrorGrowth:
+    """The errors of command and memory after a law that receives readings without rounding, and
+    whether an event or a level of the torque may differ.
+    """
+    sampling: Any = scenario.sampling
+    always = dataclasses.replace(scenario, sampling=dataclasses.replace(sampling, trigger=None))
+    part, memory, commands, sent = growth.error
+    held = before.sampled
+    states = (before.controller, before.observer, held.sensor)
+    small, back = _scales((part.q, part.dq, part.higher, memory))
+
+    def law(scale: Any) -> tuple[jax.Array, Any]:
+        q, dq, higher = _moved(
+            (before.q, before.dq, before.higher), (part.q, part.dq, part.higher), scale
+        )
+        controller, observer, sensor = _moved(states, memory, scale)
+        at = before._replace(q=q, dq=dq, higher=higher, controller=controller, observer=observer)
+        at = at._replace(sampled=held._replace(sensor=sensor, sent=()))
+        after = run_sampled_law(always, t, at, normal)
+        after_memory = (after.controller, after.observer, after.sampled.sensor)
+        return after.sampled.commands[0], after_memory
+
+    plain, shifted = law(jnp.zeros_like(small)), law(small)
+    command = plain[0]
+    command_error, memory = _moved(
+        jax.tree.map(jnp.zeros_like, plain), _difference(plain, shifted), back
+    )
+    blur = ARITHMETIC * jnp.finfo(command.dtype).eps * jnp.abs(command)
+    reaches, peak = jnp.zeros((), bool), growth.peak
+    if sampling.trigger is not None:
+        peak = jnp.maximum(peak, jnp.abs(command))
+        threshold = sampling.trigger.relative * jnp.abs(held.sent.input)
+        threshold = threshold + sampling.trigger.absolute
+        distance = jnp.abs(jnp.max(jnp.abs(command - held.sent.input) - threshold))
+        near = jnp.max(jnp.abs(command_error - sent.input) + blur) >= distance
+        reaches = near & (held.sent.number > 0)
+        fires = state.sampled.sent.number > held.sent.number
+        command_error = jnp.where(fires, command_error, sent.input)
+        sent = sent._replace(input=command_error, torque=command_error)
+    if _rounds_torque(scenario):
+        actuator: Any = as_at(scenario.actuator, t)
+        distance = actuator.distance_to_jump(state.sampled.commands[0], state.dq, state.actuator)
+        reaches = reaches | jnp.any(jnp.abs(command_error) + blur >= distance)
+    jumped = jnp.where(reaches, 1.0, growth.jumped)
+    commands = jnp.concatenate([command_error[None], commands[:-1]])
+    after = (memory, commands, sent)
+    after = jax.tree.map(lambda x: jnp.where(jumped > 0, jnp.zeros_like(x), x), after)
+    return growth._replace(error=(part, *after), jumped=jumped, peak=peak)
+
+
+def _difference(x: Any, y: Any) -> Any:
+    """The difference y - x of two pytrees; 0 for leaves that are no floats."""
+
+    def one(a: jax.Array, b: jax.Array) -> jax.Array:
+        return b - a if jnp.issubdtype(a.dtype, jnp.floating) else jnp.zeros_like(a)
+
+    return jax.tree.map(one, x, y)
+
+
+def _reading(sensor: Any, scenario: Scenario, state: LoopState, normal: jax.Array) -> jax.Array:
+    """The measured levels, (r, n)."""
+    sampling: Any = scenario.sampling
+    x = sensor_state(scenario, state.q, state.dq, state.higher)
+    q, dq, higher = sensor.measure(*x, normal, sampling.period, state.sampled.sensor)[0]
+    if isinstance(higher, tuple):
+        higher = state.higher
+    return state_of_levels(q, dq, higher)
+
+
+def _resolution(scenario: Scenario, x: jax.Array) -> jax.Array:
+    """The step of the readings of each level of a state x, (r, n); 0 for one that is not
+    rounded.
+    """
+    step = jnp.asarray(sensor_member(scenario.sensor, "resolution"), x.dtype)
+    if step.ndim < 2:
+        first = jnp.broadcast_to(step, x[:1].shape)
+        return jnp.concatenate([first, jnp.zeros_like(x[1:])])
+    return jnp.broadcast_to(step, x.shape)
+
+
+# --- the bound after a jump ----------------------------------------------------------------------
+
+
+def bound(
+    scenario: Scenario,
+    growth: ErrorGrowth,
+    state: LoopState,
+    derivative: jax.Array,
+    periods: jax.Array,
+) -> jax.Array:
+    """The bound (A.4) of the position error, (n,) [rad].
+
+    Args:
+      scenario: with a sampling.
+      growth: after the run.
+      state: of the loop, for its structure.
+      derivative: of `closed_loop.perturbed_rate` by `closed_loop.perturbed_state`, (M, M).
+      periods: in the run, () [1].
+    """
+    sampling: Any = scenario.sampling
+    n, size = scenario.n, len(derivative)
+    plant = ravel_pytree(integrated_part(state))[0].size
+    Phi = period_map(scenario, state, derivative)
+    A, B = derivative[:plant, :plant], derivative[:plant, plant : plant + n]
+    by_torque = flow(A, B, sampling.period)[:, plant:]
+
+    def columns(plant_rows: jax.Array, memory_rows: jax.Array) -> jax.Array:
+        rest = jnp.zeros((len(Phi) - plant - len(memory_rows), n), Phi.dtype)
+        return jnp.concatenate([plant_rows, memory_rows, rest])
+
+    none = jnp.zeros((size - plant - n, n), Phi.dtype)
+    inputs = [columns(by_torque, none) * _torque_width(scenario, growth)]
+    if _rounds_readings(scenario):
+        step = _resolution(scenario, state.x)
+        for rows, width in zip(_rows_of_levels(state), step, strict=True):
+            law = derivative[plant : plant + n, rows]
+            memory = derivative[plant + n :, rows]
+            inputs.append(columns(matmul_in_order(by_torque, law), memory) * width)
+            if sampling.queue:
+                inputs[-1] = _through_queue(inputs[-1], law * width, plant, size - plant - n, n)
+    G = jnp.concatenate(inputs, axis=1)
+
+    def add(j: jax.Array, found: tuple) -> tuple:
+        total, term = found
+        total = total + jnp.where(j < periods, jnp.abs(term), 0.0)
+        return total, matmul_in_order(Phi, term)
+
+    total, _ = jax.lax.fori_loop(0, SUMMED_PERIODS, add, (jnp.zeros_like(G), G))
+    power = Phi
+    for _ in range(SUMMED_PERIODS.bit_length() - 1):
+        power = matmul_in_order(power, power)
+    doubled = total
+    for _ in range(DOUBLINGS):
+        doubled = doubled + matmul_in_order(jnp.abs(power), doubled)
+        power = matmul_in_order(power, power)
+    total = jnp.where(periods > SUMMED_PERIODS, doubled, total)
+    return jnp.sum(total[:n], axis=1)
+
+
+def with_growth(
+    accuracy: Accuracy, bounds: jax.Array, width: jax.Array
+) -> tuple[Accuracy, dict[str, jax.Array]]:
+    """The `error_estimate.Accuracy` of a run, as the head of this module states, and the results
+    that it adds to the metrics.
+
+    Args:
+      accuracy: after the run; its error is that of the loop without rounding.
+      bounds: (A.4), (n,) [rad].
+      width: smallest width of the tube, (n,) [rad].
+    """
+    growth = accuracy.growth
+    bounds = bounds + accuracy.error
+    relative = jnp.max(bounds / width)
+    jumped = growth.jumped > 0
+    before = jnp.maximum(accuracy.error, growth.largest)
+    before_relative = jnp.maximum(accuracy.relative, growth.relative)
+    found = accuracy._replace(
+        error=jnp.where(jumped, bounds, jnp.minimum(before, bounds)),
+        relative=jnp.where(jumped, relative, jnp.minimum(before_relative, relative)),
+    )
+    return found, {BOUND: jnp.where(jumped, relative, 0.0)}
+
+
+def errors_by_step(metrics: Any) -> jax.Array:
+    """The stated error of runs relative to the tube; 0 where a smaller step does not reduce it,
+    because a code of a rounded signal may differ. `metrics` are by name.
+    """
+    errors = jnp.asarray(metrics[RELATIVE])
+    if BOUND not in metrics:
+        return errors
+    return jnp.where(jnp.asarray(metrics[BOUND]) > 0.0, 0.0, errors)
+
+
+def _through_queue(
+    direct: jax.Array, command: jax.Array, plant: int, memory: int, n: int
+) -> jax.Array:
+    """The columns of a rounding error of a reading whose command waits in a queue."""
+    none, last = jnp.zeros_like(direct[:plant]), plant + memory
+    return jnp.concatenate([none, direct[plant:last], command, direct[last + n :]])
+
+
+def _torque_width(scenario: Scenario, growth: ErrorGrowth) -> jax.Array:
+    """Largest difference of two deviations of the torque from that of the smooth loop, (n,)
+    [N m].
+    """
+    sampling: Any = scenario.sampling
+    width = jnp.zeros((scenario.n,), growth.largest.dtype)
+    deviation = actuators.actuator_member(scenario.actuator, "deviation")
+    if deviation is not None:
+        width = width + deviation
+    elif actuators.smooth(scenario.actuator) is not scenario.actuator:
+        width = width + jnp.inf
+    if sampling.trigger is not None:
+        trigger = sampling.trigger
+        width = width + 2.0 * (trigger.relative * growth.peak + trigger.absolute)
+    return width

@@ -1,0 +1,213 @@
+"""The stated error of loops that round a reading or a torque, have a dead zone or play, or hold
+commands until an event: it is never below the error, or the run is flagged."""
+
+from __future__ import annotations
+
+import warnings
+from functools import partial
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+
+import iblf_jax as ij
+from iblf_jax.core.status import Status
+from iblf_jax.simulation import error_growth, stability
+from iblf_jax.simulation.closed_loop import initial_state, integrated_part
+from iblf_jax.simulation.error_estimate import RELATIVE, TOLERANCE
+from iblf_jax.simulation.scenario import canonical
+
+FINER = 16
+BASE = ij.with_parameters(
+    ij.presets.zhang_yan_2024(reading="corrected"), {"controller.K2": 4.0, "observer.kf": 4.0}
+)
+DIFFERENCE = ij.sensors.FilteredDifference(cutoff=192.57)
+MOTOR = ij.actuators.Motor(bandwidth=150.0)
+
+
+def sampled(sensor=None, actuator=None, **timing):
+    parts = {"sensor": sensor, "actuator": actuator}
+    parts = {name: part for name, part in parts.items() if part is not None}
+    return ij.with_parts(BASE, sampling=ij.Sampling(period=4e-3, **timing), **parts)
+
+
+def encoder(velocity=DIFFERENCE, counts=1024.0, **fields):
+    return ij.sensors.Encoder(counts=counts, velocity=velocity, **fields)
+
+
+def quantiser(step=1.5):
+    return ij.actuators.Quantiser(step=step)
+
+
+LOOPS = {
+    "ideal": lambda: sampled(),
+    "difference": lambda: sampled(encoder()),
+    "noisy difference": lambda: sampled(encoder(noise=1e-3)),
+    "tracking": lambda: sampled(encoder(ij.sensors.Tracking(bandwidth=150.0))),
+    "measured velocity": lambda: sampled(encoder(ij.sensors.Measured(noise=0.01))),
+    "levels": lambda: sampled(ij.sensors.Levels((encoder(),))),
+    "two directs": lambda: sampled(
+        ij.sensors.Levels((ij.sensors.Direct(resolution=1e-3), ij.sensors.Direct()))
+    ),
+    "quantiser": lambda: sampled(actuator=quantiser()),
+    "quantiser and delay": lambda: sampled(actuator=quantiser(), delay=1.3e-3),
+    "quantiser before a motor": lambda: sampled(actuator=ij.actuators.Chain((quantiser(), MOTOR))),
+    "quantiser behind a motor": lambda: sampled(actuator=ij.actuators.Chain((MOTOR, quantiser()))),
+    "both": lambda: sampled(encoder(), quantiser()),
+    "limited motor": lambda: sampled(actuator=ij.actuators.Motor(bandwidth=150.0, limit=25.0)),
+    "fault": lambda: sampled(actuator=ij.actuators.Fault(effectiveness=0.7, time=0.3)),
+    "dead zone": lambda: sampled(actuator=ij.actuators.DeadZone(lower=-3.0, upper=3.0)),
+    "backlash": lambda: sampled(actuator=ij.actuators.Backlash(gap=0.5, bandwidth=150.0)),
+    "trigger": lambda: sampled(trigger=ij.EventTrigger(relative=0.05, absolute=0.5)),
+    "continuous quantiser": lambda: ij.with_parts(BASE, actuator=quantiser()),
+    "continuous dead zone": lambda: ij.with_parts(
+        BASE, actuator=ij.actuators.DeadZone(lower=-3.0, upper=3.0)
+    ),
+    "continuous backlash": lambda: ij.with_parts(
+        BASE, actuator=ij.actuators.Backlash(gap=0.5, bandwidth=150.0)
+    ),
+}
+RUNS = 5
+"""Random loops of each structure: 100 in all."""
+SMOOTH = ("ideal", "limited motor", "fault")
+
+
+def random_values(scenario, rng):
+    """Random gains, reference, start and resolution of a loop."""
+
+    def between(low, high):
+        return np.exp(rng.uniform(np.log(low), np.log(high), 2))
+
+    drawn = {
+        "controller.K2": between(3.0, 8.0),
+        "controller.k1": between(1.0, 4.0),
+        "observer.kf": between(3.0, 8.0),
+        "reference.frequency": between(0.5, 3.0),
+        "reference.amplitude": between(0.02, 0.1),
+        "initial.q": rng.uniform(0.6, 0.8, 2),
+        "sensor.counts": np.round(between(500.0, 2.0**15)),
+        "actuator.step": between(0.01, 2.0),
+    }
+    has = {parameter.path for parameter in ij.parameters(scenario)}
+    return {path: x for path, x in drawn.items() if path in has}
+
+
+def run(scenario, duration, dt, record_every=1, **options):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return ij.simulate(
+            scenario, duration=duration, dt=dt, record_every=record_every, seed=3, **options
+        )
+
+
+def assess(scenario, duration=2.0, dt=2e-3):
+    """A run, and its true error by a run at a sixteenth of the step, relative to the tube."""
+    coarse = run(scenario, duration, dt)
+    fine = run(scenario, duration, dt / FINER, FINER)
+    return coarse, float(np.max(np.abs(coarse.q - fine.q) / (fine.upper - fine.lower)))
+
+
+def is_flagged(found):
+    return bool(int(found.status) & Status.INACCURATE)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", LOOPS)
+def test_the_stated_error_holds(name, rng):
+    """100 random loops with every sensor and actuator."""
+    loop, ratios = LOOPS[name](), []
+    for _ in range(RUNS):
+        scenario = ij.with_parameters(loop, random_values(loop, rng))
+        found, error = assess(scenario)
+        stated = float(found.metrics[RELATIVE])
+        assert stated >= error or is_flagged(found), (error, stated)
+        assert is_flagged(found) == (not stated <= TOLERANCE)
+        ratios.append(stated / error)
+    print(name, "median ratio", np.median(ratios))
+    if name in SMOOTH:
+        assert np.median(ratios) < 1000.0
+
+
+@pytest.mark.slow
+def test_a_loop_whose_codes_are_certain_has_the_error_of_the_open_loop():
+    """At an eighth of the step no code can differ, and the estimate falls with the fourth power."""
+    scenario = LOOPS["quantiser"]()
+    coarse, fine = run(scenario, 2.0, 2e-3), run(scenario, 2.0, 2.5e-4)
+    assert is_flagged(coarse)
+    assert float(coarse.metrics[error_growth.BOUND]) > TOLERANCE
+    assert not is_flagged(fine)
+    assert float(fine.metrics[error_growth.BOUND]) == 0.0
+    error = np.max(np.abs(fine.q[::8] - run(scenario, 2.0, 2e-3 / 32, 32).q))
+    assert error < float(np.max(fine.metrics.numerical_error)) < 200.0 * error
+
+
+@pytest.mark.slow
+def test_the_message_says_why_a_code_may_differ():
+    with pytest.warns(ij.SimulationWarning, match=r"rounds a reading.*actuator\.step.*dt=0\.0002"):
+        ij.simulate(LOOPS["quantiser"](), duration=2.0, dt=2e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["difference", "quantiser"])
+def test_in_float32_the_stated_error_is_above_the_distance_from_float64(name):
+    scenario = LOOPS[name]()
+    exact = run(scenario, 1.0, 1e-3)
+    single = run(ij.astype(scenario, "float32"), 1.0, 1e-3)
+    assert single.q.dtype == jnp.float32
+    error = np.max(np.abs(np.asarray(single.q, float) - exact.q) / (exact.upper - exact.lower))
+    assert float(single.metrics[RELATIVE]) > error or is_flagged(single)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["difference", "quantiser", "backlash", "trigger"])
+def test_the_executors_agree(name):
+    """While the codes are certain; a run whose codes are not amplifies the last bit."""
+    found = [run(LOOPS[name](), 0.4, 1e-3, backend=backend) for backend in ("native", "vmap")]
+    for of in ("numerical_error", RELATIVE, error_growth.BOUND):
+        np.testing.assert_allclose(found[0].metrics[of], found[1].metrics[of], rtol=1e-4)
+
+
+def test_the_bound_is_that_of_the_worst_rounding_errors():
+    """The sum over periods, against one in NumPy, over a run of few periods and a long one."""
+    scenario = canonical(LOOPS["both"]())
+    state = initial_state(scenario)
+    derivative = stability.jacobian(scenario, jnp.zeros(()), state)
+    growth = error_growth.begin(scenario, state, derivative)
+    plant = ravel_pytree(integrated_part(state))[0].size
+    Phi = np.asarray(stability.period_map(scenario, state, derivative))
+    A, B = derivative[:plant, :plant], derivative[:plant, plant : plant + 2]
+    by_torque = np.asarray(stability.flow(A, B, scenario.sampling.period))[:, plant:]
+    law = np.asarray(derivative[plant:, :2])
+    by_reading = np.concatenate([by_torque @ law[:2], law[2:]]) * 2 * np.pi / 1024
+    by_level = np.concatenate([by_torque, np.zeros_like(law[2:])]) * 1.5
+    term, sums = np.concatenate([by_reading, by_level], axis=1), []
+    for _ in range(5000):
+        sums.append(np.abs(term[:2]).sum(axis=1))
+        term = Phi @ term
+    found = partial(error_growth.bound, scenario, growth, state, derivative)
+    np.testing.assert_allclose(found(jnp.asarray(20.0)), np.sum(sums[:20], axis=0), rtol=1e-9)
+    exact = np.sum(sums, axis=0)
+    long = np.asarray(found(jnp.asarray(5000.0)))
+    assert np.all(long >= exact * (1 - 1e-9))
+    assert np.all(long < 2.0 * exact)
+
+
+def test_distance_to_the_next_level():
+    command, none = jnp.array([0.2, 0.7]), jnp.zeros(2)
+    part = ij.actuators.Quantiser(step=jnp.array([1.0, 0.5]))
+    np.testing.assert_allclose(part.distance_to_jump(command, none, ()), [0.3, 0.05])
+    lag = ij.actuators.Motor(bandwidth=100.0)
+    first = ij.actuators.Chain((part, lag))
+    np.testing.assert_allclose(first.distance_to_jump(command, none, first.init(none)), [0.3, 0.05])
+    behind = ij.actuators.Chain((lag, part))
+    np.testing.assert_allclose(behind.distance_to_jump(command, none, behind.init(none)), 0.0)
+    assert behind.deviation is part.step or np.all(behind.deviation == part.step)
+
+
+def test_smooth_loops_have_no_growing_error():
+    for name in SMOOTH:
+        assert not error_growth.is_interrupted(LOOPS[name]())
+    for name in ("difference", "dead zone", "trigger", "continuous backlash"):
+        assert error_growth.is_interrupted(LOOPS[name]())
+    assert error_growth.rounds_continuously(LOOPS["continuous quantiser"]())
