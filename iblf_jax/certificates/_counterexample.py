@@ -25,7 +25,9 @@ nothing is claimed (the guard or a torque limit is active), are no counterexampl
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -39,7 +41,7 @@ from iblf_jax.certificates.level_terms import is_about_levels, level_terms_at
 from iblf_jax.certificates.proof_terms import terms_at
 from iblf_jax.control.controllers import Backstepping
 from iblf_jax.core import checks
-from iblf_jax.core.presentation import Result
+from iblf_jax.core.presentation import present
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.simulation.closed_loop import initial_state
 from iblf_jax.simulation.paths import with_parameters
@@ -60,7 +62,9 @@ class Counterexample(NamedTuple):
     """The largest g that was found; at most -1 where the proof is exact, positive where V2 grows
     against the claim."""
 
-    save = Result.save
+    def save(self, path: str | os.PathLike) -> Path:
+        """As `Result.save`: a result that is a tuple cannot have it as a base class."""
+        return present("result file", self, path)
 
 
 def _growth(scenario: Scenario) -> tuple[jax.Array, jax.Array]:

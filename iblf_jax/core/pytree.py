@@ -184,7 +184,13 @@ def register_component(cls: type[T]) -> type[T]:
             return values, ()
         fixed = structure_of(obj)
         settled = obj.__settled_key__
-        return values, (fixed, divisions, settled, settled or exact_key(fixed), cls.__behaviour__)
+        return values, (
+            fixed,
+            divisions,
+            settled,
+            settled or exact_key(fixed),
+            getattr(cls, _BEHAVIOUR),
+        )
 
     def unflatten(aux, values):
         obj = object.__new__(cls)

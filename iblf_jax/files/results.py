@@ -514,7 +514,7 @@ class _Reader:
     def member(self, node: dict[str, Any], key: str) -> Any:
         """An object of a class in a table of members."""
         name = checks.string(key, node["member"], "the name of a class")
-        known = {}
+        known: dict[str, type] = {}
         for family in components.FAMILIES.values():
             known |= {f"{family.module}.{x}": cls for x, cls in family.members.items()}
         if name not in known:

@@ -395,7 +395,7 @@ def _parameters(run: Rollout, batch: tuple[str, ...]) -> tuple[dict[str, Any], d
         else:
             dims = (*batch, *dimension_names(p.path, first.shape, run.n))
             varying[p.path] = (dims, value, _attrs(p.unit or "1", f"parameter {p.path}"))
-    attrs = {
+    attrs: dict[str, Any] = {
         "parameters": json.dumps(fixed),
         "method": run.method,
         "metrics": json.dumps({"names": list(run.metrics), "units": run.metrics.unit_pairs}),
@@ -447,7 +447,7 @@ def _read_netcdf(path: str | os.PathLike) -> dict[str, xarray.Dataset]:
         prefix = f"{name}."
         one = merged[[label for label in merged.variables if str(label).startswith(prefix)]]
         labels = {label: str(label).removeprefix(prefix) for label in (*one.variables, *one.dims)}
-        attrs = {
+        attrs: dict[str, Any] = {
             key.removeprefix(prefix): value
             for key, value in merged.attrs.items()
             if key.startswith(prefix)
@@ -494,7 +494,9 @@ def _write_npz(path: str | os.PathLike, data: dict[str, xarray.Dataset]) -> None
         variables = {}
         for label, variable in one.variables.items():
             arrays[f"{name}.{label}"] = np.asarray(variable.values)
-            attrs = {key: np.asarray(x).tolist() for key, x in variable.attrs.items()}
+            attrs: dict[str, Any] = {
+                key: np.asarray(x).tolist() for key, x in variable.attrs.items()
+            }
             variables[str(label)] = [list(variable.dims), attrs]
         coordinates = [str(label) for label in one.coords]
         described[name] = {"variables": variables, "coords": coordinates, "attrs": dict(one.attrs)}
