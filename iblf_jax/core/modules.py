@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.core.exact_keys import exact_key
 from iblf_jax.core.optional import has_members
 
 NUMBERS = (jax.Array, np.ndarray, np.generic, float, int)
@@ -57,17 +58,14 @@ class ConstantArray(NamedTuple):
 
 @jax.tree_util.register_pytree_node_class
 class Structure:
-    """A pytree without leaves that holds one hashable value.
-
-    The class of the value belongs to the comparison, because 1 == True == 1.0.
-    """
+    """A pytree without leaves that holds one hashable value, compared by its exact key."""
 
     def __init__(self, value: Any) -> None:
         self.value = value
 
     def tree_flatten(self) -> tuple[tuple, Any]:
-        """No leaves, and the value with its class."""
-        return (), (type(self.value), self.value)
+        """No leaves, and the value with its key."""
+        return (), (exact_key(self.value), self.value)
 
     @classmethod
     def tree_unflatten(cls, aux: Any, children: Any) -> Structure:

@@ -165,9 +165,6 @@ def register_component(cls: type[T]) -> type[T]:
     children_of, structure_of = _getter(children), _getter(structure)
     keys = tuple(map(jax.tree_util.GetAttrKey, children))
 
-    behaviour = behaviour_of(cls)
-    has_key = bool(structure) or behaviour is not None
-
     def flatten_with_keys(obj):
         values, aux = flatten(obj)
         return tuple(zip(keys, values, strict=True)), aux
@@ -212,7 +209,9 @@ def register_component(cls: type[T]) -> type[T]:
     setattr(cls, _REGISTERED, True)
     setattr(cls, _DIVISIONS, ())
     setattr(cls, _SETTLED_KEY, None)
+    behaviour = behaviour_of(cls)
     setattr(cls, _BEHAVIOUR, behaviour)
+    has_key = bool(structure) or behaviour is not None
     return cls
 
 
