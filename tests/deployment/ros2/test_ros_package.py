@@ -455,7 +455,7 @@ def rendered_rows(text):
 def test_hostile_names_of_joints_and_links_stay_text(case, named, tmp_path):
     joints = HOSTILE[case]
     # A link's name is a part of a path, in which brackets have a meaning.
-    links = tuple(re.sub(r"[\[\],]", "", x) for x in joints)
+    links = tuple("link" + re.sub(r"[\[\],]", "", x) for x in joints)
     scenario = named_scenario(joints, links)
     programs, recorded = named
     law = Law(scenario, programs, "hostile_law", False, recorded, joints, None)
@@ -515,12 +515,12 @@ def test_names_that_are_not_printable_are_refused(name):
     ) as error:
         ros_options(named_scenario(("a", name)), None, 50.0, "zero")
     assert repr(name)[:20] in str(error.value)
-    gains = [ij.tunable(f"model.link[{name}].mass", 1.0, 4.0)]
+    gains = [ij.tunable(f"model.link[link{name}].mass", 1.0, 4.0)]
     with pytest.raises(
         ValueError,
         match=r"gains: got .*expected at most 500 characters.*printable.*Rename the link",
     ):
-        ros_options(named_scenario(("a", "b"), ("c", name)), gains, 50.0, "zero")
+        ros_options(named_scenario(("a", "b"), ("c", f"link{name}")), gains, 50.0, "zero")
 
 
 @pytest.mark.slow
