@@ -259,7 +259,8 @@ class Tube(NamedTuple):
 
 NARROWEST = 1e-6
 """Least distance of a feasible reference to its bounds [rad].  Smaller widths are replaced by it,
-so that a run with an infeasible reference gives large numbers and a status flag instead of NaN."""
+so that a run with an infeasible reference gives large numbers and a status flag instead of NaN.
+Rounding decides their derivatives: a compiled one and that of single operations may differ."""
 
 
 def positive_width(k: jax.Array) -> jax.Array:

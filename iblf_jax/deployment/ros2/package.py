@@ -8,11 +8,13 @@ import json
 import keyword
 import math
 import re
+import shlex
 import sys
 from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
+from xml.sax.saxutils import escape
 
 import jax
 import jax.numpy as jnp
@@ -21,11 +23,18 @@ import numpy as np
 from iblf_jax import __version__
 from iblf_jax.core import checks, notices
 from iblf_jax.deployment.build import write_files
-from iblf_jax.deployment.c_names import Parameters
+from iblf_jax.deployment.c_names import Parameters, comment
 from iblf_jax.deployment.control_law import bounds_at, inputs_at_start
+from iblf_jax.deployment.ros2.escaped_text import (
+    check_printable,
+    markdown_code,
+    yaml_name,
+    yaml_names,
+    yaml_number,
+    yaml_numbers,
+)
 from iblf_jax.deployment.ros2.node.supervisor import ARRIVAL_TIMEOUT, STALE_PERIODS
 from iblf_jax.deployment.ros2.ros2_control import controller_package, ros2_control_files
-from iblf_jax.deployment.ros2.yaml_text import yaml_number, yaml_numbers
 from iblf_jax.deployment.write_c import (
     CHECK_INTERVAL,
     GeneratedLaw,
@@ -108,6 +117,8 @@ def ros_options(scenario: Scenario, gains: Any, torque_limits: Any, on_fault: st
         expected = "a robot, whose state is q and q'"
         remedy = "sensor_msgs/JointState has no further levels; export to C instead."
         raise checks.fail("scenario.model", type(scenario.model).__name__, expected, remedy)
+    remedy = "Rename the joint in the robot's file, and in its driver."
+    check_printable("joints", plants.declared_joints(scenario.model), remedy)
     limits = _torque_limits(scenario, torque_limits)
     return RosOptions(_gains(scenario, gains), limits, on_fault)
 
@@ -148,6 +159,7 @@ def _gains(scenario: Scenario, given: Any) -> tuple[GainOption, ...]:
     entries = checks.nonempty_list("gains", given, example)
     tunables = [as_tunable(f"gains[{i}]", entry) for i, entry in enumerate(entries)]
     check_paths(scenario, [x.path for x in tunables], "gains")
+    check_printable("gains", [x.path for x in tunables], "Rename the link in the robot's file.")
     if any(x.path == PERIOD for x in tunables):
         expected = "leaves of law, observer or model"
         remedy = "The period of a node is fixed: export once for each period."
@@ -286,7 +298,8 @@ def _gain_lines(options: RosOptions) -> str:
         text = _yaml_value(gain)
         low, high = gain.low.reshape(-1).tolist(), gain.high.reshape(-1).tolist()
         limits = f"{yaml_numbers(low)} to {yaml_numbers(high)}"
-        lines.append(f"    {json.dumps(gain.path)}: {text}  # [{gain.unit}], from {limits}")
+        unit = comment(gain.unit)
+        lines.append(f"    {yaml_name(gain.path)}: {text}  # [{unit}], from {limits}")
     return "\n".join(lines) or "    # This law was exported without gains that can be changed."
 
 
@@ -308,7 +321,7 @@ def ros_files(law: Law, generated: GeneratedLaw, options: RosOptions) -> dict[st
         "name": name,
         "title": title_of(law.scenario),
         "version": __version__,
-        "joints": json.dumps(description["joints"]),
+        "joints": yaml_names(description["joints"]),
         "period": yaml_number(description["period"]),
         "state_timeout": yaml_number(STALE_PERIODS * description["period"]),
         "arrival_timeout": yaml_number(ARRIVAL_TIMEOUT),
@@ -325,7 +338,9 @@ def ros_files(law: Law, generated: GeneratedLaw, options: RosOptions) -> dict[st
         "start_table": _start_table(law, description["joints"]),
     }
     texts = {
-        "package.xml": fill_template("package.xml", values, TEMPLATES),
+        "package.xml": fill_template(
+            "package.xml", values | {"title": escape(values["title"])}, TEMPLATES
+        ),
         "setup.py": fill_template("setup.py.txt", values, TEMPLATES),
         "setup.cfg": fill_template("setup.cfg", values, TEMPLATES),
         "README.md": fill_template("README.md", values, TEMPLATES),
@@ -357,7 +372,7 @@ def _set_gain_note(name: str, options: RosOptions) -> str:
     return (
         "The gains among them can be changed while the node runs, within their ranges there; the"
         " torque makes a step. Simulate the ends of the ranges with the delay of your loop.\n\n"
-        f"    ros2 param set /{name} {gain.path} {json.dumps(_yaml_value(gain))}"
+        f"    ros2 param set /{name} {shlex.quote(gain.path)} {json.dumps(_yaml_value(gain))}"
     )
 
 
@@ -384,7 +399,10 @@ def _start_table(law: Law, joints: Sequence[str]) -> str:
     lower, upper = bounds_at(scenario, inputs)
     rows = zip(joints, scenario.reference.position(inputs.t), lower, upper, strict=True)
     lines = ["| joint | reference [rad] | bounds [rad] |", "|---|---|---|"]
-    lines += [f"| `{name}` | {q:.4g} | {low:.4g} to {high:.4g} |" for name, q, low, high in rows]
+    lines += [
+        f"| {markdown_code(name)} | {q:.4g} | {low:.4g} to {high:.4g} |"
+        for name, q, low, high in rows
+    ]
     return "\n".join(f"  {line}" for line in lines)
 
 

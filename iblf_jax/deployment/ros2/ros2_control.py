@@ -4,7 +4,6 @@ exported C law.
 
 from __future__ import annotations
 
-import json
 import string
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -12,7 +11,13 @@ from xml.sax.saxutils import escape
 
 from iblf_jax import __version__
 from iblf_jax.core import notices
-from iblf_jax.deployment.ros2.yaml_text import yaml_numbers
+from iblf_jax.deployment.c_names import comment
+from iblf_jax.deployment.ros2.escaped_text import (
+    markdown_code,
+    yaml_name,
+    yaml_names,
+    yaml_numbers,
+)
 from iblf_jax.deployment.write_c import GeneratedLaw, Law, fill_template, title_of
 
 RATE_TOLERANCE = 1e-9
@@ -94,8 +99,8 @@ def _values(
         "period": repr(period),
         "period_ns": round(period * 1e9),
         "rate": rate,
-        "joints": json.dumps(list(joints)),
-        "joint_list": ", ".join(f"`{json.dumps(x)[1:-1]}`" for x in joints),
+        "joints": yaml_names(joints),
+        "joint_list": ", ".join(map(markdown_code, joints)),
         "state_interfaces": " and ".join(states),
         "on_fault": description["on_fault"],
         "reads_velocity": _cpp_bool(description["reads_velocity"]),
@@ -141,7 +146,7 @@ def _gain_names(gains: Sequence[Mapping[str, Any]]) -> str:
     """The sentence of the README about the gains."""
     if not gains:
         return "the law was exported without gains that can be changed."
-    names = ", ".join(f"`{gain['path']}`" for gain in gains)
+    names = ", ".join(markdown_code(gain["path"]) for gain in gains)
     return f"the gains {names} within the exported ranges."
 
 
@@ -152,5 +157,6 @@ def _gain_lines(generated: GeneratedLaw, gains: Sequence[Mapping[str, Any]]) -> 
     for gain in gains:
         values = yaml_numbers(numbers[places[0]] for places in gain["offsets"])
         limits = f"{yaml_numbers(gain['low'])} to {yaml_numbers(gain['high'])}"
-        lines.append(f"    {json.dumps(gain['path'])}: {values}  # [{gain['unit']}], from {limits}")
+        unit = comment(gain["unit"])
+        lines.append(f"    {yaml_name(gain['path'])}: {values}  # [{unit}], from {limits}")
     return "\n".join(lines) or "    # The law was exported without gains that can be changed."

@@ -4,7 +4,11 @@ refuses."""
 from __future__ import annotations
 
 import ast
+import dataclasses
+import itertools
 import json
+import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -21,7 +25,8 @@ import yaml
 from conftest import ROOT
 
 import iblf_jax as ij
-from iblf_jax.deployment.control_law import bounds_at, inputs_at_start
+from iblf_jax.deployment.control_law import bounds_at, control_law, inputs_at_start
+from iblf_jax.deployment.export import vectors
 from iblf_jax.deployment.ros2.node.c_law import (
     FLAGS,
     NOT_FINITE,
@@ -29,7 +34,8 @@ from iblf_jax.deployment.ros2.node.c_law import (
     load_law,
     read_description,
 )
-from iblf_jax.deployment.ros2.package import ros_options
+from iblf_jax.deployment.ros2.package import ros_options, write_package
+from iblf_jax.deployment.write_c import Law, generate
 from iblf_jax.simulation.scenario import canonical
 
 setuptools = pytest.importorskip("setuptools", reason="setuptools builds a package")
@@ -385,6 +391,136 @@ def test_ranges_without_limits_are_those_of_tune_and_not_simulated(package):
         ros_options(
             canonical(package.scenario), [ij.tunable("controller.K2", 1.0, 4.0)], 100.0, "zero"
         )
+
+
+# --- names from a robot's file --------------------------------------------------------------------
+
+HOSTILE = {
+    "quotes and backslashes": ("a\"b'c\\", '\\"""\\n'),
+    "comments of C": ("*/ int x; /*", "// ??/ ??' \\"),
+    "templates of Python and shells": ("${name}$(touch x)`touch y`", "{{a}}{% b %} %s {0}"),
+    "YAML": ("a: b # c", "!!python/object/apply:os.system ['x']"),
+    "more YAML": ("[1, 2", "- &a *b |"),
+    "numbers and words of YAML": ("1e3", "null"),
+    "tables and marks of Markdown": ("a | b \\| c", "**`` <b> ](x) &amp; $"),
+    "spaces at the ends": (" a ", " "),
+    "beyond ASCII": ("épaule_关节", "joint 😀 \U0002070e"),
+    "the same as names of C": ("a-b", "a_b"),
+    "long": ("x" * 450, "y|" * 225),
+}
+
+
+def named_scenario(joints, links=("upper", "lower")):
+    """An arm of two joints with names."""
+    arm = ij.robots.Arm(
+        mass=[2.0, 1.0],
+        centre=[[0.0, 0.0, 0.1]] * 2,
+        inertia=[[0.02, 0.02, 0.02, 0.0, 0.0, 0.0]] * 2,
+        position=[[0.0, 0.0, 0.3], [0.4, 0.0, 0.0]],
+        axis=[0.0, 1.0, 0.0],
+        joints=joints,
+        links=links,
+    )
+    parts = {"observer": ij.observers.NoObserver(), "sampling": ij.Sampling(ros_package.PERIOD)}
+    scenario = ij.with_parts(plain(), controller=ij.controllers.PDGravity(Kp=5.0, Kd=1.0), **parts)
+    return canonical(dataclasses.replace(scenario, plant=arm, model=arm))
+
+
+@pytest.fixture(scope="module")
+def named():
+    """The law of the arm with names; its program does not depend on them."""
+    scenario = named_scenario(("a", "b"))
+    return control_law(scenario, False), vectors(scenario, False)
+
+
+def rendered_rows(text):
+    """The texts of the cells of the tables in a Markdown page, row by row."""
+    markdown = pytest.importorskip("markdown_it").MarkdownIt("commonmark")
+    tokens = markdown.enable("table").parse(text)
+    rows = [[]]
+    for before, token in itertools.pairwise(tokens):
+        if token.type == "tr_open":
+            rows.append([])
+        if before.type in ("td_open", "th_open"):
+            assert {x.type for x in token.children} <= {"text", "code_inline", "html_inline"}
+            tags = [x.content for x in token.children if x.type == "html_inline"]
+            assert tags == ["<code>", "</code>"] * (len(tags) // 2)
+            plain = [x.content for x in token.children if x.type != "html_inline"]
+            rows[-1].append("".join(plain))
+    return rows
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", HOSTILE)
+def test_hostile_names_of_joints_and_links_stay_text(case, named, tmp_path):
+    joints = HOSTILE[case]
+    # A link's name is a part of a path, in which brackets have a meaning.
+    links = tuple("link" + re.sub(r"[\[\],]", "", x) for x in joints)
+    scenario = named_scenario(joints, links)
+    programs, recorded = named
+    law = Law(scenario, programs, "hostile_law", False, recorded, joints, None)
+    path = f"model.link[{links[0]}].mass"
+    options = ros_options(scenario, [ij.tunable(path, 1.0, 4.0)], 50.0, "zero")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        files = write_package(law, generate(law), options, tmp_path)
+    controller = tmp_path / "hostile_law_controller"
+    configuration = (tmp_path / "config" / "hostile_law.yaml").read_text(encoding="utf-8")
+    values = yaml.safe_load(configuration)["/**"]["ros__parameters"]
+    assert values["joints"] == list(joints)
+    assert values[path] == 2.0
+    text = (controller / "config" / "controllers.yaml").read_text(encoding="utf-8")
+    values = yaml.safe_load(text)["hostile_law_controller"]["ros__parameters"]
+    assert values["joints"] == list(joints)
+    assert values[path] == [2.0]
+    assert read_description(tmp_path / "hostile_law" / "law.json").joints == joints
+    for file in files:
+        if file.endswith(".py"):
+            compile((tmp_path / file).read_text(encoding="utf-8"), file, "exec")
+        if file.endswith(".xml"):
+            xml.etree.ElementTree.parse(tmp_path / file)
+    readme = (tmp_path / "README.md").read_text(encoding="utf-8")
+    rows = rendered_rows(readme)
+    assert [row[0] for row in rows[-2:]] == list(joints)
+    assert [len(row) for row in rows[-2:]] == [3, 3]
+    (row,) = [
+        x
+        for x in rendered_rows((controller / "README.md").read_text(encoding="utf-8"))
+        if x[:1] == ["commands"]
+    ]
+    assert row[1] == f"effort of {', '.join(joints)}"
+    (command,) = [x for x in readme.splitlines() if x.startswith("    ros2 param set")]
+    assert shlex.split(command)[3:] == ["/hostile_law", path, "2.0"]
+    flags = ["-Wall", "-Wextra", "-Wpedantic", "-Werror", "-fsyntax-only", "-trigraphs"]
+    include = [
+        "-I",
+        controller / "include" / "hostile_law_controller",
+        "-I",
+        controller / "include",
+    ]
+    include += ["-isystem", ROOT / "tests" / "deployment" / "ros2" / "stubs"]
+    sources = sorted((tmp_path / "c").glob("*.c"))
+    subprocess.run(["cc", "-std=c99", *flags, "-Wno-trigraphs", *sources], check=True)
+    source = controller / "src" / "law_controller.cpp"
+    subprocess.run(["c++", "-std=c++17", *flags, *include, source], check=True)
+
+
+@pytest.mark.parametrize(
+    "name", ["a\nb", "a\tb", "a\0", "\x7f", "a\u2028b", "\ud83d", "a\u202eb", "x" * 501]
+)
+def test_names_that_are_not_printable_are_refused(name):
+    with pytest.raises(
+        ValueError,
+        match=r"joints: got .*expected at most 500 characters.*printable.*Rename the joint",
+    ) as error:
+        ros_options(named_scenario(("a", name)), None, 50.0, "zero")
+    assert repr(name)[:20] in str(error.value)
+    gains = [ij.tunable(f"model.link[link{name}].mass", 1.0, 4.0)]
+    with pytest.raises(
+        ValueError,
+        match=r"gains: got .*expected at most 500 characters.*printable.*Rename the link",
+    ):
+        ros_options(named_scenario(("a", "b"), ("c", f"link{name}")), gains, 50.0, "zero")
 
 
 @pytest.mark.slow
