@@ -6,7 +6,7 @@ lab = ij.with_parts(
     ij.with_parameters(ij.presets.zhang_yan_2024(), {"controller.K2": 4.0, "observer.kf": 4.0}),
     sampling=ij.Sampling(period=4e-3, delay=5e-4),
     sensor=ij.sensors.Encoder(
-        counts=2.0**14, noise=1e-5, velocity=ij.sensors.FilteredDifference(cutoff=500.0)
+        counts=2.0**16, noise=1e-5, velocity=ij.sensors.FilteredDifference(cutoff=500.0)
     ),
     actuator=ij.actuators.Motor(bandwidth=1000.0, rate_limit=5000.0),
 )
