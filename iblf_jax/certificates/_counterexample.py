@@ -25,10 +25,9 @@ nothing is claimed (the guard or a torque limit is active), are no counterexampl
 
 from __future__ import annotations
 
-import os
+import dataclasses
 from collections.abc import Mapping
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -41,7 +40,7 @@ from iblf_jax.certificates.level_terms import is_about_levels, level_terms_at
 from iblf_jax.certificates.proof_terms import terms_at
 from iblf_jax.control.controllers import Backstepping
 from iblf_jax.core import checks
-from iblf_jax.core.presentation import present
+from iblf_jax.core.presentation import Result
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.simulation.closed_loop import initial_state
 from iblf_jax.simulation.paths import with_parameters
@@ -52,7 +51,8 @@ from iblf_jax.studies.perturbation_cube import unit_cube
 EXCLUDED = "The guard or a torque limit is active at the start, where nothing is claimed."
 
 
-class Counterexample(NamedTuple):
+@dataclasses.dataclass(frozen=True, eq=False)
+class Counterexample(Result):
     """The largest growth that `counterexample` found."""
 
     scenario: Scenario
@@ -61,10 +61,6 @@ class Counterexample(NamedTuple):
     growth: float
     """The largest g that was found; at most -1 where the proof is exact, positive where V2 grows
     against the claim."""
-
-    def save(self, path: str | os.PathLike) -> Path:
-        """As `Result.save`: a result that is a tuple cannot have it as a base class."""
-        return present("result file", self, path)
 
 
 def _growth(scenario: Scenario) -> tuple[jax.Array, jax.Array]:

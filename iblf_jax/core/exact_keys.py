@@ -6,20 +6,25 @@ changed.  `exact_key` returns a hashable value that differs where two values can
 
 A key holds of
 
-- a number, a string, a tuple: its type and its value, zeros with their sign;
+- a number, a string, a tuple, a frozenset, a frozen dataclass: its type and its value, zeros with
+  their sign;
 - a function: its code, its default values, the values that it captures, and the global variables
-  that it names; functions of the same module are followed, those of installed packages are not;
+  that it names; functions of the same module are followed, and what functions of installed packages
+  wrap, such as that of `jax.vmap`;
 - an array of NumPy: type, shape and content;
 - everything else: its identity, with a reference, so that no other object gets the same address.
 
 Not detected, as in `jax.jit`: what changes inside a list, a dict or an object that a function
-captures, attributes of modules, and methods of this package that a user replaces.
+captures, attributes of modules and of functions, functions of other modules of the user, modules of
+other libraries in fields of components, and methods of this package that a user replaces.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
+import site
+import sysconfig
 import types
 from collections.abc import Hashable, Iterator
 from typing import Any
@@ -28,8 +33,23 @@ import jax
 import numpy as np
 
 CUSTOM_RULES = (jax.custom_jvp, jax.custom_vjp)
-PLAIN_TYPES = (int, bool, str, bytes, types.NoneType)
-"""Types whose values are equal only if they are the same to a program, given their type."""
+PLAIN_TYPES = (int, str, bytes, types.NoneType, np.dtype)
+"""Types whose values are equal only if they are the same to a program, given their class."""
+NOT_BEHAVIOUR = {
+    *("__module__", "__qualname__", "__doc__", "__dict__", "__weakref__", "__annotations__"),
+    *("__firstlineno__", "__static_attributes__"),
+    # of dataclasses
+    *("__dataclass_fields__", "__dataclass_params__", "__match_args__", "__init__", "__repr__"),
+    *("__setattr__", "__delattr__", "__replace__"),
+    # of components
+    *("__behaviour__", "__settled_key__"),
+}
+"""Attributes of a class that no program depends on."""
+INSTALLED = (
+    *(sysconfig.get_path(name) for name in ("purelib", "platlib", "stdlib")),
+    site.getusersitepackages(),
+)
+"""Folders of installed packages, whose code a process does not change."""
 
 
 class Identity:
@@ -49,42 +69,68 @@ class Identity:
 
 def exact_key(value: Any) -> Hashable:
     """The key of a static value (head of this module)."""
-    return _key(value, None, ())
+    return _Keys().of(value, None)
 
 
-def _key(value: Any, module: str | None, inside: tuple[int, ...]) -> Hashable:
-    """The key of a value.
+class _Keys:
+    """The keys of one value and of what it consists of; each function is described once."""
 
-    Args:
-      value: what is described.
-      module: the module whose functions are followed; None for any.
-      inside: identities of the functions whose description contains this one.
-    """
-    kind = type(value)
-    if kind in PLAIN_TYPES:
-        return kind, value
-    if kind is float:
-        return kind, value.hex()
-    if isinstance(value, np.ndarray | np.generic) and not value.dtype.hasobject:
-        return kind, value.dtype.str, value.shape, value.tobytes()
-    if isinstance(value, tuple):
-        return kind, tuple([_key(x, module, inside) for x in value])
-    if isinstance(value, types.FunctionType):
-        return _key_of_function(value, module, inside)
-    if isinstance(value, types.MethodType):
-        return kind, Identity(value.__self__), _key(value.__func__, module, inside)
-    if isinstance(value, functools.partial):
-        parts = (value.func, value.args, tuple(sorted(value.keywords.items())))
-        return kind, _key(parts, module, inside)
-    if isinstance(value, CUSTOM_RULES):
-        rules = [x for x in vars(value).values() if isinstance(x, types.FunctionType)]
-        return Identity(value), _key(tuple(rules), module, inside)
-    if isinstance(value, type) or not _has_value(value):
+    def __init__(self) -> None:
+        self._described: dict[types.FunctionType, int] = {}
+
+    def of(self, value: Any, module: str | None) -> Hashable:
+        """The key of a value.
+
+        Args:
+          value: what is described.
+          module: the module whose functions are followed; None for any.
+        """
+        kind = type(value)
+        if isinstance(value, PLAIN_TYPES):
+            return kind, value
+        if isinstance(value, float):
+            return kind, value.hex()
+        if isinstance(value, complex):
+            return kind, value.real.hex(), value.imag.hex()
+        if isinstance(value, np.ndarray | np.generic) and not value.dtype.hasobject:
+            return kind, value.dtype, value.shape, value.tobytes()
+        if isinstance(value, tuple):
+            return kind, tuple([self.of(x, module) for x in value])
+        if isinstance(value, frozenset):
+            return kind, frozenset([self.of(x, module) for x in value])
+        if isinstance(value, types.FunctionType):
+            return self._of_function(value, module)
+        if isinstance(value, types.MethodType):
+            return kind, Identity(value.__self__), self.of(value.__func__, module)
+        if isinstance(value, functools.partial):
+            keywords = tuple(sorted(value.keywords.items()))
+            return kind, self.of((value.func, value.args, keywords), module)
+        if isinstance(value, CUSTOM_RULES):
+            rules = [x for x in vars(value).values() if callable(x)]
+            return Identity(value), self.of(tuple(rules), module)
+        if dataclasses.is_dataclass(value) and not isinstance(value, type) and _is_value(kind):
+            fields = [getattr(value, field.name) for field in dataclasses.fields(value)]
+            return kind, self.of(tuple(fields), module)
         return Identity(value)
-    if dataclasses.is_dataclass(value):
-        fields = [getattr(value, field.name) for field in dataclasses.fields(value)]
-        return kind, _key(tuple(fields), module, inside)
-    return kind, value
+
+    def _of_function(self, function: types.FunctionType, module: str | None) -> Hashable:
+        """The key of a function of Python."""
+        if function in self._described:
+            return self._described[function]  # a function that is described already, by its number
+        self._described[function] = len(self._described)
+        home = function.__globals__.get("__name__", "")
+        if _is_installed(function):
+            inside = (*map(_content, function.__closure__ or ()), _wrapped_by(function))
+            return Identity(function), self.of(tuple(filter(_is_of_a_user, inside)), module)
+        if module not in (None, home):
+            return Identity(function)
+        parts = (
+            function.__defaults__,
+            tuple(sorted((function.__kwdefaults__ or {}).items())),
+            tuple([_content(cell) for cell in function.__closure__ or ()]),
+            tuple(_globals_of(function)),
+        )
+        return Identity(function), function.__code__, self.of(parts, home)
 
 
 def is_settled(value: Any) -> bool:
@@ -96,37 +142,32 @@ def is_settled(value: Any) -> bool:
     return isinstance(value, (*PLAIN_TYPES, float, type))
 
 
-def _has_value(value: Any) -> bool:
-    """Whether an object is hashable and compared by more than its identity."""
-    kind = type(value)
-    return kind.__hash__ not in (None, object.__hash__) and kind.__eq__ is not object.__eq__
-
-
-def _key_of_function(
-    function: types.FunctionType, module: str | None, inside: tuple[int, ...]
-) -> Hashable:
-    """The key of a function of Python."""
-    home = function.__module__ or ""
-    is_foreign = module not in (None, home) or is_of_a_library(home)
-    if is_foreign or id(function) in inside or _is_installed(function):
-        return Identity(function)
-    within = (*inside, id(function))
-    defaults = (function.__defaults__, tuple(sorted((function.__kwdefaults__ or {}).items())))
-    captured = tuple([_cell(cell) for cell in function.__closure__ or ()])
-    read = tuple(_globals_of(function))
-    return (
-        Identity(function),
-        function.__code__,
-        *[_key(part, home, within) for part in (defaults, captured, read)],
-    )
+def _is_value(cls: type) -> bool:
+    """Whether two objects of a class can be equal, and be keys."""
+    return cls.__eq__ is not object.__eq__ and cls.__hash__ is not None
 
 
 def _is_installed(function: types.FunctionType) -> bool:
-    """Whether a function belongs to an installed package, whose code a process does not change."""
-    return "-packages" in function.__code__.co_filename
+    """Whether a function belongs to this package or to an installed one."""
+    home = function.__globals__.get("__name__", "")
+    return is_of_a_library(home) or function.__code__.co_filename.startswith(INSTALLED)
 
 
-def _cell(cell: types.CellType) -> Any:
+def _is_of_a_user(value: Any) -> bool:
+    """Whether a value is a function of a user, wraps one, or is a tuple with one."""
+    if isinstance(value, tuple):
+        return any(map(_is_of_a_user, value))
+    if isinstance(value, types.FunctionType):
+        return not _is_installed(value) or _is_of_a_user(_wrapped_by(value))
+    return isinstance(value, (types.MethodType, functools.partial, *CUSTOM_RULES))
+
+
+def _wrapped_by(function: types.FunctionType) -> Any:
+    """The function that another one wraps (`functools.wraps`); None if it wraps none."""
+    return vars(function).get("__wrapped__")
+
+
+def _content(cell: types.CellType) -> Any:
     """What a cell of a closure holds; the cell itself while it holds nothing."""
     try:
         return cell.cell_contents
@@ -159,21 +200,22 @@ def behaviour_of(cls: type) -> Hashable:
     """The key of the attributes of a user's class and of its bases; None for a class of the
     package.
     """
+    keys = _Keys()
     parts = []
     for base in cls.__mro__:
         if base is object or is_of_a_library(base.__module__):
             continue
         for name, value in vars(base).items():
-            if name.startswith("__") and name != "__call__":
-                continue
-            parts.append((name, exact_key(_function_in(value))))
+            if name not in NOT_BEHAVIOUR:
+                parts.append((name, keys.of(_functions_in(value), None)))
     return tuple(parts) or None
 
 
-def _function_in(attribute: Any) -> Any:
+def _functions_in(attribute: Any) -> Any:
     """The functions of an attribute of a class."""
     if isinstance(attribute, staticmethod | classmethod):
         return attribute.__func__
     if isinstance(attribute, property):
-        return attribute.fget
-    return attribute
+        return attribute.fget, attribute.fset
+    # A property that keeps its value, or a method with some of its arguments.
+    return getattr(attribute, "func", attribute)

@@ -27,8 +27,7 @@ from iblf_jax.engine.loops import kernel_loop, scan
 from iblf_jax.engine.plan import ExecutionPlan
 from iblf_jax.engine.registry import Executor
 from iblf_jax.engine.request import RunRequest
-from iblf_jax.kernels import UnsupportedError
-from iblf_jax.kernels.primitives import is_zero, new_primitive, without_symbol
+from iblf_jax.kernels import UnsupportedError, is_zero, new_primitive, without_symbol
 
 
 class Runs(NamedTuple):

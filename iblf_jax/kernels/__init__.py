@@ -71,6 +71,7 @@ from iblf_jax.kernels.cpu import c_source as c_source
 from iblf_jax.kernels.drafts import draft as draft
 from iblf_jax.kernels.emit_c import header as header
 from iblf_jax.kernels.emit_c import plain_function as plain_function
+from iblf_jax.kernels.enclosure import ENCLOSURE_FLAGS as ENCLOSURE_FLAGS
 from iblf_jax.kernels.enclosure import IntervalKernel as IntervalKernel
 from iblf_jax.kernels.enclosure import enclose as enclose
 from iblf_jax.kernels.enclosure import interval_kernel as interval_kernel
@@ -94,6 +95,9 @@ from iblf_jax.kernels.packed import pack as pack
 from iblf_jax.kernels.packed import unpack as unpack
 from iblf_jax.kernels.packed import unpacked_records as unpacked_records
 from iblf_jax.kernels.passes import written_out as written_out
+from iblf_jax.kernels.primitives import is_zero as is_zero
+from iblf_jax.kernels.primitives import new_primitive as new_primitive
+from iblf_jax.kernels.primitives import without_symbol as without_symbol
 from iblf_jax.kernels.program import INPUTS as INPUTS
 from iblf_jax.kernels.program import PER_RUN as PER_RUN
 from iblf_jax.kernels.program import SHARED as SHARED

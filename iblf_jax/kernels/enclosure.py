@@ -34,7 +34,7 @@ from iblf_jax.kernels.program import (
 )
 from iblf_jax.kernels.toolchain import ToolchainError, built, loaded
 
-FLAGS = ("-frounding-math",)
+ENCLOSURE_FLAGS = ("-frounding-math",)
 """Flags of the compiler, after those of all kernels. A product and a sum that become one operation
 are rounded once, which is upward, too."""
 FUNCTIONS = frozenset(
@@ -415,7 +415,7 @@ def library(source: str) -> ctypes.CDLL:
     Raises:
       ToolchainError: there is no compiler, it fails, or it does not honour the rounding mode.
     """
-    path, _ = built(source, FLAGS)
+    path, _ = built(source, ENCLOSURE_FLAGS)
     found = loaded(path, "search_box", "enclose_boxes", "rounded_operations", "vector_size")
     check_rounding(found)
     return found

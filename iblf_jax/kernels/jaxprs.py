@@ -88,6 +88,21 @@ def depend_on_last(function: Any, count: int) -> list[bool]:
     return [is_variable(x) and x in found for x in jaxpr.outvars]
 
 
+def entry_of_stack(function: Any, index: int) -> Any:
+    """A Python function that returns one entry of the array that a traced function stacks along its
+    first axis at its end, without the computation of the others; None if it does not do so.
+    """
+    jaxpr, _ = opened(function)
+    if not jaxpr.eqns or jaxpr.eqns[-1].outvars != jaxpr.outvars:
+        return None
+    last = jaxpr.eqns[-1]
+    if last.primitive.name != "stack" or last.params["axis"] != 0:
+        return None
+    one = jaxpr.replace(eqns=jaxpr.eqns[:-1], outvars=[last.invars[index]])
+    evaluate = core.jaxpr_as_fun(function.replace(jaxpr=one))
+    return lambda *operands: evaluate(*operands)[0]
+
+
 def nested(function: Any) -> Iterator[tuple[Any, Sequence[Any]]]:
     """A function and all functions inside it, as `opened`, each time that one occurs."""
     jaxpr, constants = opened(function)

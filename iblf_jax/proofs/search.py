@@ -25,8 +25,13 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.core.progress import bar
-from iblf_jax.kernels import IntervalKernel, ToolchainError, interval_kernel, pointer
-from iblf_jax.kernels.enclosure import FLAGS
+from iblf_jax.kernels import (
+    ENCLOSURE_FLAGS,
+    IntervalKernel,
+    ToolchainError,
+    interval_kernel,
+    pointer,
+)
 
 STATUSES = ("proved", "undecided", "refuted", "out of boxes", "stopped", "out of memory")
 """How the search of a unit ended, in the order of `kernels/c/boxes.h`."""
@@ -122,7 +127,15 @@ class _Problem:
 
         Each part has its length in front of it, so that no two problems have the same bytes.
         """
-        options = (FORMAT, UNITS, RENEWAL, NARROWEST, MAX_UNDECIDED, FLAGS, np.shape(units))
+        options = (
+            FORMAT,
+            UNITS,
+            RENEWAL,
+            NARROWEST,
+            MAX_UNDECIDED,
+            ENCLOSURE_FLAGS,
+            np.shape(units),
+        )
         arrays = (self.kernel.numbers, self.lower, self.upper, self.smallest, units)
         parts = [repr(options).encode(), self.kernel.compiled.source.encode()]
         parts += [np.ascontiguousarray(x).tobytes() for x in arrays]

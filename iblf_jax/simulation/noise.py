@@ -278,7 +278,7 @@ def least_distances(
 
     Source: P. Baldi, Annals of Probability 23 (1995) 1644-1670, for the use of the law of the
       bridge's extreme; M. Broadie, P. Glasserman, S. Kou, Mathematical Finance 7 (1997) 325-349,
-      for the shift of the walls.
+      for the shift of the bounds.
     """
     is_wall = jnp.isfinite(before) & jnp.isfinite(now)
     first, last = (jnp.where(is_wall, x, 1.0) for x in (before, now))

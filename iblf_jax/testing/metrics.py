@@ -12,7 +12,7 @@ import numpy as np
 
 from iblf_jax.engine import folded
 from iblf_jax.simulation.metrics import Fold
-from iblf_jax.simulation.signals import Sample
+from iblf_jax.simulation.signals import Sample, has
 from iblf_jax.testing._contract import (
     Findings,
     check_function,
@@ -120,7 +120,8 @@ def samples(rng: np.random.Generator, n: int = 2, step: float = 0.01) -> Sample:
 def parts(samples: Sample) -> tuple[dict[str, jax.Array], dict[str, jax.Array]]:
     """The floating-point signals of a run, and its flags."""
     flags = dict(vars(samples))
-    numbers = {name: flags.pop(name) for name, value in vars(samples).items() if is_float(value)}
+    names = [name for name, x in vars(samples).items() if has(samples, name) and is_float(x)]
+    numbers = {name: flags.pop(name) for name in names}
     return numbers, flags
 
 

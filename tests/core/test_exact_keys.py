@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import pickle
+from decimal import Decimal
 
 import jax
 import jax.numpy as jnp
@@ -11,9 +13,19 @@ import numpy as np
 import pytest
 
 import iblf_jax as ij
-from iblf_jax.core.exact_keys import exact_key
+from iblf_jax.core.exact_keys import behaviour_of, exact_key
 
 FACTOR = 2.0
+Axis = type("Axis", (str,), {"__module__": __name__})
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """A static value of a user."""
+
+    size: float
+
+
 TABLE = np.array([0.0, 1.0])
 
 
@@ -45,20 +57,54 @@ def capturing(value):
         ("1", 1),
         ((), None),
         (functools.partial(max, 1), functools.partial(max, 1.0)),
+        (0j, complex(-0.0, 0.0)),
+        (frozenset({1}), frozenset({1.0})),
+        (Decimal("0"), Decimal("-0")),
+        (Settings(0.0), Settings(-0.0)),
+        (np.zeros(1, jnp.int4), np.zeros(1, jnp.uint4)),
+        (
+            np.zeros((), np.dtype([("a", "i4"), ("b", "i4")])),
+            np.zeros((), np.dtype([("a", "f4"), ("b", "i4")])),
+        ),
     ],
 )
 def test_equal_values_of_two_kinds_have_two_keys(one, other):
     assert exact_key(one) != exact_key(other)
 
 
-@pytest.mark.parametrize("value", [1, 0.0, "a", (1, (2.0, "b")), None, float, np.dtype("int32")])
+@pytest.mark.parametrize(
+    "value", [1, 0.0, "a", (1, (2.0, "b")), None, float, np.dtype("int32"), Axis("x")]
+)
 def test_a_value_has_one_key(value):
     copy = pickle.loads(pickle.dumps(value))
     assert exact_key(value) == exact_key(copy)
     assert hash(exact_key(value)) == hash(exact_key(copy))
 
 
-@pytest.mark.parametrize("function", [from_a_global, of_another_function])
+def as_jax_names_it(x):
+    return FACTOR * x
+
+
+functools.update_wrapper(as_jax_names_it, jnp.sin)
+VECTORISED = jax.vmap(from_a_global)
+SLOPE = jax.grad(of_another_function)
+
+
+def of_a_transformed_function(x):
+    return VECTORISED(x)
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        from_a_global,
+        of_another_function,
+        VECTORISED,
+        SLOPE,
+        of_a_transformed_function,
+        functools.partial(from_a_global, 1.0),
+    ],
+)
 def test_a_global_variable_of_a_function_is_part_of_its_key(function, monkeypatch):
     before = exact_key(function)
     assert exact_key(function) == before
@@ -106,6 +152,27 @@ def test_a_second_rule_of_differentiation_changes_the_key():
         return square(*primals), 3.0 * primals[0] * tangents[0]
 
     assert exact_key(user) != before
+
+
+def test_the_rules_of_defjvps_are_followed():
+    factor = 2.0
+
+    @jax.custom_jvp
+    def double(x):
+        return 2.0 * x
+
+    double.defjvps(lambda t, answer, x: factor * t)
+    before = exact_key(double)
+    factor = 3.0
+    assert exact_key(double) != before
+
+
+def test_each_function_is_described_once():
+    """The number of paths to the first of these functions is that of Fibonacci."""
+    chain = [lambda x: x, lambda x: x]
+    for _ in range(60):
+        chain.append(lambda x, f=chain[-1], g=chain[-2]: f(x) + g(x))
+    assert exact_key(chain[-1]) == exact_key(chain[-1])
 
 
 def test_functions_that_call_each_other_have_a_key():
@@ -173,6 +240,26 @@ def test_a_replaced_method_or_attribute_is_compiled(paper, monkeypatch):
         Own, "torque", lambda self, t, q, dq, plant, model: jnp.full_like(q, self.size)
     )
     assert disturbance_of(paper, part) - first == pytest.approx(0.0)
+
+
+def test_properties_of_a_class_are_part_of_its_behaviour(monkeypatch):
+    class Own:
+        @functools.cached_property
+        def kept(self):
+            return FACTOR
+
+        @property
+        def computed(self):
+            return TABLE[0]
+
+    before = behaviour_of(Own)
+    assert behaviour_of(Own) == before
+    monkeypatch.setitem(globals(), "FACTOR", 9.0)
+    changed = behaviour_of(Own)
+    assert changed != before
+    monkeypatch.setitem(globals(), "TABLE", np.ones(2))
+    assert behaviour_of(Own) != changed
+    assert behaviour_of(type(ij.barriers.Log())) is None
 
 
 def test_a_component_with_functions_is_pickled():

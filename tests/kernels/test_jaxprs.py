@@ -107,6 +107,19 @@ def test_dependences():
     assert y not in found
 
 
+def test_one_entry_of_a_stack():
+    def stacked(x):
+        return jnp.stack([jnp.sin(x) * TABLE, jnp.cos(x) + TABLE])
+
+    traced = jax.make_jaxpr(stacked)(0.3)
+    for index in range(2):
+        entry = jaxprs.entry_of_stack(traced, index)
+        np.testing.assert_array_equal(entry(jnp.asarray(0.3)), stacked(0.3)[index])
+    assert jaxprs.entry_of_stack(jax.make_jaxpr(jnp.sin)(0.3), 0) is None
+    other_axis = jax.make_jaxpr(lambda x: jnp.stack([x, x], axis=1))(jnp.ones(2))
+    assert jaxprs.entry_of_stack(other_axis, 0) is None
+
+
 def test_constants_and_primitives_of_inner_functions():
     def branches(x):
         return jax.lax.cond(x[0] > 0.5, lambda x: jnp.sum(jnp.sin(x)) * 7.5, dotted, x)

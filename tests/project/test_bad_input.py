@@ -540,7 +540,6 @@ GOOD = {
         **({"scenario": WEAK, "perturbations": DRAWN, **SHORT} | x)
     ),
     "tune_file": lambda **x: ij.tune_file(**x),
-    "save_tuning": lambda **x: ij.save_tuning(**({"path": "never.json"} | x)),
     "plotting.identification": lambda **x: ij.plotting.identification(**x),
     "plotting.tuning": lambda **x: ij.plotting.tuning(**x),
     "plotting.paths": lambda **x: ij.plotting.paths(**x),
@@ -593,7 +592,6 @@ REFUSED = {
         )
     },
     "explore scenario": (NO_SCENARIOS, []),
-    "save_tuning result": ((None, 3, "x", WEAK), ["ij.tune"]),
     "plotting.identification known": ((None, 3, WEAK), ["ij.identify"]),
     "plotting.tuning result": ((None, 3, WEAK), ["ij.tune"]),
     "plotting.paths result": ((None, 3, WEAK), ["ij.tune"]),

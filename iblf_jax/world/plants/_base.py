@@ -23,6 +23,7 @@ from iblf_jax.core.linalg import matvec, solve_gain, solve_spd
 from iblf_jax.core.optional import OptionalMembers, has_members
 from iblf_jax.core.status import VELOCITY_LIMIT
 from iblf_jax.core.units import ByLevel, Unit, per_second, product
+from iblf_jax.kernels import jaxprs
 from iblf_jax.world.robots import joint_names
 from iblf_jax.world.robots._base import robot_member
 
@@ -183,8 +184,8 @@ def level_rate(
     own = plant_member(plant, "level_rate")
     if own is not None:
         return own(level, t, x, above, torque)  # type: ignore[no-any-return]
-    gain = plant.gain(t, x)[level - 1]
-    return plant.drift(t, x)[level - 1] + _times(gain, above)
+    gain = _row(plant.gain, t, x, level)
+    return _row(plant.drift, t, x, level) + _times(gain, above)
 
 
 def level_input(
@@ -201,8 +202,8 @@ def level_input(
     own = plant_member(plant, "level_input")
     if own is not None:
         return own(level, t, x, rate, torque)  # type: ignore[no-any-return]
-    gain = plant.gain(t, x)[level - 1]
-    rest = rate - plant.drift(t, x)[level - 1]
+    gain = _row(plant.gain, t, x, level)
+    rest = rate - _row(plant.drift, t, x, level)
     if gain.ndim == 2:
         return solve_gain(gain, rest)
     # NaN, as `solve_gain` gives; a division by 0 would give an infinite input.
@@ -225,7 +226,22 @@ def transposed_gain(
     own = plant_member(plant, "transposed_gain")
     if own is not None:
         return own(level, t, x, s)  # type: ignore[no-any-return]
-    return _times(plant.gain(t, x)[level - 1].T, s)
+    return _times(_row(plant.gain, t, x, level).T, s)
+
+
+def _row(
+    function: Callable[[jax.Array, jax.Array], jax.Array], t: jax.Array, x: jax.Array, level: int
+) -> jax.Array:
+    """One row of drift or gain, without the computation of the others.
+
+    Most plants stack their rows.  The row is taken before it is stacked, so that it depends only on
+    what its own equation contains: a proof admits operations in the last level that it does not
+    admit in the others.
+    """
+    row = jaxprs.entry_of_stack(jax.make_jaxpr(function)(t, x), level - 1)
+    if row is None:
+        return function(t, x)[level - 1]
+    return row(t, x)  # type: ignore[no-any-return]
 
 
 def _times(gain: jax.Array, v: jax.Array) -> jax.Array:
