@@ -23,7 +23,6 @@ from typing import Any, NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import Jaxpr, jaxprs_in_params
 
 from iblf_jax.core import notices
 from iblf_jax.core.caches import CACHE
@@ -36,7 +35,14 @@ from iblf_jax.engine.plan import ExecutionPlan, Sizes, choose_plan
 from iblf_jax.engine.registry import Executor, Machine
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.time_step import TimeStep
-from iblf_jax.kernels import Program, Shapes, ToolchainError, UnsupportedError, stop_compilers
+from iblf_jax.kernels import (
+    Program,
+    Shapes,
+    ToolchainError,
+    UnsupportedError,
+    jaxprs,
+    stop_compilers,
+)
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
 from iblf_jax.simulation.noise import needs_key, realised
 from iblf_jax.simulation.scenario import Scenario
@@ -106,18 +112,7 @@ def operations(inputs: Inputs) -> int:
     """Operations of one evaluation of the closed loop."""
     zero = jnp.zeros_like(inputs.dt)
     arguments = (inputs.scenario, zero, initial_state(inputs.scenario), zero)
-    return count_operations(jax.make_jaxpr(evaluate)(*arguments).jaxpr)
-
-
-def count_operations(jaxpr: Jaxpr) -> int:
-    """Number of operations of a jaxpr, including those of its inner functions."""
-    number = 0
-    for operation in jaxpr.eqns:
-        bodies = list(jaxprs_in_params(operation.params))
-        number += sum(map(count_operations, bodies))
-        if not bodies:
-            number += 1
-    return number
+    return jaxprs.count_executed_operations(jax.make_jaxpr(evaluate)(*arguments))
 
 
 def plan_of_batch(
