@@ -23,9 +23,8 @@ from typing import Any, NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import Jaxpr, jaxprs_in_params
 
-from iblf_jax.core import notices
+from iblf_jax.core import checks, notices
 from iblf_jax.core.caches import CACHE
 from iblf_jax.engine import plan, registry, thresholds
 from iblf_jax.engine.batch import Batch, StepLoop, carry_shapes, linearization_batch
@@ -36,7 +35,15 @@ from iblf_jax.engine.plan import ExecutionPlan, Sizes, choose_plan
 from iblf_jax.engine.registry import Executor, Machine
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.time_step import TimeStep
-from iblf_jax.kernels import Program, Shapes, ToolchainError, UnsupportedError, stop_compilers
+from iblf_jax.kernels import (
+    Program,
+    Shapes,
+    StoppedError,
+    ToolchainError,
+    UnsupportedError,
+    jaxprs,
+    stop_own_compilers,
+)
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
 from iblf_jax.simulation.noise import needs_key, realised
 from iblf_jax.simulation.scenario import Scenario
@@ -66,19 +73,25 @@ def first_that_works(
 ) -> T:
     """The value of `attempt` for the first executor of a plan that works, else that of `by_scan`.
 
+    A compiler that was stopped says nothing about the executor, so that attempt is made once more.
+
     Args:
       execution: the plan.
       attempt: function of an executor; it raises ToolchainError if the executor is not available
-        or a compiled program cannot be loaded (`building`), and UnsupportedError if the executor
-        cannot express the step.
+        or XLA fails (`building`), and UnsupportedError if the executor cannot express the step.
       by_scan: function without arguments.
+
+    Raises:
+      StoppedError: the compiler was stopped twice, as at the end of the process.
     """
     for text in execution.warnings:
         _warn_once(text)
     names = (*execution.backends, "vmap")
     for name, following in itertools.pairwise(names):
         try:
-            return attempt(registry.EXECUTORS[name])
+            return _attempted(attempt, registry.EXECUTORS[name])
+        except StoppedError:
+            raise
         except ToolchainError as error:
             _warn_once(plan.unavailable_warning(name, error, following))
         except UnsupportedError as reason:
@@ -86,6 +99,14 @@ def first_that_works(
                 _warn_once(plan.scan_warning(reason))
             break
     return by_scan()
+
+
+def _attempted(attempt: Callable[[Executor], T], executor: Executor) -> T:
+    """The value of an attempt, of a second one if the compiler was stopped in the first."""
+    try:
+        return attempt(executor)
+    except StoppedError:
+        return attempt(executor)
 
 
 def inputs_of(
@@ -106,18 +127,7 @@ def operations(inputs: Inputs) -> int:
     """Operations of one evaluation of the closed loop."""
     zero = jnp.zeros_like(inputs.dt)
     arguments = (inputs.scenario, zero, initial_state(inputs.scenario), zero)
-    return count_operations(jax.make_jaxpr(evaluate)(*arguments).jaxpr)
-
-
-def count_operations(jaxpr: Jaxpr) -> int:
-    """Number of operations of a jaxpr, including those of its inner functions."""
-    number = 0
-    for operation in jaxpr.eqns:
-        bodies = list(jaxprs_in_params(operation.params))
-        number += sum(map(count_operations, bodies))
-        if not bodies:
-            number += 1
-    return number
+    return jaxprs.count_executed_operations(jax.make_jaxpr(evaluate)(*arguments))
 
 
 def plan_of_batch(
@@ -130,16 +140,20 @@ def plan_of_batch(
 
 @contextlib.contextmanager
 def building() -> Iterator[None]:
-    """Context manager of an attempt to run by an executor.  If its body raises, the compilers in
-    the background stop.  A ToolchainError replaces an error of XLA, which could not compile or load
-    a program; a lack of memory remains one.
+    """Context manager of an attempt to run by an executor.  If its body raises, the compilers that
+    this thread has started stop; those of other threads go on.
+
+    A ToolchainError replaces an error of XLA, so that the next backend makes the run.  XLA does not
+    tell whether it failed to compile, to load or to execute a program.  A run has no effect but its
+    result, so that it may be made again after any of them.  A lack of memory remains an error.
     """
     try:
         yield
     except BaseException as error:
-        stop_compilers()
+        stop_own_compilers()
         if isinstance(error, jax.errors.JaxRuntimeError) and OUT_OF_MEMORY not in str(error):
-            raise ToolchainError(f"XLA failed: {str(error).splitlines()[0][:200]}") from error
+            first = str(error).strip().partition("\n")[0] or "no message"
+            raise ToolchainError(f"XLA failed: {checks.one_line(first)}") from error
         raise
 
 
@@ -252,6 +266,9 @@ def compiled_plan(
       machine: the machine that runs the batch.
       structure: tree structure of (scenario, varied, folds, dt).
       shapes: shapes of their leaves (`shapes_of`).
+
+    Raises:
+      StoppedError: as `first_that_works`; a plan without an executor would be kept.
     """
     arguments = _tree_of_shapes(structure, shapes)
 

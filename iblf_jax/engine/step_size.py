@@ -311,7 +311,7 @@ def _find_part(
         q, width = found.records[0]["q"], found.records[0]["upper"] - found.records[0]["lower"]
         poor = has_flag(int(found.status), Status.STEP_TOO_LARGE)
         # A step of any size leaves the error that a different code makes.
-        if not float(found.metrics.get(error_growth.BOUND, 0.0)) > error_estimate.TOLERANCE:
+        if float(error_growth.errors_by_step(found.metrics)) != 0.0:
             poor |= has_flag(int(found.status), Status.INACCURATE)
         if method in NOISY_PHASES:
             poor |= float(dt) * float(found.fastest_mode) > NOISY_PHASES[method]

@@ -112,4 +112,5 @@ from iblf_jax.kernels.toolchain import built_for as built_for
 from iblf_jax.kernels.toolchain import compiler as compiler
 from iblf_jax.kernels.toolchain import has_ziglang as has_ziglang
 from iblf_jax.kernels.toolchain import stop_compilers as stop_compilers
+from iblf_jax.kernels.toolchain import stop_own_compilers as stop_own_compilers
 from iblf_jax.kernels.toolchain import ziglang as ziglang

@@ -29,8 +29,8 @@ class Caches:
         """Key of a kernel -> the error of the thread that built it in the background."""
         self.locks: dict[str, threading.Lock] = {}
         """Key of a kernel -> the lock of the thread that builds it."""
-        self.running: set[int] = set()
-        """Process numbers of the compilers that run."""
+        self.running: dict[int, object] = {}
+        """Process number of a compiler that runs -> the mark of the thread that needs it."""
         self.libraries: dict[str, ctypes.CDLL] = {}
         """Key of a kernel -> its library: loaded once, as XLA takes one address for a name."""
         self.registered: set[str] = set()

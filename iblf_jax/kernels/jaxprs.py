@@ -56,16 +56,28 @@ def scan_sizes(params: dict[str, Any]) -> tuple[int, int]:
 
 def count_operations(function: Any) -> int:
     """The number of operations of a function and of its inner functions, each counted once."""
-    pending = [opened(function)[0]]
-    # The functions themselves are the values, so that no other one gets the `id` of one of them.
-    found: dict[int, Any] = {}
-    while pending:
-        inner = pending.pop()
-        if id(inner) not in found:
-            found[id(inner)] = inner
-            for equation in inner.eqns:
-                pending += core.jaxprs_in_params(equation.params)
-    return sum(len(inner.eqns) for inner in found.values())
+    return sum(len(jaxpr.eqns) for jaxpr, _ in nested(function))
+
+
+def count_executed_operations(function: Any) -> int:
+    """The number of operations of a function, with those of an inner function at each of its calls
+    in the place of the call.
+    """
+    # By `id`: the function holds all of its inner ones, so none of them ends meanwhile.
+    counts: dict[int, int] = {}
+
+    def count(jaxpr: Any) -> int:
+        if id(jaxpr) not in counts:
+            counts[id(jaxpr)] = sum(map(count_of, jaxpr.eqns))
+        return counts[id(jaxpr)]
+
+    def count_of(equation: Any) -> int:
+        bodies = list(core.jaxprs_in_params(equation.params))
+        if not bodies:
+            return 1
+        return sum(count(opened(body)[0]) for body in bodies)
+
+    return count(opened(function)[0])
 
 
 def needed(function: Any) -> set[Any]:
@@ -104,12 +116,25 @@ def entry_of_stack(function: Any, index: int) -> Any:
 
 
 def nested(function: Any) -> Iterator[tuple[Any, Sequence[Any]]]:
-    """A function and all functions inside it, as `opened`, each time that one occurs."""
-    jaxpr, constants = opened(function)
-    yield jaxpr, constants
-    for equation in jaxpr.eqns:
-        for inner in core.jaxprs_in_params(equation.params):
-            yield from nested(inner)
+    """A function and all functions inside it, as `opened`, in the order of their first calls.
+
+    A function that is called several times occurs once: a chain of n functions, each of which calls
+    the next one twice, has 2^n calls.
+    """
+    # The functions themselves are the values, so that no other one gets the `id` of one of them.
+    found: dict[int, Any] = {}
+
+    def visit(function: Any) -> Iterator[tuple[Any, Sequence[Any]]]:
+        jaxpr, constants = opened(function)
+        if id(jaxpr) in found:
+            return
+        found[id(jaxpr)] = jaxpr
+        yield jaxpr, constants
+        for equation in jaxpr.eqns:
+            for inner in core.jaxprs_in_params(equation.params):
+                yield from visit(inner)
+
+    return visit(function)
 
 
 def primitives(function: Any) -> set[str]:

@@ -191,6 +191,8 @@ def _version_of(command: tuple[str, ...], changed: int) -> Version | ToolchainEr
     """The version, or the error: a compiler that does not answer is started once."""
     try:
         text = _run([*command, "--version"], "stdout", VERSION_TIMEOUT).decode()
+    except StoppedError:
+        raise  # this process stopped it, so its answer is not known
     except ToolchainError as error:
         return error
     except UnicodeDecodeError:
@@ -228,14 +230,31 @@ class _ThisThread(threading.local):
     is_ahead = False
     """Whether the thread compiles something before it is needed."""
 
+    def __init__(self) -> None:
+        self.needed_by: object = object()
+        """Mark of the thread that needs what this one compiles: of another one if it is ahead."""
+
 
 _this_thread = _ThisThread()
 
 
 def stop_compilers() -> None:
     """Kills every compiler that this process has started."""
-    for pid in tuple(CACHES.running):
-        CACHES.running.discard(pid)
+    _stop(tuple(CACHES.running))
+
+
+def stop_own_compilers() -> None:
+    """Kills the compilers that this thread has started, also those that it has started ahead.
+
+    A thread that waits for one of their kernels compiles it itself.
+    """
+    mark = _this_thread.needed_by
+    _stop([pid for pid, needed_by in tuple(CACHES.running.items()) if needed_by is mark])
+
+
+def _stop(pids: Iterable[int]) -> None:
+    for pid in pids:
+        CACHES.running.pop(pid, None)
         with contextlib.suppress(ProcessLookupError):
             os.killpg(pid, signal.SIGKILL)
 
@@ -247,9 +266,11 @@ def build_ahead(source: str, extra: tuple[str, ...] = ()) -> None:
     """Starts `built` in the background; a later call of `built` waits for it, and raises its
     error.
     """
+    needed_by = _this_thread.needed_by
 
     def build() -> None:
         _this_thread.is_ahead = True
+        _this_thread.needed_by = needed_by
         with contextlib.suppress(ToolchainError):
             built(source, extra)
 
@@ -282,7 +303,7 @@ def _run(command: list[str], stream: str, seconds: float) -> bytes:
         with pipe:
             received.append(pipe.read(MAX_TEXT))
 
-    CACHES.running.add(process.pid)
+    CACHES.running[process.pid] = _this_thread.needed_by
     listener = threading.Thread(target=listen, daemon=True)
     end = time.monotonic() + seconds
     listener.start()
@@ -298,7 +319,7 @@ def _run(command: list[str], stream: str, seconds: float) -> bytes:
         raise
     finally:
         stopped = process.pid not in CACHES.running
-        CACHES.running.discard(process.pid)
+        CACHES.running.pop(process.pid, None)
     if stopped:
         raise StoppedError(f"{name} was stopped")
     text = b"".join(received)
@@ -373,7 +394,8 @@ def cache_path(content: Iterable[str], suffix: str) -> Path:
 
 @contextlib.contextmanager
 def _made_once(key: str) -> Iterator[None]:
-    """Waits while another thread makes the same file; an interrupted wait stops the compilers.
+    """Waits while another thread makes the same file; an interrupted wait stops the compilers of
+    this thread.
 
     Raises:
       ToolchainError: the error of `build_ahead`, once.
@@ -392,7 +414,7 @@ def _made_once(key: str) -> Iterator[None]:
                 raise
     except BaseException:
         if waiting:
-            stop_compilers()
+            stop_own_compilers()
         raise
 
 

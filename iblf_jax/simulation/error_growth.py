@@ -26,6 +26,11 @@ edge:
 
     |e_i| >= step_i / 2 - |round(y_i) - y_i|   at any sample, or the same for the command. (A.3)
 
+An event trigger compares the command u with the held one h. Both have errors, e_u and e_h, and the
+threshold depends on h. An event may differ if
+
+    max_i (|e_u - e_h|_i + relative_i |e_h|_i) >= |max_i (|u_i - h_i| - relative_i |h_i| - a_i)|.
+
 After that (A.2) does not hold. Both solutions are then those of the loop without rounding, driven
 by rounding errors w with |w_i| <= step_i / 2 each, so their difference z satisfies
 
@@ -38,7 +43,9 @@ the place of the step. Of an event trigger it is 2 (relative max |u| + absolute)
 depend on the time step. It holds with or without a jump, as far as the states at which the loop is
 linearised (start, end, nearest to a bound) stand for the run.
 
-The stated error is the smaller one of the largest e and (A.4) before a jump, and (A.4) after it.
+(A.4) is the difference of two exact solutions; the error of the loop without rounding, which falls
+with the time step, is added to it. The stated error is the smaller one of the largest e and this
+sum before a jump, and the sum after it.
 In a continuous loop a quantiser jumps within the steps. The quadrature of a step across a jump of
 the torque by `step` is wrong by up to dt step / 3 (rk4), and the differences of `error_estimate`
 sum to 16/18 of dt step in absolute value. There the absolute values are summed, because those of
@@ -58,6 +65,7 @@ from jax.flatten_util import ravel_pytree
 from iblf_jax.control.actuators import _base as actuators
 from iblf_jax.control.controllers._base import state_of_levels
 from iblf_jax.control.sensors._base import sensor_member, unrounded
+from iblf_jax.core import checks
 from iblf_jax.core.linalg import matmul_in_order
 from iblf_jax.core.time import as_at
 from iblf_jax.simulation.closed_loop import (
@@ -67,7 +75,7 @@ from iblf_jax.simulation.closed_loop import (
     run_sampled_law,
     with_integrated_part,
 )
-from iblf_jax.simulation.error_estimate import RELATIVE, Accuracy
+from iblf_jax.simulation.error_estimate import RELATIVE, TOLERANCE, Accuracy
 from iblf_jax.simulation.levels import sensor_state
 from iblf_jax.simulation.noise import normals
 from iblf_jax.simulation.sampling import Instant, step_torques
@@ -76,9 +84,11 @@ from iblf_jax.simulation.stability import flow, period_map
 
 BOUND = "relative_rounding_error"
 """Name of the bound (A.4), relative to the width of the tube, among the metrics of a sampled run
-whose feedback is interrupted; 0 where no code may have differed."""
-SUMMED_PERIODS, DOUBLINGS = 256, 8
-"""Periods over which the sum of (A.4) is exact, and the number of times it is doubled."""
+whose feedback is interrupted; 0 where, to first order, no error reached a code."""
+SUMMED_PERIODS = 256
+"""Periods over which the sum of (A.4) is exact."""
+DOUBLINGS = (checks.MAX_STEPS // SUMMED_PERIODS).bit_length()
+"""Number of times that it can be doubled, enough for the longest run."""
 ARITHMETIC = 4.0
 """Rounding error of a reading or a command, in units of its last place."""
 
@@ -398,11 +408,13 @@ def _after_law(
     reaches, peak = jnp.zeros((), bool), growth.peak
     if sampling.trigger is not None:
         peak = jnp.maximum(peak, jnp.abs(command))
-        threshold = sampling.trigger.relative * jnp.abs(held.sent.input)
-        threshold = threshold + sampling.trigger.absolute
+        relative = sampling.trigger.relative
+        size = jnp.abs(held.sent.input)
+        threshold = relative * size + sampling.trigger.absolute
         distance = jnp.abs(jnp.max(jnp.abs(command - held.sent.input) - threshold))
-        near = jnp.max(jnp.abs(command_error - sent.input) + blur) >= distance
-        reaches = near & (held.sent.number > 0)
+        moved = jnp.abs(command_error - sent.input) + relative * jnp.abs(sent.input)
+        rounding = blur + ARITHMETIC * jnp.finfo(size.dtype).eps * (size + threshold)
+        reaches = (jnp.max(moved + rounding) >= distance) & (held.sent.number > 0)
         fires = state.sampled.sent.number > held.sent.number
         command_error = jnp.where(fires, command_error, sent.input)
         sent = sent._replace(input=command_error, torque=command_error)
@@ -457,7 +469,7 @@ def bound(
     derivative: jax.Array,
     periods: jax.Array,
 ) -> jax.Array:
-    """The bound (A.4) of the position error, (n,) [rad].
+    """The bound (A.4) of the position error, (n,) [rad]; infinite where the sum overflows.
 
     Args:
       scenario: with a sampling.
@@ -498,12 +510,16 @@ def bound(
     power = Phi
     for _ in range(SUMMED_PERIODS.bit_length() - 1):
         power = matmul_in_order(power, power)
-    doubled = total
-    for _ in range(DOUBLINGS):
-        doubled = doubled + matmul_in_order(jnp.abs(power), doubled)
-        power = matmul_in_order(power, power)
-    total = jnp.where(periods > SUMMED_PERIODS, doubled, total)
-    return jnp.sum(total[:n], axis=1)
+
+    def double(k: jax.Array, found: tuple) -> tuple:
+        total, power = found
+        covered = SUMMED_PERIODS * 2.0**k
+        doubled = total + matmul_in_order(jnp.abs(power), total)
+        return jnp.where(covered < periods, doubled, total), matmul_in_order(power, power)
+
+    total, _ = jax.lax.fori_loop(0, DOUBLINGS, double, (total, power))
+    bounds = jnp.sum(total[:n], axis=1)
+    return jnp.where(jnp.isnan(bounds), jnp.inf, bounds)
 
 
 def with_growth(
@@ -518,8 +534,9 @@ def with_growth(
       width: smallest width of the tube, (n,) [rad].
     """
     growth = accuracy.growth
+    of_codes = jnp.max(bounds / width)
     bounds = bounds + accuracy.error
-    relative = jnp.max(bounds / width)
+    relative = of_codes + accuracy.relative
     jumped = growth.jumped > 0
     before = jnp.maximum(accuracy.error, growth.largest)
     before_relative = jnp.maximum(accuracy.relative, growth.relative)
@@ -527,17 +544,23 @@ def with_growth(
         error=jnp.where(jumped, bounds, jnp.minimum(before, bounds)),
         relative=jnp.where(jumped, relative, jnp.minimum(before_relative, relative)),
     )
-    return found, {BOUND: jnp.where(jumped, relative, 0.0)}
+    return found, {BOUND: jnp.where(jumped, of_codes, 0.0)}
 
 
 def errors_by_step(metrics: Any) -> jax.Array:
-    """The stated error of runs relative to the tube; 0 where a smaller step does not reduce it,
-    because a code of a rounded signal may differ. `metrics` are by name.
+    """The stated error of runs relative to the tube, as far as a smaller step makes it tolerable;
+    `metrics` are by name.
+
+    No step makes a bound (A.4) above the tolerance tolerable. Of such a run it is the rest of the
+    error, or 0 if that is tolerable.
     """
     errors = jnp.asarray(metrics[RELATIVE])
     if BOUND not in metrics:
         return errors
-    return jnp.where(jnp.asarray(metrics[BOUND]) > 0.0, 0.0, errors)
+    bounds = jnp.asarray(metrics[BOUND])
+    # Less the rounding error of the sum, so that it does not count as an error by the step.
+    rest = errors - (1.0 + ARITHMETIC * jnp.finfo(errors.dtype).eps) * bounds
+    return jnp.where(bounds > TOLERANCE, jnp.where(rest > TOLERANCE, rest, 0.0), errors)
 
 
 def _through_queue(

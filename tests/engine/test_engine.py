@@ -216,13 +216,6 @@ def executors_of(platform):
     return executors
 
 
-def test_the_length_of_a_function_is_that_of_its_inner_ones():
-    inner = jax.jit(lambda x: jnp.sin(x) + jnp.cos(x))
-    closed = jax.make_jaxpr(lambda x: inner(x) * inner(2.0 * x))(1.0)
-    assert compile.count_operations(closed.jaxpr) == 8
-    assert compile.count_operations(jax.make_jaxpr(inner)(1.0).jaxpr) == 3
-
-
 @pytest.mark.parametrize("size", [2, 72])
 def test_the_spectral_radius_is_that_of_the_largest_eigenvalue(size):
     """The map of a sampled loop of six joints has 72 rows."""

@@ -22,7 +22,7 @@ from iblf_jax.engine import (
     registry,
     single_run,
 )
-from iblf_jax.kernels import ToolchainError, UnsupportedError
+from iblf_jax.kernels import StoppedError, ToolchainError, UnsupportedError
 from iblf_jax.simulation.scenario import canonical
 
 needs_compiler = pytest.mark.skipif(native.unavailable() is not None, reason="no C++ compiler")
@@ -164,6 +164,30 @@ def test_one_place_falls_back(monkeypatch, failures, tried, result):
     assert len(given) == len(missing), "a step that does not lower is not reported here"
 
 
+@pytest.mark.parametrize("stops", [1, 2])
+def test_a_stopped_compiler_does_not_decide_the_plan_of_a_batch(scenario, monkeypatch, stops):
+    """One more attempt; after a second stop an error, which is not kept."""
+    calls = []
+
+    def build(*arguments):
+        calls.append("build")
+        if len(calls) <= stops:
+            raise StoppedError("the compiler was stopped")
+
+    mine = registry.Executor("mine", (devices.platform(),), None, lambda: None, build)
+    monkeypatch.setattr(registry, "EXECUTORS", {"mine": mine})
+    CACHE.clear()
+    request = RunRequest(10, backend="mine")
+    arguments = (canonical(scenario), {"controller.Kp": jnp.ones((2, 2))}, (), jnp.asarray(1e-3))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        if stops == 2:
+            with pytest.raises(StoppedError):
+                compile_batch(request, *arguments)
+        assert compile_batch(request, *arguments).backend == "mine"
+    CACHE.clear()
+
+
 def calls_what_xla_does_not_know(program, shared, per_run, carry, *others):
     """As `native.run`, in a program that XLA cannot load."""
     shapes = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in carry]
@@ -216,6 +240,15 @@ def test_a_lack_of_memory_is_reported_as_such():
     """Another executor needs as much."""
     with pytest.raises(jax.errors.JaxRuntimeError, match="RESOURCE_EXHAUSTED"), compile.building():
         raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 1 TiB.")
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [("", "no message"), ("\n", "no message"), ("\nnot found\n at 0", "not found")],
+)
+def test_an_error_of_xla_is_one_line(text, reason):
+    with pytest.raises(ToolchainError, match=f"^XLA failed: {reason}$"), compile.building():
+        raise jax.errors.JaxRuntimeError(text)
 
 
 def test_a_value_of_shapes_holds_no_arrays():

@@ -87,6 +87,31 @@ def test_a_shared_function_is_counted_once():
     assert (once, twice) == (4, 5)
 
 
+def test_executed_operations_are_those_of_every_call():
+    inner = jax.jit(lambda x: jnp.sin(x) + jnp.cos(x))
+    twice = jax.make_jaxpr(lambda x: inner(x) * inner(2.0 * x))(1.0)
+    assert jaxprs.count_executed_operations(twice) == 8
+    assert jaxprs.count_executed_operations(twice.jaxpr) == 8
+    assert jaxprs.count_executed_operations(jax.make_jaxpr(inner)(1.0)) == 3
+
+
+def test_a_function_that_is_called_often_is_visited_once():
+    """Forty functions, each of which calls the next one twice: 2^40 calls."""
+
+    def doubled(inner):
+        return jax.jit(lambda x: inner(inner(x)))
+
+    function = jax.jit(lambda x: jnp.sin(x) + 0.25)
+    for _ in range(40):
+        function = doubled(function)
+    traced = jax.make_jaxpr(function)(1.0)
+    assert [float(x) for x in jaxprs.constants(traced)] == [0.25]
+    assert {"sin", "add"} <= jaxprs.primitives(traced)
+    assert len(list(jaxprs.nested(traced))) == 42
+    assert jaxprs.count_operations(traced) == 1 + 40 * 2 + 2
+    assert jaxprs.count_executed_operations(traced) == 2 * 2**40
+
+
 def test_operations_of_branches_are_counted():
     def chosen(x):
         return jax.lax.cond(x > 0, lambda y: jnp.sin(y), lambda y: jnp.cos(y) * 2.0, x)

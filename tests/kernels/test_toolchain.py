@@ -14,6 +14,7 @@ import subprocess
 import sys
 import time
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import jax
@@ -431,6 +432,57 @@ def test_who_stops_waiting_stops_the_compiler(cache, tmp_path, monkeypatch):
         pytest.fail("the compiler still runs")
     fake(tmp_path, monkeypatch, compiles('exec "$REAL" "$@"'))
     assert value() == 41, "what was stopped is built when it is asked for again"
+
+
+def wait_for_compiler(calls):
+    """Waits until the compiler has written a file, and this process knows its number."""
+    wait_for(calls)
+    for _ in range(2000):
+        if toolchain.CACHES.running:
+            return
+        time.sleep(0.001)
+    pytest.fail("no compiler runs")
+
+
+@needs_compiler
+def test_who_stops_leaves_the_compilers_of_other_threads(cache, tmp_path, monkeypatch):
+    """An exception in one thread is no reason to end the build of another one."""
+    calls = tmp_path / "calls"
+    fake(tmp_path, monkeypatch, compiles(f'echo once >> {calls}; sleep 0.5; exec "$REAL" "$@"'))
+    with ThreadPoolExecutor(1) as other:
+        found = other.submit(toolchain.built, SOURCE)
+        wait_for_compiler(calls)
+        with pytest.raises(ZeroDivisionError), compile.building():
+            raise ZeroDivisionError
+        found.result()
+    assert calls.read_text().split() == ["once"]
+
+
+@needs_compiler
+def test_who_waits_for_a_stopped_build_builds_it(cache, tmp_path, monkeypatch):
+    calls = tmp_path / "calls"
+    fake(tmp_path, monkeypatch, compiles(f'echo once >> {calls}; sleep 0.5; exec "$REAL" "$@"'))
+    toolchain.build_ahead(SOURCE)
+    wait_for_compiler(calls)
+    with ThreadPoolExecutor(1) as other:
+        found = other.submit(toolchain.built, SOURCE)
+        toolchain.stop_own_compilers()
+        found.result()
+    assert calls.read_text().split() == ["once"] * 2
+
+
+def test_a_stopped_compiler_is_asked_again_for_its_version(tmp_path, monkeypatch):
+    fake(tmp_path, monkeypatch, "echo fake 1.0")
+    command = toolchain.compiler()
+
+    def stopped(*arguments):
+        raise toolchain.StoppedError("the compiler was stopped")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(toolchain, "_run", stopped)
+        with pytest.raises(toolchain.StoppedError):
+            toolchain._version(command)
+    assert toolchain._version(command).line == "fake 1.0"
 
 
 FRESH = """

@@ -14,8 +14,9 @@ from jax.flatten_util import ravel_pytree
 import iblf_jax as ij
 from iblf_jax.core.status import Status
 from iblf_jax.simulation import error_growth, stability
-from iblf_jax.simulation.closed_loop import initial_state, integrated_part
-from iblf_jax.simulation.error_estimate import RELATIVE, TOLERANCE
+from iblf_jax.simulation.closed_loop import initial_state, integrated_part, run_sampled_law
+from iblf_jax.simulation.error_estimate import RELATIVE, TOLERANCE, Accuracy
+from iblf_jax.simulation.sampling import SentCommand
 from iblf_jax.simulation.scenario import canonical
 
 FINER = 16
@@ -191,6 +192,93 @@ def test_the_bound_is_that_of_the_worst_rounding_errors():
     long = np.asarray(found(jnp.asarray(5000.0)))
     assert np.all(long >= exact * (1 - 1e-9))
     assert np.all(long < 2.0 * exact)
+
+
+@pytest.mark.parametrize("periods", [2.0**15, 2.0**20, 2.0**31])
+def test_the_bound_covers_the_longest_run(periods):
+    """Of x' = tau, which forgets no rounding error, it is N times that of a period."""
+    scenario = canonical(LOOPS["quantiser"]())
+    state = initial_state(scenario)
+    derivative = jnp.zeros_like(stability.jacobian(scenario, jnp.zeros(()), state))
+    growth = error_growth.begin(scenario, state, derivative)
+    plant = ravel_pytree(integrated_part(state))[0].size
+    derivative = derivative.at[:2, plant : plant + 2].set(jnp.eye(2))
+    found = error_growth.bound(scenario, growth, state, derivative, jnp.asarray(periods))
+    np.testing.assert_allclose(found, periods * 4e-3 * 1.5, rtol=1e-9)
+
+
+def test_a_bound_that_overflows_is_infinite():
+    scenario = canonical(LOOPS["quantiser"]())
+    state = initial_state(scenario)
+    derivative = stability.jacobian(scenario, jnp.zeros(()), state)
+    growth = error_growth.begin(scenario, state, derivative)
+    derivative = derivative + 100.0 * jnp.eye(len(derivative))
+    found = error_growth.bound(scenario, growth, state, derivative, jnp.asarray(1e6))
+    assert np.all(np.isposinf(found))
+
+
+def assessed(jumped, bounds, error=1e-3):
+    """The stated error, the bound, and the error by the step, of a run in a tube of width 1."""
+    none = jnp.zeros(2)
+    growth = error_growth.ErrorGrowth((), jnp.asarray(jumped), none, none[0], ())
+    accuracy = Accuracy((), none, none, jnp.full(2, error), jnp.asarray(error), growth)
+    found, more = error_growth.with_growth(accuracy, jnp.full(2, bounds), jnp.ones(2))
+    metrics = {RELATIVE: found.relative, **more}
+    by_step = error_growth.errors_by_step(metrics)
+    return [float(x) for x in (found.relative, more[error_growth.BOUND], by_step)]
+
+
+@pytest.mark.parametrize("error", [1e-3, 1e-5])
+def test_the_bound_of_a_jump_does_not_depend_on_the_step(error):
+    stated, bound, _ = assessed(1.0, 0.02, error)
+    assert bound == 0.02
+    assert stated == pytest.approx(0.02 + error)
+    assert assessed(0.0, 0.02, error)[:2] == [pytest.approx(error), 0.0]
+
+
+@pytest.mark.parametrize(
+    ("bounds", "error", "by_step"),
+    [
+        (0.02, 1e-3, 0.0),
+        (0.02, 0.01, 0.01),
+        (1e12, 1e-3, 0.0),
+        (np.inf, 1e-3, 0.0),
+        (0.003, 0.004, 0.007),
+    ],
+)
+def test_a_smaller_step_reduces_what_is_no_bound(bounds, error, by_step):
+    assert assessed(1.0, bounds, error)[2] == pytest.approx(by_step, rel=1e-9)
+
+
+@pytest.mark.parametrize(("distance", "jumped"), [(0.4, 1.0), (0.6, 0.0)])
+def test_the_error_of_the_held_command_moves_the_threshold(distance, jumped):
+    """Command and held command have one error c, so only that of 0.5 |u_held| remains: 0.5 |c|."""
+    scenario = canonical(sampled(trigger=ij.EventTrigger(relative=0.5)))
+    state = initial_state(scenario)
+    zero = jnp.zeros(())
+    growth = error_growth.begin(scenario, state, jnp.eye(1))
+    part, *others = growth.error
+    growth = growth._replace(error=(part._replace(q=jnp.full(2, 1e-6)), *others))
+    normal = jnp.zeros(scenario.sensor.draws)
+    always = ij.with_parts(scenario, sampling=ij.Sampling(period=4e-3))
+
+    def at_sample(growth, held, number):
+        sent = SentCommand(held, held, jnp.asarray(number))
+        before = state._replace(sampled=state.sampled._replace(sent=sent))
+        after = before._replace(sampled=before.sampled._replace(sent=sent._replace(number=1.0)))
+        return error_growth._after_law(growth, scenario, zero, normal, before, after)
+
+    plain = state._replace(sampled=state.sampled._replace(sent=()))
+    u = run_sampled_law(always, zero, plain, normal).sampled.commands[0]
+    first = at_sample(growth, u, 0.0)
+    assert float(first.jumped) == 0.0
+    _, _, commands, sent = first.error
+    error = jnp.abs(sent.input)
+    assert float(jnp.min(error)) > 0.0
+    # |u - held| - 0.5 |held| = -distance |c| in the component that is nearest to its threshold.
+    held = u + jnp.sign(u) * (jnp.abs(u) - 2.0 * distance * jnp.max(error))
+    growth = growth._replace(error=(growth.error[0], others[0], commands, sent))
+    assert float(at_sample(growth, held, 1.0).jumped) == jumped
 
 
 def test_distance_to_the_next_level():
