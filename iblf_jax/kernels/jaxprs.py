@@ -115,23 +115,31 @@ def entry_of_stack(function: Any, index: int) -> Any:
     return lambda *operands: evaluate(*operands)[0]
 
 
+def inner_functions(equation: Any) -> Iterator[Any]:
+    """The functions among the parameters of an equation, with their constants."""
+    for value in equation.params.values():
+        parts = value if isinstance(value, tuple | list) else (value,)
+        yield from (x for x in parts if isinstance(x, core.Jaxpr | core.ClosedJaxpr))
+
+
 def nested(function: Any) -> Iterator[tuple[Any, Sequence[Any]]]:
     """A function and all functions inside it, as `opened`, in the order of their first calls.
 
     A function that is called several times occurs once: a chain of n functions, each of which calls
     the next one twice, has 2^n calls.
     """
-    # The functions themselves are the values, so that no other one gets the `id` of one of them.
-    found: dict[int, Any] = {}
+    # The values keep what the keys are the identities of: nothing else can get one of these.
+    found: dict[tuple[int, ...], Any] = {}
 
     def visit(function: Any) -> Iterator[tuple[Any, Sequence[Any]]]:
         jaxpr, constants = opened(function)
-        if id(jaxpr) in found:
+        key = (id(jaxpr), *map(id, constants))
+        if key in found:
             return
-        found[id(jaxpr)] = jaxpr
+        found[key] = function
         yield jaxpr, constants
         for equation in jaxpr.eqns:
-            for inner in core.jaxprs_in_params(equation.params):
+            for inner in inner_functions(equation):
                 yield from visit(inner)
 
     return visit(function)

@@ -90,12 +90,30 @@ def _digest(prepared: PreparedStudy) -> str:
         return f"calls Python by {error}, {secrets.token_hex(8)}"
 
 
-def describe(prepared: PreparedStudy, points: Points, design: str) -> dict[str, Any]:
-    """Everything that the data of a sweep depend on."""
+def computed_by(backend: str) -> dict[str, Any]:
+    """What decides the last digits of a result besides its program: backend, platform, versions,
+    and processor and compiler of kernels on the host.
+    """
     import jaxlib
 
     import iblf_jax
 
+    found: dict[str, Any] = {
+        "backend": backend,
+        "platform": devices.platform(),
+        "versions": {
+            "iblf_jax": iblf_jax.__version__,
+            "jax": jax.__version__,
+            "jaxlib": jaxlib.__version__,
+        },
+    }
+    if uses_host_compiler(backend):
+        found["kernel"] = built_for()
+    return found
+
+
+def describe(prepared: PreparedStudy, points: Points, design: str) -> dict[str, Any]:
+    """Everything that the data of a sweep depend on."""
     scenario = prepared.scenario
 
     def place(path: str) -> dict[str, Any]:
@@ -107,10 +125,6 @@ def describe(prepared: PreparedStudy, points: Points, design: str) -> dict[str, 
         }
 
     options = prepared.options
-    backend = prepared.backend
-    kernel = {}
-    if uses_host_compiler(backend):
-        kernel = {"kernel": built_for()}
     return {
         "design": design,
         "dims": dict(points.dims),
@@ -124,19 +138,12 @@ def describe(prepared: PreparedStudy, points: Points, design: str) -> dict[str, 
         },
         **dataclasses.asdict(options),
         "duration": round(options.steps * options.dt, 12),
-        "backend": backend,
+        **computed_by(prepared.backend),
         "metrics": describe_component(prepared.shared.folds),
         "scenario": values_of(scenario),
         "structure": structure(scenario),
         "joints": scenario.n,
         "dtype": str(scenario.initial.q.dtype),
-        "platform": devices.platform(),
-        **kernel,
         "block": block_size(),
-        "versions": {
-            "iblf_jax": iblf_jax.__version__,
-            "jax": jax.__version__,
-            "jaxlib": jaxlib.__version__,
-        },
         "program": _digest(prepared),
     }

@@ -22,7 +22,7 @@ from iblf_jax.core import checks
 from iblf_jax.core.optional import has_members
 from iblf_jax.core.program_digest import CallsPythonError, program_digest
 from iblf_jax.core.pytree import field_values
-from iblf_jax.studies.store_config import structure
+from iblf_jax.studies.store_config import computed_by, structure
 from iblf_jax.tuning.evaluation import Evaluator
 from iblf_jax.tuning.search import Search
 from iblf_jax.tuning.solvers import Solver
@@ -37,7 +37,7 @@ def fingerprint(evaluate: Evaluator, solver: Solver, mode: str, iterations: int)
     Args:
       evaluate: the problem. Its numbers and its program are part of the hash: names of classes
         would not tell that the code of a user has changed.
-      solver: its class and its options are part of the hash.
+      solver: its class and its options are part of the hash; those of a solver must be known.
       mode: of differentiation.
       iterations: of the search, which a schedule depends on.
 
@@ -48,7 +48,8 @@ def fingerprint(evaluate: Evaluator, solver: Solver, mode: str, iterations: int)
         described_solver(solver, iterations),
         mode,
         structure(evaluate.problem),
-        _program_of_problem(evaluate),
+        _digest_of(evaluate.traced()),
+        computed_by(evaluate.problem.request.backend),
     ]
     digest = hashlib.sha256(repr(parts).encode())
     for x in jax.tree.leaves((evaluate.problem, evaluate.candidates)):
@@ -56,10 +57,10 @@ def fingerprint(evaluate: Evaluator, solver: Solver, mode: str, iterations: int)
     return digest.hexdigest()
 
 
-def _program_of_problem(evaluate: Evaluator) -> str:
-    """The digest of the program that computes value and derivatives."""
+def _digest_of(traced: Any) -> str:
+    """The digest of a program; ValueError for one that calls functions of Python."""
     try:
-        return program_digest(evaluate.traced())
+        return program_digest(traced)
     except CallsPythonError as error:
         remedy = f"It has a {error}: what that computes cannot be compared. Leave checkpoint out."
         raise checks.fail(
@@ -68,10 +69,16 @@ def _program_of_problem(evaluate: Evaluator) -> str:
 
 
 def described_solver(solver: Solver, iterations: int) -> tuple[str, dict[str, Any]]:
-    """The name of a solver and its options."""
-    options: dict[str, Any] = {}
-    if dataclasses.is_dataclass(solver):
-        options = field_values(solver)
+    """The class of a solver and its options.
+
+    Raises:
+      ValueError: a class of a user that is no dataclass, whose options are not known.
+    """
+    cls = type(solver)
+    if not dataclasses.is_dataclass(solver):
+        remedy = "Make its class a dataclass, so that its options can be compared, or leave it out."
+        raise checks.fail("checkpoint", cls, "a solver whose class is a dataclass", remedy)
+    options: dict[str, Any] = field_values(solver)
     for name in NOT_PART_OF_THE_PROBLEM:
         options.pop(name, None)
     for name, value in options.items():
@@ -79,17 +86,23 @@ def described_solver(solver: Solver, iterations: int) -> tuple[str, dict[str, An
             options[name] = _program_of(value)
     if "schedule" in options:
         options["iterations"] = iterations  # a schedule ends with the last step
-    return solver.name, options
+    return f"{cls.__module__}.{cls.__qualname__}", options
 
 
 def _program_of(optimiser: Any) -> str:
-    """The program of an optimiser of optax with its constants: its functions print as addresses,
-    which differ between processes.
+    """The digest of the first two steps of an optimiser of optax, with the numbers of its start.
+
+    Its functions print as addresses, which differ between processes.
     """
-    w = jnp.zeros(1)
-    update = optax.with_extra_args_support(optimiser).update
+
+    def steps(w: jax.Array) -> Any:
+        extended = optax.with_extra_args_support(optimiser)
+        state = extended.init(w)
+        found, state = extended.update(w, state, w, value=w[0])
+        return found, extended.update(w, state, w, value=w[0])
+
     with jax.numpy_dtype_promotion("standard"):  # optax mixes integers of several types
-        return program_digest(jax.jit(update).trace(w, optimiser.init(w), w, value=w[0]))
+        return _digest_of(jax.jit(steps).trace(jnp.zeros(1)))
 
 
 def _named_leaves(state: Any) -> dict[str, np.ndarray]:

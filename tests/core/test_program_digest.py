@@ -65,15 +65,18 @@ def test_programs_that_differ_have_two_digests(case):
     assert digest(one) == digest(one)
 
 
-@pytest.mark.parametrize("call", ["pure_callback", "debug_callback"])
+@pytest.mark.parametrize("call", ["pure_callback", "debug_callback", "debug_print"])
 def test_a_program_that_calls_python_has_no_digest(call):
     def f(x):
         if call == "debug_callback":
             jax.debug.callback(print, x)
             return x
+        if call == "debug_print":
+            jax.debug.print("{x}", x=x)
+            return x
         return jax.pure_callback(np.sin, x, x)
 
-    with pytest.raises(CallsPythonError, match="callback"):
+    with pytest.raises(CallsPythonError, match=r"callback|debug_print"):
         digest(lambda x: jax.lax.cond(x > 0, f, lambda x: x, x), jnp.ones(()))
 
 

@@ -157,6 +157,9 @@ def test_constants_and_primitives_of_inner_functions():
     found = [np.asarray(x) for x in jaxprs.constants(traced)]
     assert any(np.array_equal(x, TABLE) for x in found)
     assert any(np.array_equal(x, 7.5) for x in found)
+    captured = jnp.arange(6.0).reshape(2, 3)
+    inner = jax.make_jaxpr(jax.jit(lambda x: x + captured))(1.0)
+    assert any(np.array_equal(x, captured) for x in jaxprs.constants(inner))
 
 
 def shape_of_first(x, y):

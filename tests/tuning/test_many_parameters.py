@@ -269,6 +269,20 @@ def test_a_checkpoint_knows_the_numbers_of_an_optimiser():
         for rate in (1e-3, 1e-3, 2e-3)
     ]
     assert marks[0] == marks[1] != marks[2]
+    for make, numbers in [
+        (lambda x: optax.adagrad(0.1, initial_accumulator_value=x), (0.1, 0.5)),
+        (lambda x: optax.inject_hyperparams(optax.adam)(x), (0.1, 0.2)),
+    ]:
+        one, other = (described_solver(Optax(make(x)), 60) for x in numbers)
+        assert one != other
+
+
+def test_a_solver_without_known_options_has_no_checkpoint():
+    class Own:
+        name = "own"
+
+    with pytest.raises(ValueError, match="a solver whose class is a dataclass"):
+        described_solver(Own(), 60)
 
 
 @pytest.mark.slow
