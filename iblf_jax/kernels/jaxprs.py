@@ -16,6 +16,8 @@ CALLED = {
     "pjit": "jaxpr",
     "closed_call": "call_jaxpr",
     "core_call": "call_jaxpr",
+    "call": "call_jaxpr",
+    "eval_jaxpr": "call_jaxpr",  # from JAX 0.12 on, for the three above
     "custom_jvp_call": "call_jaxpr",
     "custom_vjp_call": "call_jaxpr",
     "custom_vjp_call_jaxpr": "fun_jaxpr",
@@ -93,8 +95,11 @@ def nested(function: Any) -> Iterator[tuple[Any, Sequence[Any]]]:
     jaxpr, constants = opened(function)
     yield jaxpr, constants
     for equation in jaxpr.eqns:
-        for inner in core.jaxprs_in_params(equation.params):
-            yield from nested(inner)
+        for value in equation.params.values():
+            # `core.jaxprs_in_params` would leave out the constants of a `ClosedJaxpr`.
+            for inner in value if isinstance(value, tuple) else (value,):
+                if isinstance(inner, core.ClosedJaxpr | core.Jaxpr):
+                    yield from nested(inner)
 
 
 def primitives(function: Any) -> set[str]:
