@@ -36,9 +36,7 @@ def program_digest(traced: Any) -> str:
     if callbacks:
         raise CallsPythonError(callbacks[0])
     found = hashlib.sha256()
-    for constant in jaxprs.constants(traced.jaxpr):
-        array = _numbers(constant)
-        found.update(f"{array.dtype} {array.shape} ".encode() + array.tobytes())
+    hash_constants(found, traced.jaxpr)
     found.update(traced.lower().as_text().encode())
     return found.hexdigest()
 
@@ -46,6 +44,13 @@ def program_digest(traced: Any) -> str:
 def _calls_python(primitive: str) -> bool:
     """Whether a primitive of this name calls a function of Python while a program runs."""
     return "callback" in primitive or primitive == "debug_print"
+
+
+def hash_constants(found: Any, function: Any) -> None:
+    """Adds all constants and literals of a jaxpr, and of the functions in it, to a hash."""
+    for constant in jaxprs.constants(function):
+        array = _numbers(constant)
+        found.update(f"{array.dtype} {array.shape} ".encode() + array.tobytes())
 
 
 def _numbers(constant: Any) -> np.ndarray:

@@ -424,7 +424,9 @@ def _examined(scenario: Scenario, parts: ArmParts, uncertain: Uncertain) -> Exam
     in_time = check_time_functions(scenario.reference, sides, scenario.n)
     if type(parts.law.barrier) not in BARRIERS:
         name = "scenario.controller.barrier"
-        digests += check_barrier(name, parts.law.barrier, parts.law.o, homogeneous=True)
+        digests += check_barrier(
+            name, parts.law.barrier, parts.law.o, n=scenario.n, homogeneous=True
+        )
     assumed = [*in_time.assumed, *agreement_of_robot(scenario.plant)]
     return Examined(assumed, [*digests, *in_time.digests])
 

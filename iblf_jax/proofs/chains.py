@@ -490,7 +490,7 @@ def _examined(scenario: Scenario, parts: ChainParts, uncertain: Uncertain) -> Ex
         if type(barrier) not in BARRIERS:
             name = f"scenario.controller.barriers[{i}]"
             o = None if parts.law.o is None else parts.law.o[i]
-            digests += check_barrier(name, barrier, o, homogeneous=False)
+            digests += check_barrier(name, barrier, o, n=1, homogeneous=False)
     assumed = [*in_time.assumed, *agreement_of_plant(scenario.plant)]
     return Examined(assumed, [*digests, *in_time.digests])
 

@@ -11,16 +11,18 @@ Only operations count that depend on what varies, and on which an output depends
 from __future__ import annotations
 
 import hashlib
+import os
+import re
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.extend import core
 from jax.extend.core import primitives
 
 from iblf_jax.core import checks
+from iblf_jax.core.program_digest import hash_constants
 from iblf_jax.kernels import jaxprs
 
 
@@ -30,9 +32,12 @@ def _primitives(names: str) -> frozenset[core.Primitive]:
     return frozenset(primitive for primitive in found if primitive is not None)
 
 
-def _primitives_of(function: Callable, *inputs: Any) -> frozenset[core.Primitive]:
-    """The primitives of a function of JAX, for those that `jax.extend` does not export."""
-    return frozenset(eqn.primitive for eqn in jax.make_jaxpr(function)(*inputs).jaxpr.eqns)
+def _primitive_of(name: str, function: Callable, *inputs: Any) -> frozenset[core.Primitive]:
+    """JAX's primitive of this name, which `jax.extend` does not export, from a function that has
+    it.  In some versions the function may consist of other primitives, which are not taken.
+    """
+    eqns = jax.make_jaxpr(function)(*inputs).jaxpr.eqns
+    return frozenset(eqn.primitive for eqn in eqns if eqn.primitive.name == name)
 
 
 SMOOTH = _primitives(
@@ -55,9 +60,9 @@ REARRANGING = _primitives(
     # Their indices do not vary: operations that give a varying integer are not in the lists.
     " gather dynamic_slice dynamic_update_slice scatter scatter_add"
 )
-REARRANGING |= _primitives_of(lambda x: jnp.stack([x, x]), 0.0)
-REARRANGING |= _primitives_of(lambda x: jnp.unstack(x), jnp.zeros(2))
-REARRANGING |= _primitives_of(lambda x: jnp.split(x, 2), jnp.zeros(2))
+REARRANGING |= _primitive_of("stack", lambda x: jnp.stack([x, x]), 0.0)
+REARRANGING |= _primitive_of("unstack", lambda x: jnp.unstack(x), jnp.zeros(2))
+REARRANGING |= _primitive_of("split", lambda x: jnp.split(x, 2), jnp.zeros(2))
 """Operations that only move numbers, without a numerical operation."""
 KINKS = _primitives("abs max min clamp reduce_max reduce_min cummax cummin")
 """Continuous operations whose derivatives jump. On a box that touches the kink, their derivatives
@@ -68,14 +73,11 @@ CASES = _primitives(
 )
 """Operations of `jnp.where`, `jnp.sign` and comparisons. Nothing shows that a function with one of
 them is continuous."""
-INNER = {
-    primitives.jit_p: "jaxpr",
-    primitives.closed_call_p: "call_jaxpr",
-    primitives.call_p: "call_jaxpr",
-    primitives.remat_p: "jaxpr",
-}
-"""Primitives that call a function without a change -> the parameter that holds it. Functions with
+INNER = _primitives("jit closed_call call remat")
+"""Primitives that call a function without a change; `jaxprs.called` knows which one. Functions with
 derivative rules of their own are not among them."""
+ADDRESS = re.compile(r" at 0x[0-9a-fA-F]+")
+"""What the text of a jaxpr says of a function of Python beside its name."""
 
 
 class Operations(NamedTuple):
@@ -128,7 +130,7 @@ def interpreted(
     known = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*constants, *inputs], strict=True))
 
     def read(atom: Any) -> Value:
-        return constant(atom.val) if isinstance(atom, core.Literal) else known[atom]
+        return known[atom] if jaxprs.is_variable(atom) else constant(atom.val)
 
     live = jaxprs.needed(jaxpr)
     for eqn in jaxpr.eqns:
@@ -136,8 +138,7 @@ def interpreted(
             continue
         operands = [read(v) for v in eqn.invars]
         if eqn.primitive in INNER:
-            inner = eqn.params[INNER[eqn.primitive]]
-            results = interpreted(inner, operands, rule, constant)
+            results = interpreted(jaxprs.called(eqn), operands, rule, constant)
         else:
             results = rule(eqn, operands)
         known.update(zip(eqn.outvars, results, strict=True))
@@ -156,6 +157,19 @@ def traced(name: str, function: Callable, inputs: Sequence[Any]) -> Any:
         got = f"a function that cannot be traced ({checks.one_line(str(error))})"
         expected = "a function of jnp operations, without `if` and `float` of its inputs"
         raise checks.fail(name, checks.Words(got), expected) from error
+
+
+def digest_of(jaxpr: Any) -> str:
+    """The digest of a function: of its text without addresses, and of all its constants.
+
+    No text holds what a function of Python computes while a program runs.  A jaxpr that calls one
+    has another digest each time.
+    """
+    found = hashlib.sha256(ADDRESS.sub("", str(jaxpr)).encode())
+    hash_constants(found, jaxpr)
+    if any("callback" in name for name in jaxprs.primitives(jaxpr)):
+        found.update(os.urandom(32))
+    return found.hexdigest()
 
 
 def operations(
@@ -183,18 +197,14 @@ def operations(
         return [seen] * len(eqn.outvars)
 
     def constant(value: Any) -> frozenset:
-        array = np.asarray(value)
-        digest.update(f"{array.dtype} {array.shape}".encode())
-        digest.update(array.tobytes())
         return frozenset()
 
     jaxpr = traced(name, function, inputs)
-    digest = hashlib.sha256(str(jaxpr).encode())
     numbers = set(range(len(inputs)) if varying is None else varying)
     values = [frozenset({i} & numbers) for i in range(len(inputs))]
     outputs = interpreted(jaxpr, values, rule, constant)
     sets = {kind: frozenset(names) for kind, names in found.items()}
-    return Operations(**sets, inputs=frozenset().union(*outputs), digest=digest.hexdigest())
+    return Operations(**sets, inputs=frozenset().union(*outputs), digest=digest_of(jaxpr))
 
 
 def _kind(eqn: Any, operands: list[frozenset]) -> str | None:

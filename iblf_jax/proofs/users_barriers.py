@@ -16,15 +16,23 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend import core
 from jax.extend.core import primitives
 
-from iblf_jax.control.barriers._base import barrier_member
+from iblf_jax.control.barriers._base import barrier_member, ratio_jumps
 from iblf_jax.core import checks
+from iblf_jax.kernels import jaxprs
 from iblf_jax.proofs.arm_motion import degree
 from iblf_jax.proofs.chain_motion import OpenTube
-from iblf_jax.proofs.examination import REARRANGING, SMOOTH, interpreted, operations, traced
-from iblf_jax.proofs.users_parts import check_agreement
+from iblf_jax.proofs.examination import (
+    CASES,
+    KINKS,
+    REARRANGING,
+    SMOOTH,
+    digest_of,
+    interpreted,
+    traced,
+)
+from iblf_jax.proofs.users_parts import ACCURACY, check_agreement
 
 SAMPLES = 256
 """Tubes and errors at which methods of a barrier are compared."""
@@ -60,23 +68,24 @@ class _Quantity(NamedTuple):
 ZERO, NUMBER = _Quantity(), _Quantity(0)
 
 
-def check_barrier(name: str, barrier: Any, o: Any, *, homogeneous: bool) -> list[str]:
+def check_barrier(name: str, barrier: Any, o: Any, *, n: int, homogeneous: bool) -> list[str]:
     """The digests of the methods of a user's barrier (`Operations.digest`).
 
     Args:
       name: of the barrier, for the message.
       barrier: without its guard.
       o: gain of the law, or None.
+      n: number of joints.
       homogeneous: whether a length of its own is refused.
 
     Raises:
-      ValueError: a case besides the sign of e1, a length of its own, or methods that contradict
-        each other.
+      ValueError: a case besides the sign of e1, a length of its own, joints that mix, or methods
+        that contradict each other.
     """
     digests = []
-    for method, function, inputs, expected in _methods(barrier, o):
-        digests.append(operations(name, function, [jnp.ones(2) for _ in inputs]).digest)
-        jaxpr = traced(f"{name}.{method}", function, [jnp.ones(2) for _ in inputs])
+    for method, function, inputs, expected in _methods(barrier, o, n):
+        jaxpr = traced(f"{name}.{method}", function, [jnp.ones(n) for _ in inputs])
+        digests.append(digest_of(jaxpr))
         rule = _homogeneous if homogeneous else _on_each_side
         try:
             outputs = interpreted(jaxpr, inputs, rule, _of_constant)
@@ -87,7 +96,8 @@ def check_barrier(name: str, barrier: Any, o: Any, *, homogeneous: bool) -> list
             words = "a barrier without a length of its own, smooth on each side of e1 = 0"
             reason = "The bound divides all lengths by the width of the tube."
             raise checks.fail(f"prove: {name}", got, words, reason) from None
-    _check_samples(name, barrier, o)
+        _check_joints(f"{name}.{method}", function, inputs, n)
+    _check_samples(name, barrier, o, n)
     return digests
 
 
@@ -97,7 +107,7 @@ def _tube(lower: Any, upper: Any, dlower: Any, dupper: Any) -> OpenTube:
     return OpenTube(zero, zero, lower, upper, dlower, dupper)
 
 
-def _methods(barrier: Any, o: Any) -> Iterator[tuple[str, Callable, list[_Quantity], int]]:
+def _methods(barrier: Any, o: Any, n: int) -> Iterator[tuple[str, Callable, list[_Quantity], int]]:
     """Name, function, inputs and degree of the result of each method of a barrier."""
     d = degree(barrier)
     length, of_tube = _Quantity(1), [_Quantity(1)] * 4
@@ -112,10 +122,15 @@ def _methods(barrier: Any, o: Any) -> Iterator[tuple[str, Callable, list[_Quanti
         return barrier.virtual_velocity(_tube(*x[:4]), x[4], x[5], own)
 
     yield "virtual_velocity", virtual_velocity, [*at_error, gain, gain], 1
+
+    def error_over_slope(*x: Any) -> Any:
+        return barrier_member(barrier, "error_over_slope")(_tube(*x[:4]), x[4])
+
+    yield "error_over_slope", error_over_slope, at_error, 2 - d
     for above in (True, False):
 
         def error_at(*x: Any, above: bool = above) -> Any:
-            return barrier_member(barrier, "error_at")(x[4], _tube(*x[:4]), jnp.full(2, above))
+            return barrier_member(barrier, "error_at")(x[4], _tube(*x[:4]), jnp.full(n, above))
 
         yield "error_at", error_at, [*of_tube, _Quantity(d)], 1
 
@@ -169,8 +184,11 @@ def _result(eqn: Any, operands: list[_Quantity]) -> _Quantity:
         return _Quantity(_unit_of(operands), is_error)
     if primitive in OF_ONE_UNIT:
         return first._replace(is_error=first.is_error and primitive is primitives.neg_p)
-    if primitive not in SMOOTH:
+    is_conversion = primitive is primitives.convert_element_type_p
+    if primitive in CASES | KINKS and not is_conversion:
         raise _UnitError(f"{primitive.name}, which is no case of the sign of e1")
+    if primitive not in SMOOTH:
+        raise _UnitError(f"{primitive.name}, which a proof does not know")
     return _Quantity(_degree(eqn, operands))
 
 
@@ -214,7 +232,7 @@ def _degree(eqn: Any, operands: list[_Quantity]) -> Any:
         return None if degrees[0] is None else degrees[0] * eqn.params["y"]
     if primitive is primitives.integer_pow_p and degrees[0] is not None:
         return degrees[0] * eqn.params["y"]
-    if primitive is primitives.pow_p and isinstance(eqn.invars[1], core.Literal):
+    if primitive is primitives.pow_p and not jaxprs.is_variable(eqn.invars[1]):
         exponent = Fraction(float(eqn.invars[1].val))
         return 0 if degrees[0] is None else degrees[0] * exponent
     if any(degrees):
@@ -225,45 +243,86 @@ def _degree(eqn: Any, operands: list[_Quantity]) -> Any:
 # --- at random points -----------------------------------------------------------------------------
 
 
-@jax.enable_x64(True)
-def _check_samples(name: str, barrier: Any, o: Any) -> None:
-    """Raises ValueError for methods that contradict each other at a random point."""
-    generator = np.random.default_rng(0)
-    k_l, k_u = np.exp(generator.normal(size=(2, SAMPLES)))
-    dlower, dupper = generator.normal(size=(2, SAMPLES))
-    share = generator.uniform(-0.9, 0.9, SAMPLES)
-    e = np.where(share > 0.0, share * k_u, share * k_l)
-    gain_o = None if o is None else jnp.max(o) * jnp.ones(1)
+class _Samples(NamedTuple):
+    """Tubes and errors inside them, (SAMPLES, n)."""
 
-    def tube_of(x: tuple) -> OpenTube:
-        return _tube(*(y[None] for y in x))
+    lower: np.ndarray
+    upper: np.ndarray
+    dlower: np.ndarray
+    dupper: np.ndarray
+    e: np.ndarray
+
+
+def _samples(n: int) -> _Samples:
+    """Random tubes of n joints, and an error of each joint on a random side."""
+    generator = np.random.default_rng(0)
+    k_l, k_u = np.exp(generator.normal(size=(2, SAMPLES, n)))
+    dlower, dupper = generator.normal(size=(2, SAMPLES, n))
+    share = generator.uniform(-0.9, 0.9, (SAMPLES, n))
+    e = np.where(share > 0.0, share * k_u, share * k_l)
+    return _Samples(-k_l, k_u, dlower, dupper, e)
+
+
+@jax.enable_x64(True)
+def _check_joints(name: str, function: Callable, inputs: list[_Quantity], n: int) -> None:
+    """Raises ValueError if the result of a joint depends on an input of another joint."""
+    if n == 1:
+        return
+    samples = _samples(n)
+    positive = np.exp(np.random.default_rng(1).normal(size=(SAMPLES, n)))
+    error_or_value = samples.e if inputs[4].is_error else positive
+    x = [*samples[:4], error_or_value, positive, positive][: len(inputs)]
+
+    def results(*y: jax.Array) -> list[jax.Array]:
+        return [jnp.broadcast_to(found, (n,)) for found in jax.tree.leaves(function(*y))]
+
+    jacobian = jax.vmap(jax.jacfwd(results, argnums=tuple(range(len(x)))))
+    for found in jax.tree.leaves(jacobian(*x)):
+        size = np.max(np.abs(found), axis=(1, 2))
+        others = np.max(np.abs(np.where(np.eye(n), 0.0, found)), axis=(1, 2))
+        if not np.all(others <= ACCURACY * size):
+            got = checks.Words("a result of a joint that depends on another joint")
+            reason = "The bound adds one V1 for each joint."
+            raise checks.fail(f"prove: {name}", got, "joints that do not mix", reason)
+
+
+@jax.enable_x64(True)
+def _check_samples(name: str, barrier: Any, o: Any, n: int) -> None:
+    """Raises ValueError for methods that contradict each other at a random point."""
+    one = jnp.ones(n)
+    gain_o = None if o is None else jnp.max(o) * one
 
     def pairs(lower: Any, upper: Any, dlower: Any, dupper: Any, e: Any) -> dict[str, tuple]:
-        tube = tube_of((lower, upper, dlower, dupper))
-        V = barrier.value(tube, e[None])
-        slope = jax.jvp(lambda q: barrier.value(tube, q), (e[None],), (jnp.ones(1),))[1]
-        found = {"slope": (barrier.slope(tube, e[None]), slope)}
-        back = barrier_member(barrier, "error_at")(V, tube, e[None] > 0)
+        tube = _tube(lower, upper, dlower, dupper)
+        V = barrier.value(tube, e)
+        slope = jax.jvp(lambda q: barrier.value(tube, q), (e,), (one,))[1]
+        found = {"slope": (barrier.slope(tube, e), slope)}
+        back = barrier_member(barrier, "error_at")(V, tube, e > 0)
         if back is not None:
-            found["error_at"] = (back, e[None])
-        ratio = barrier_member(barrier, "error_over_slope")(tube, e[None])
+            found["error_at"] = (back, e)
+        ratio = barrier_member(barrier, "error_over_slope")(tube, e)
         if ratio is not None:
-            found["error_over_slope"] = (ratio * slope, e[None])
+            found["error_over_slope"] = (ratio * slope, e)
         return found
 
-    def at_zero(lower: Any, upper: Any, dlower: Any, dupper: Any, e: Any) -> tuple:
-        tube = tube_of((lower, upper, dlower, dupper))
+    def functions(lower: Any, upper: Any, dlower: Any, dupper: Any, e: Any) -> tuple:
+        """V1, slope, alpha and the derivative of alpha at an error; e1/s if it states that it does
+        not jump.
+        """
+        tube = _tube(lower, upper, dlower, dupper)
+        alpha, rate = jax.jvp(
+            lambda q: barrier.virtual_velocity(tube, q, one, gain_o), (e,), (one,)
+        )
+        found = (barrier.value(tube, e), barrier.slope(tube, e), alpha, rate)
+        ratio = barrier_member(barrier, "error_over_slope")(tube, e)
+        return found if ratio is None or ratio_jumps(barrier) else (*found, ratio)
 
-        def functions(q: jax.Array) -> jax.Array:
-            alpha = barrier.virtual_velocity(tube, q, jnp.ones(1), gain_o)
-            return jnp.stack([barrier.value(tube, q), barrier.slope(tube, q), alpha])
-
-        values, rates = jax.jvp(functions, (e[None],), (jnp.ones(1),))
-        return values, rates[2]
-
-    x = (-k_l, k_u, dlower, dupper)
-    for method, pair in jax.vmap(pairs)(*x, e).items():
+    samples = _samples(n)
+    for method, pair in jax.vmap(pairs)(*samples).items():
         check_agreement(f"{name}.{method}", *pair)
-    sides = [jax.vmap(at_zero)(*x, sign * NEAR_ZERO * np.minimum(k_l, k_u)) for sign in (-1.0, 1.0)]
-    for one, other in zip(*sides, strict=True):
-        check_agreement(f"{name} at e1 = 0", one, other, JUMP)
+    width = np.minimum(-samples.lower, samples.upper)
+    shares = (-0.5, -NEAR_ZERO, NEAR_ZERO, 0.5)
+    found = [jax.vmap(functions)(*samples[:4], share * width) for share in shares]
+    for left, below, above, right in zip(*found, strict=True):
+        size = np.maximum(np.abs(left), np.abs(right))
+        check_agreement(f"{name} at e1 = 0", below, above, size, JUMP)

@@ -148,38 +148,61 @@ def _is_known(robot: Any) -> bool:
 
 def _robot_pairs(
     robot: Any, q: jax.Array, v: jax.Array, u: jax.Array, a: jax.Array
-) -> Iterator[tuple[str, tuple[jax.Array, jax.Array]]]:
-    """Name of a method -> what it returns, and what follows from M, C and G."""
+) -> Iterator[tuple[str, tuple[jax.Array, jax.Array, jax.Array]]]:
+    """Name of a method -> what it returns, what follows from M, C and G, and the size of the terms
+    in it, of which a difference is a share.
+    """
     M, rate = jax.jvp(robot.mass_matrix, (q,), (v,))
-    C_u = robot.coriolis(q, v, u)
-    yield "mass_matrix", (M, M.T)
-    yield "coriolis", (2.0 * jnp.dot(u, C_u), jnp.dot(u, rate @ u))
-    yield "coriolis of a sum", (robot.coriolis(q, v, u + a), C_u + robot.coriolis(q, v, a))
+    C_u, C_v, C_a = (robot.coriolis(q, v, x) for x in (u, v, a))
+    G = robot.gravity(q)
+    # sqrt(M_ii M_jj) bounds M_ij in the units of M_ij, so that a light joint has a scale of its own
+    inertia = jnp.sqrt(jnp.abs(jnp.outer(jnp.diag(M), jnp.diag(M))))
+    # The terms of C u cancel where M is constant; they are of the size of M |v| |u|.
+    speed = jnp.max(jnp.abs(v))
+    turned_u, turned_v, turned_a = (speed * inertia @ jnp.abs(x) for x in (u, v, a))
+    yield "mass_matrix", (M, M.T, inertia)
+    size = jnp.dot(jnp.abs(u), jnp.abs(C_u) + turned_u)
+    yield "coriolis", (2.0 * jnp.dot(u, C_u), jnp.dot(u, rate @ u), size)
+    size = jnp.abs(C_u) + jnp.abs(C_a) + turned_u + turned_a
+    yield "coriolis of a sum", (robot.coriolis(q, v, u + a), C_u + C_a, size)
     own = robot_member(robot, "momentum")
     if own is not None:
-        yield "momentum", (own(q, v), M @ v)
+        yield "momentum", (own(q, v), M @ v, inertia @ jnp.abs(v))
     own = robot_member(robot, "energy_gradient")
     if own is not None:
-        yield "energy_gradient", (own(q, v), rate @ v - robot.coriolis(q, v, v))
+        yield "energy_gradient", (own(q, v), rate @ v - C_v, jnp.abs(C_v) + turned_v)
     own = robot_member(robot, "inverse_dynamics")
     if own is not None:
-        yield "inverse_dynamics", (own(q, v, u, a), C_u + robot.gravity(q) + M @ a)
+        size = jnp.abs(C_u) + jnp.abs(G) + inertia @ jnp.abs(a) + turned_u
+        yield "inverse_dynamics", (own(q, v, u, a), C_u + G + M @ a, size)
 
 
-def check_agreement(name: str, given: Any, expected: Any, accuracy: float = ACCURACY) -> None:
+def check_agreement(
+    name: str, given: Any, expected: Any, size: Any = 0.0, accuracy: float = ACCURACY
+) -> None:
     """Raises ValueError where two arrays (points, ...) differ; entries that are not finite in both
     do not count.
+
+    Args:
+      name: of the method, for the message.
+      given, expected: what is compared.
+      size: of the terms in `expected` at each entry, at least |expected|; the unit of `expected`.
+      accuracy: largest difference as a share of the size.
+
+    Raises:
+      ValueError: a larger difference.
     """
     given, expected = np.asarray(given), np.asarray(expected)
     is_known = np.isfinite(given) & np.isfinite(expected)
     is_unknown = ~np.isfinite(given) & ~np.isfinite(expected)
-    scale = max(1.0, np.max(np.abs(expected[is_known]), initial=0.0))
+    size = np.where(np.isfinite(size), size, 0.0)
+    scale = np.maximum(np.abs(expected), size)[is_known]
     distance = np.abs(given[is_known] - expected[is_known])
-    is_equal = np.max(distance, initial=0.0) <= accuracy * scale
+    is_equal = np.all(distance <= accuracy * scale)
     if is_equal and np.all(is_known | is_unknown) and np.any(is_known | (given.size == 0)):
         return
     got = f"a difference of {np.max(distance, initial=0.0):.3g}"
-    words = "methods that agree with the formulas of `Robot` or `Plant`"
+    words = "methods that agree with the formulas of `Robot`, `Plant` or `Barrier`"
     remedy = "The proof uses these formulas; ij.testing has a check of each family."
     raise checks.fail(f"prove: {name}", checks.Words(got), words, remedy)
 
@@ -210,21 +233,28 @@ def agreement_of_plant(plant: Any) -> list[str]:
 
 def _plant_pairs(
     plant: Any, x: jax.Array, above: jax.Array
-) -> Iterator[tuple[str, tuple[jax.Array, jax.Array]]]:
-    """Name of a method and a level -> what it returns, and what follows from drift and gain."""
+) -> Iterator[tuple[str, tuple[jax.Array, jax.Array, jax.Array]]]:
+    """Name of a method and a level -> what it returns, what follows from drift and gain, and the
+    size of the terms in it.
+    """
     t = jnp.zeros(())
     drift, gain = plant.drift(t, x), plant.gain(t, x)
     for level in range(1, plant.order + 1):
         G = gain[level - 1]
-        product = G @ above if G.ndim == 2 else G * above
-        transposed = G.T @ above if G.ndim == 2 else product
-        rate = drift[level - 1] + product
+        G = G if G.ndim == 2 else jnp.diag(G)
+        rate = drift[level - 1] + G @ above
+        size = jnp.abs(drift[level - 1]) + jnp.abs(G) @ jnp.abs(above)
         found = plants.level_rate(plant, level, t, x, above)
-        yield f"level_rate of level {level}", (found, rate)
+        yield f"level_rate of level {level}", (found, rate, size)
         found = plants.level_input(plant, level, t, x, rate)
-        yield f"level_input of level {level}", (found, above)
+        yield (
+            f"level_input of level {level}",
+            (found, above, jnp.full_like(above, jnp.max(jnp.abs(above)))),
+        )
         found = plants.transposed_gain(plant, level, t, x, above)
-        yield f"transposed_gain of level {level}", (found, transposed)
+        terms = jnp.abs(G.T) @ jnp.abs(above)
+        yield f"transposed_gain of level {level}", (found, G.T @ above, terms)
         known = jnp.where(jnp.arange(plant.order)[:, None] < level, x, 0.0)
         alone = plants.level_rate(plant, level, t, known, above)
-        yield f"drift and gain of level {level} without the levels above", (alone, rate)
+        name = f"drift and gain of level {level} without the levels above"
+        yield name, (alone, rate, size)

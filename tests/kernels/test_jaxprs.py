@@ -162,6 +162,17 @@ def test_constants_and_primitives_of_inner_functions():
     assert any(np.array_equal(x, captured) for x in jaxprs.constants(inner))
 
 
+def test_constants_of_a_function_that_a_loop_calls():
+    """Before JAX 0.11 such a function keeps its constants for itself."""
+
+    def body(carry, _):
+        return jax.jit(lambda x: x @ jnp.diag(np.array([3.0, 5.0, 8.0])))(carry), None
+
+    traced = jax.make_jaxpr(lambda x: jax.lax.scan(body, x, None, length=2)[0])(jnp.ones(3))
+    found = [np.asarray(x) for x in jaxprs.constants(traced)]
+    assert any(np.array_equal(x, [3.0, 5.0, 8.0]) for x in found)
+
+
 def shape_of_first(x, y):
     return x
 

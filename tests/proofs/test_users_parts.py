@@ -14,8 +14,12 @@ from test_chains import lever
 
 import iblf_jax as ij
 from iblf_jax.core.pytree import Leaf, component, leaf, static
+from iblf_jax.kernels import jaxprs
+from iblf_jax.proofs import examination
 from iblf_jax.proofs.arms import arm_problem
 from iblf_jax.proofs.chains import chain_problem
+from iblf_jax.proofs.users_barriers import check_barrier
+from iblf_jax.proofs.users_parts import agreement_of_robot, check_agreement
 
 
 @jax.custom_jvp
@@ -153,6 +157,53 @@ def test_a_function_whose_numbers_changed_has_another_program(function, monkeypa
     assert bound() != before
 
 
+def by_table(x):
+    """A function with constants of its own, inside a loop over numbers that do not vary."""
+    return jax.jit(lambda y: y + jnp.sum(jnp.asarray(TABLE["array"])))(x)
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda v: v * jax.lax.scan(lambda c, _: (by_table(c), None), jnp.ones(()), None, 3)[0],
+        lambda v: v * jax.lax.while_loop(lambda c: c < 9.0, by_table, jnp.ones(())),
+        lambda v: TABLE["gain"] * v * without_slope(jnp.ones(())),
+    ],
+)
+def test_a_function_whose_numbers_changed_has_another_digest(function, monkeypatch):
+    def digest():
+        jax.clear_caches()
+        return examination.operations("f", lambda v: function(v), [jnp.zeros(1)]).digest
+
+    before = digest()
+    assert digest() == before
+    monkeypatch.setitem(TABLE, "gain", 5.0)
+    monkeypatch.setitem(TABLE, "array", np.array([1.0, 3.0]))
+    assert digest() != before
+
+
+def test_a_function_that_calls_python_has_another_digest_each_time():
+    """No text holds what the called function computes."""
+
+    def function(v):
+        return v * called_back(jnp.ones(1))
+
+    digests = {examination.operations("f", function, [jnp.zeros(1)]).digest for _ in range(2)}
+    assert len(digests) == 2
+
+
+def test_only_the_primitive_of_the_name_is_admitted():
+    """A version of JAX may write jnp.stack with other primitives."""
+    found = examination._primitive_of("stack", lambda x: jnp.floor(jnp.stack([x, x])), 0.0)
+    assert {primitive.name for primitive in found} <= {"stack"}
+
+
+def test_functions_that_are_called_are_found_and_have_no_rules_of_their_own():
+    names = {primitive.name for primitive in examination.INNER}
+    assert names and names <= set(jaxprs.CALLED)
+    assert not any("custom" in name for name in names)
+
+
 SMOOTH = {
     "a polynomial": lambda v: 3.0 + v * (2.0 + v * (1.0 + v**3)),
     "a loop": lambda v: jax.lax.fori_loop(0, 3, lambda i, x: x * v, v),
@@ -286,6 +337,33 @@ def test_a_robot_whose_matrices_contradict_each_other_is_refused():
     plant = Unbalanced(1.2)
     with pytest.raises(ValueError, match="coriolis"):
         arm_problem(pendulum(plant=plant, model=plant), {})
+
+
+@component
+class Light(Link):
+    """A light arm whose inertia matrix is not symmetric."""
+
+    n: ClassVar[int] = 2
+
+    def mass_matrix(self, q):
+        return 1e-9 * jnp.array([[5.0, 1.0], [3.0, 5.0]])
+
+    def gravity(self, q):
+        return jnp.zeros_like(q)
+
+
+def test_a_light_robot_is_compared_in_the_size_of_its_own_inertia():
+    with pytest.raises(ValueError, match="mass_matrix"):
+        agreement_of_robot(Light())
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"), [([1e-9], [3e-9]), ([1e9, 1.0], [1e9, 2.0]), ([1.0, 1.0], [1.0, np.inf])]
+)
+def test_a_difference_is_a_share_of_the_number_itself(given, expected):
+    with pytest.raises(ValueError, match="a difference of"):
+        check_agreement("part", given, expected)
+    check_agreement("part", expected, expected)
 
 
 def test_methods_of_a_robot_of_a_user_are_an_assumption():
@@ -470,6 +548,7 @@ class Altered(ij.barriers.Mapping):
     of_value: Any = static(default=None)
     of_slope: Any = static(default=None)
     of_alpha: Any = static(default=None)
+    of_ratio: Any = static(default=None)
 
     def value(self, tube, q):
         return super().value(tube, q) * (self.of_value or one)(tube, q)
@@ -480,9 +559,16 @@ class Altered(ij.barriers.Mapping):
     def virtual_velocity(self, tube, q, k1, o):
         return super().virtual_velocity(tube, q, k1, o) * (self.of_alpha or one)(tube, q)
 
+    def error_over_slope(self, tube, q):
+        return super().error_over_slope(tube, q) * (self.of_ratio or one)(tube, q)
+
 
 def one(tube, q):
     return jnp.ones_like(q)
+
+
+def two_sides(tube, q):
+    return jnp.where(q > 0.0, 2.0, 1.0)
 
 
 BARRIERS = {
@@ -504,15 +590,23 @@ BARRIERS = {
         "at e1 = 0",
     ),
     "a slope that is none of V1": ({"of_slope": lambda tube, q: 2.0 * one(tube, q)}, "slope"),
-    "a floor": ({"of_alpha": lambda tube, q: jnp.floor(q / tube.k_u)}, "no case of the sign"),
+    "a floor": ({"of_alpha": lambda tube, q: jnp.floor(q / tube.k_u)}, "floor, which a proof does"),
+    "a floor in e1/s": (
+        {"of_ratio": lambda tube, q: 1.0 + jnp.floor(1e-6 * (q / tube.k_u) ** 2)},
+        "error_over_slope with floor, which a proof does not know",
+    ),
+    "its own rule in e1/s": (
+        {"of_ratio": lambda tube, q: 0.2 * without_slope(q / tube.k_u) * tube.k_u / q},
+        "error_over_slope with custom_jvp_call, which a proof does not know",
+    ),
     "fewer digits": (
         {"of_slope": lambda tube, q: (q / tube.k_u).astype(jnp.float32).astype(float)},
-        "no case of the sign",
+        "does not know",
     ),
-    "its own rule": ({"of_slope": lambda tube, q: without_slope(q / tube.k_u)}, "no case of"),
+    "its own rule": ({"of_slope": lambda tube, q: without_slope(q / tube.k_u)}, "does not know"),
     "stop_gradient": (
         {"of_alpha": lambda tube, q: jax.lax.stop_gradient(q / tube.k_u)},
-        "no case of the sign",
+        "does not know",
     ),
 }
 
@@ -538,12 +632,72 @@ def test_a_registered_barrier_is_not_one_of_the_package(monkeypatch):
         arm_problem(with_barrier(Altered(**length)), {})
 
 
-def test_the_barriers_of_the_package_satisfy_what_is_required_of_others():
-    from iblf_jax.proofs.users_barriers import check_barrier
+def digests_of(barrier, n):
+    """What `check_barrier` finds of a barrier without its guard."""
+    object.__setattr__(barrier, "guard", -np.inf)
+    return check_barrier("barrier", barrier, jnp.asarray(0.1), n=n, homogeneous=True)
 
+
+def test_the_barriers_of_the_package_satisfy_what_is_required_of_others():
     for barrier in (ij.barriers.Integral(), ij.barriers.Log(), ij.barriers.Mapping()):
-        object.__setattr__(barrier, "guard", -np.inf)
-        check_barrier("barrier", barrier, jnp.asarray(0.1), homogeneous=True)
+        digests_of(barrier, 2)
+
+
+@component
+class Shifted(ij.barriers.Mapping):
+    """A barrier on the error of another joint in one of its methods."""
+
+    method: str = static(default="value")
+    move: Any = static(default=lambda q: q[::-1])
+
+    def value(self, tube, q):
+        return super().value(tube, self.move(q) if self.method == "value" else q)
+
+    def slope(self, tube, q):
+        return super().slope(tube, self.move(q) if self.method == "slope" else q)
+
+    def virtual_velocity(self, tube, q, k1, o):
+        moved = self.move(q) if self.method == "virtual_velocity" else q
+        return super().virtual_velocity(tube, moved, k1, o)
+
+
+@pytest.mark.parametrize("method", ["value", "slope", "virtual_velocity"])
+def test_a_barrier_whose_joints_mix_is_refused(method):
+    with pytest.raises(ValueError, match=f"{method}: got .* depends on another joint"):
+        digests_of(Shifted(method=method), 2)
+
+
+def test_joints_may_not_mix_for_the_number_of_joints_of_the_arm():
+    digests_of(Shifted(move=lambda q: jnp.roll(q, 2)), 2)
+    with pytest.raises(ValueError, match="depends on another joint"):
+        digests_of(Shifted(move=lambda q: jnp.roll(q, 2)), 3)
+
+
+@component
+class Kinked(Altered):
+    """A barrier with twice the slope above e1 = 0, and a ratio that jumps there."""
+
+    def error_at(self, V, tube, above):
+        return None
+
+
+def test_a_ratio_that_jumps_although_the_barrier_denies_it_is_refused():
+    barrier = Kinked(
+        of_value=two_sides, of_slope=two_sides, of_ratio=lambda tube, q: 1.0 / two_sides(tube, q)
+    )
+    assert not barrier.ratio_jumps
+    with pytest.raises(ValueError, match="at e1 = 0"):
+        digests_of(barrier, 1)
+
+
+def test_a_changed_ratio_of_a_barrier_has_another_digest(monkeypatch):
+    """The ratio e1/s is in the law of every level above the first one."""
+    barrier = Altered(of_ratio=lambda tube, q: one(tube, q) + 1e-9 * (TABLE["gain"] - 1.0))
+    before = digests_of(barrier, 1)
+    assert digests_of(barrier, 1) == before
+    monkeypatch.setitem(TABLE, "gain", 2.0)
+    jax.clear_caches()
+    assert digests_of(barrier, 1) != before
 
 
 # --- domains of functions -------------------------------------------------------------------------
