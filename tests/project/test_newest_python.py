@@ -324,11 +324,3 @@ def test_a_step_that_fails_is_shown_with_its_output():
         tool.run("a step", [sys.executable, "-uc", code])
     with pytest.raises(tool.UnavailableError, match="a step did not start"):
         tool.run("a step", ["/no/such/program"])
-
-
-def test_ci_runs_the_tests_in_both_environments_and_fails_without_the_second():
-    text = (ROOT / ".ci" / "run").read_text()
-    assert "set -euo pipefail" in text
-    waits = text.index('wait "$newest" || {')
-    assert "exit 1" in text[waits : text.index("\n", waits)]
-    assert text.index("tools/newest_python python -m pytest") > waits
