@@ -26,7 +26,11 @@ def answer(line: str) -> None:
     backend, name = line.strip().split(" ", 1)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        run = ij.simulate(scenarios()[name](), backend=backend, **RUN)
+        scenario = scenarios()[name]()
+        method = "rk4"
+        if scenario.process_noise is not None:
+            method = "euler_maruyama"
+        run = ij.simulate(scenario, backend=backend, method=method, **RUN)
     end = [getattr(run, x)[-1].tolist() for x in ("q", "dq", "tau")]
     print(json.dumps({"name": name, "backend": backend, "end": end}), flush=True)
 

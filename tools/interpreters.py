@@ -28,5 +28,8 @@ def version_of(python: Path) -> tuple[int, int] | None:
         return None
     if done.returncode:
         return None
-    major, minor = map(int, done.stdout.split())
+    try:
+        major, minor = map(int, done.stdout.split())
+    except ValueError:
+        return None
     return major, minor

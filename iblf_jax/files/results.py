@@ -54,6 +54,7 @@ import numpy as np
 from iblf_jax.core import checks
 from iblf_jax.core.optional import attributes
 from iblf_jax.core.pytree import field_values
+from iblf_jax.core.whole_files import written_whole
 from iblf_jax.engine import RunRequest
 from iblf_jax.files import components, tuning
 from iblf_jax.files.modules import tables_of_modules
@@ -162,14 +163,15 @@ def save(result: Any, path: str | os.PathLike) -> Path:
         "written_by": {"iblf_jax": version("iblf_jax"), "jax": jax.__version__},
         "result": writer.node(result, name),
     }
-    temporary = target.with_name(f".{target.name}.partial")
-    with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
+    with (
+        written_whole(target) as file,
+        zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive,
+    ):
         archive.writestr(DESCRIPTION, json.dumps(description, allow_nan=False, indent=1))
         for number, array in enumerate(writer.arrays):
             content = io.BytesIO()
             np.save(content, array, allow_pickle=False)
             archive.writestr(f"{number}.npy", content.getbuffer())
-    os.replace(temporary, target)
     return target
 
 
@@ -253,12 +255,18 @@ class _Writer:
             return self.scenario(value, key)
         for name, cls in MAPPINGS.items():
             if type(value) is cls:
-                pairs = value.items()
-                return {name: [[self.node(k, key), self.node(x, f"{key}[{k}]")] for k, x in pairs]}
+                return {name: [self.pair(k, x, key) for k, x in value.items()]}
         for name, cls in SEQUENCES.items():
             if type(value) is cls:
                 return {name: [self.node(x, f"{key}[{i}]") for i, x in enumerate(value)]}
         return self.object(value, key)
+
+    def pair(self, name: Any, value: Any, key: str) -> list[Any]:
+        """The nodes of an entry of a dict: of its name and of its value."""
+        if not isinstance(name, KEY_OF_DICT):
+            came = Words(f"a dict with the key {name!r}")
+            raise checks.fail(key, came, "keys of type str, int or float")
+        return [self.node(name, key), self.node(value, f"{key}[{name}]")]
 
     def array(self, value: Any, kind: str, key: str) -> dict[str, Any]:
         """The node of an array."""
@@ -269,8 +277,12 @@ class _Writer:
         described = {"type": str(array.dtype), "shape": list(array.shape)}
         if array.dtype.hasobject:
             raise checks.fail(key, Words("an array of objects"), "numbers, booleans or texts")
-        if array.dtype.kind == "V":  # bfloat16, which the format of NumPy does not know
-            array = array.view(f"u{array.dtype.itemsize}")
+        if array.dtype == jnp.bfloat16:  # the format of NumPy does not know it
+            array = array.view(np.uint16)
+        elif array.dtype.kind == "V" or array.dtype.isbuiltin == DEFINED_BY_A_LIBRARY:
+            expected = "numbers of NumPy or bfloat16, booleans or texts"
+            remedy = "Convert them to a type of NumPy, such as float32, before saving."
+            raise checks.fail(key, Words(f"an array of type {array.dtype}"), expected, remedy)
         self.arrays.append(array)
         return {kind: len(self.arrays) - 1, **described}
 
@@ -356,6 +368,9 @@ def _name_of_member(cls: type) -> str | None:
 MADE_AGAIN = {("Proof", "problem")}
 """Class and name of the properties that hold functions, which no file can."""
 MAPPINGS: dict[str, Any] = {"dict": dict, "counter": Counter}
+KEY_OF_DICT = str | float | int
+DEFINED_BY_A_LIBRARY = 2
+"""The value of `numpy.dtype.isbuiltin` of types that NumPy does not define, such as float8_e5m2."""
 SEQUENCES: dict[str, Any] = {"tuple": tuple, "list": list}
 
 
@@ -476,7 +491,7 @@ class _Reader:
             if len(_listed(pair, key)) != 2:
                 raise checks.fail(key, pair, "a pair of a name and a value")
             name = self.value(pair[0], key)
-            if not isinstance(name, str | float | int):
+            if not isinstance(name, KEY_OF_DICT):
                 raise checks.fail(key, name, "a name or a number")
             found[name] = self.value(pair[1], f"{key}[{name}]")
         return MAPPINGS[kind](found)

@@ -25,6 +25,7 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.core.progress import bar
+from iblf_jax.core.whole_files import written_whole
 from iblf_jax.kernels import (
     ENCLOSURE_FLAGS,
     IntervalKernel,
@@ -250,16 +251,12 @@ class _Results:
             self.save()
 
     def save(self) -> None:
-        """Writes the file under another name and renames it, so that it is complete."""
+        """Writes the file."""
         self.saved = time.monotonic()
         if self.path is None:
             return
-        temporary = self.path.with_name(f".{self.path.name}.{os.getpid()}.partial")
-        with open(temporary, "wb") as file:
+        with written_whole(self.path) as file:
             np.savez(file, digest=np.asarray(self.digest), boxes=self.boxes, done=self.done)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, self.path)
 
     def _load(self, path: Path) -> None:
         """Reads the file.

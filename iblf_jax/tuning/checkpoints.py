@@ -22,6 +22,7 @@ from iblf_jax.core import checks
 from iblf_jax.core.optional import has_members
 from iblf_jax.core.program_digest import CallsPythonError, program_digest
 from iblf_jax.core.pytree import field_values
+from iblf_jax.core.whole_files import written_whole
 from iblf_jax.studies.store_config import computed_by, structure
 from iblf_jax.tuning.evaluation import Evaluator
 from iblf_jax.tuning.search import Search
@@ -125,13 +126,8 @@ def save_checkpoint(search: Search, path: str | os.PathLike, mark: str) -> None:
     """
     arrays = _named_leaves(search.state)
     arrays |= {f"history_{name}": np.stack(x) for name, x in search.history.items()}
-    target = Path(path)
-    temporary = target.with_name(f".{target.name}.{os.getpid()}.partial")
-    with open(temporary, "wb") as file:
+    with written_whole(Path(path)) as file:
         np.savez(file, allow_pickle=False, fingerprint=np.asarray(mark), **arrays)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(temporary, target)
 
 
 def load_checkpoint(path: str | os.PathLike, search: Search, mark: str) -> None:

@@ -63,6 +63,7 @@ def test_laws_that_are_alike_have_their_own_programs(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.members
 @pytest.mark.parametrize("part", range(4))
 def test_every_member_has_its_own_program(tmp_path_factory, part):
     """In four parts, with one folder in common if one process runs them."""

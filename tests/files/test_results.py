@@ -8,6 +8,7 @@ import importlib
 import inspect
 import io
 import json
+import re
 import typing
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
@@ -388,6 +389,40 @@ def test_an_unknown_class_in_a_result_is_refused(run, tmp_path):
     with pytest.raises(ValueError, match="traced"):
         jax.jit(lambda x: dataclasses.replace(run, q=x).save(tmp_path / "odd"))(run.q)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("dtype", ["int4", "float8_e4m3fn", "float8_e5m2"])
+def test_an_array_that_could_not_be_read_is_refused(run, dtype, tmp_path):
+    odd = dataclasses.replace(run, measured={"x": jnp.zeros(2, dtype)})
+    with pytest.raises(ValueError, match=rf"Rollout.measured\[x\]: got an array of type {dtype}"):
+        odd.save(tmp_path / "odd")
+    records = np.zeros(2, [("a", float)])
+    with pytest.raises(ValueError, match=r"Rollout.measured: got an array of type \[\('a'"):
+        dataclasses.replace(run, measured=records).save(tmp_path / "odd")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", [(0, 1), None, np.int64(1)])
+def test_a_key_of_a_dict_that_could_not_be_read_is_refused(run, name, tmp_path):
+    odd = dataclasses.replace(run, measured={"inner": {name: 1.0}})
+    message = re.escape(f"Rollout.measured[inner]: got a dict with the key {name!r}")
+    with pytest.raises(ValueError, match=message):
+        odd.save(tmp_path / "odd")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_failed_save_leaves_what_was_there(run, tmp_path, monkeypatch):
+    path = tmp_path / "run"
+    path.write_bytes(b"old")
+
+    def full(*words, **options):
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(np, "save", full)
+    with pytest.raises(OSError, match="no space"):
+        run.save(path)
+    assert path.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [path]
 
 
 # --- files that are not what was saved

@@ -7,6 +7,9 @@ from __future__ import annotations
 import configparser
 import os
 import re
+import select
+import shutil
+import signal
 import subprocess
 import sys
 import threading
@@ -161,7 +164,69 @@ def test_the_command_has_the_environment_of_the_copy(machine, tmp_path, monkeypa
     assert seen["PATH"].split(os.pathsep)[:2] == first
 
 
+def end_of(monkeypatch, machine, tmp_path, *command):
+    """The exit code of a call whose environment is there."""
+
+    def prepare(options, stack):
+        stack.callback(tool.is_removed, tmp_path / "copy")
+        return machine, tmp_path / "packages", tmp_path / "copy"
+
+    (tmp_path / "copy" / "tree").mkdir(parents=True)
+    handler = signal.getsignal(signal.SIGTERM)
+    monkeypatch.setattr(tool, "prepare", prepare)
+    monkeypatch.setattr(sys, "argv", ["newest_python", *command])
+    try:
+        return tool.main()
+    finally:
+        signal.signal(signal.SIGTERM, handler)
+
+
+def test_a_command_that_is_not_there_is_no_missing_environment(
+    machine, tmp_path, monkeypatch, capfd
+):
+    assert end_of(monkeypatch, machine, tmp_path, "pyhton", "-m", "pytest") == tool.NOT_STARTED
+    assert "the command did not start: " in capfd.readouterr().err
+    assert not (tmp_path / "copy").exists()
+
+
+def test_a_copy_that_cannot_be_removed_does_not_change_the_exit_code(
+    machine, tmp_path, monkeypatch, capfd
+):
+    def stays(folder):
+        raise tool.UnavailableError(f"removing {folder} failed")
+
+    monkeypatch.setattr(tool, "_remove", stays)
+    command = [sys.executable, "-c", "raise SystemExit(3)"]
+    assert end_of(monkeypatch, machine, tmp_path, *command) == 3
+    assert f"removing {tmp_path / 'copy'} failed" in capfd.readouterr().err
+    left = tmp_path / "copies" / "left"
+    left.mkdir(parents=True)
+    tool.lock_of(left).touch()
+    tool.remove_unused(machine)
+    assert tool.lock_of(left).exists()
+
+
 # --- calls at the same time, and calls that were interrupted -------------------------------------
+
+
+def test_what_a_step_has_started_ends_with_the_call(tmp_path):
+    """Here the step itself ends the call, once its child runs; the child holds a pipe open."""
+
+    def terminate(number, frame):
+        raise SystemExit(128 + number)
+
+    os.mkfifo(tmp_path / "pipe")
+    pipe = os.open(tmp_path / "pipe", os.O_RDONLY | os.O_NONBLOCK)
+    handler = signal.signal(signal.SIGTERM, terminate)
+    step = "exec 3> pipe; sleep 30 & kill -TERM $PPID; wait"
+    try:
+        with pytest.raises(SystemExit):
+            tool.run("a step", ["sh", "-c", step], folder=tmp_path)
+    finally:
+        signal.signal(signal.SIGTERM, handler)
+    assert select.select([pipe], [], [], 10.0)[0], "the child is still there"
+    assert os.read(pipe, 1) == b""
+    os.close(pipe)
 
 
 def test_only_what_no_call_uses_is_removed(machine, tmp_path):
@@ -227,8 +292,18 @@ def test_a_lock_is_awaited(tmp_path):
 def test_a_python_that_cannot_be_used_is_named(tmp_path):
     done = call("true", NEWEST_PYTHON="/no/such/python", NEWEST_PYTHON_FOLDER=str(tmp_path))
     assert done.returncode == tool.UNAVAILABLE
-    assert "the environment cannot be made: /no/such/python" in done.stderr
-    assert "it must be a Python 3.13, 3.12" in done.stderr
+    assert (
+        "the environment cannot be made: /no/such/python is no Python that starts and has venv and"
+        " ensurepip; it must be Python 3.13 or 3.12." in done.stderr
+    )
+
+
+def test_a_program_that_is_no_python_and_one_of_another_version_are_told_apart(monkeypatch):
+    with pytest.raises(tool.UnavailableError, match=r"echo is no Python that starts"):
+        tool.found_python(shutil.which("echo"))
+    monkeypatch.setattr(tool.interpreters, "version_of", lambda python: (3, 11))
+    with pytest.raises(tool.UnavailableError, match=r"old is Python 3\.11; it must be Python 3"):
+        tool.found_python("/of/an/old")
 
 
 def test_without_any_python_and_root_it_says_what_to_do(tmp_path, monkeypatch):
@@ -249,11 +324,3 @@ def test_a_step_that_fails_is_shown_with_its_output():
         tool.run("a step", [sys.executable, "-uc", code])
     with pytest.raises(tool.UnavailableError, match="a step did not start"):
         tool.run("a step", ["/no/such/program"])
-
-
-def test_ci_runs_the_tests_in_both_environments_and_fails_without_the_second():
-    text = (ROOT / ".ci" / "run").read_text()
-    assert "set -euo pipefail" in text
-    waits = text.index('wait "$newest" || {')
-    assert "exit 1" in text[waits : text.index("\n", waits)]
-    assert text.index("tools/newest_python python -m pytest") > waits

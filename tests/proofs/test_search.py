@@ -192,6 +192,23 @@ def test_checkpoints_of_other_problems_are_refused(tmp_path):
         search(waves, LOW, HIGH, [-1.2], progress=False, checkpoint=path)
 
 
+def test_a_checkpoint_that_cannot_be_written_leaves_the_one_before(tmp_path, monkeypatch):
+    path = tmp_path / "proof.npz"
+    results = module._Results(path, "digest", 3)
+    results.save()
+    before = path.read_bytes()
+
+    def full(file, **arrays):
+        file.write(b"half")
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(np, "savez", full)
+    with pytest.raises(OSError, match="no space"):
+        results.save()
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
 def test_a_checkpoint_belongs_to_its_units(tmp_path, monkeypatch):
     """Units of other places do not count as proved, although their number is the same."""
     path = tmp_path / "proof.npz"

@@ -829,6 +829,22 @@ def test_a_smoothed_peak_is_followed_to_where_the_peak_itself_is_lowest(tmp_path
     np.testing.assert_array_equal(again.history["loss"], sharp.history["loss"])
 
 
+def test_a_checkpoint_that_cannot_be_written_leaves_the_one_before(tmp_path, monkeypatch):
+    search, path = followed([1.0], 0, steps=1), tmp_path / "search.npz"
+    save_checkpoint(search, path, "mark")
+    before = path.read_bytes()
+
+    def full(file, **arrays):
+        file.write(b"half")
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(np, "savez", full)
+    with pytest.raises(OSError, match="no space"):
+        save_checkpoint(search, path, "mark")
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
 @pytest.mark.slow
 def test_only_active_starts_are_evaluated_in_groups_of_one_shape(nominal):
     candidates = nominal.candidates(np.arange(20.0)[:, None] * np.ones(6))

@@ -1,0 +1,103 @@
+"""`.ci/run` fails where one of its steps does, shows why, and leaves nothing running.
+
+It runs here in a folder in which every program that it calls is a short script.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import select
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+from conftest import ROOT
+
+SCRIPT = """#!/bin/sh
+echo "$0 $*" >> calls
+if [ "$0 $*" = "$STAYS" ]; then exec 3> pipe; sleep 30 & echo 1 > ready; wait; fi
+if [ "$0 $*" = "$FAILS" ]; then cat ready; echo "the reason"; exit 3; fi
+"""
+"""A program: it notes its call, and then waits with a child that holds a pipe, fails once that
+child runs, or succeeds."""
+
+NEWEST = "tools/newest_python"
+TESTS_OF_NEWEST = f"{NEWEST} python -m pytest -m not release and not site and (not slow or members)"
+SITE = ".venv-test/bin/python docs/build.py"
+LINT = ".venv-test/bin/ruff check ."
+TESTS_OF_ROS = ".venv-ros/bin/python -m pytest -n 2 --dist loadfile " + " ".join(
+    f"tests/deployment/ros2/test_{name}.py"
+    for name in ("law_node", "simulated_robot", "demo", "recorded_demo")
+)
+INSTALLATION_OF_ROS = (
+    ".venv-ros/bin/pip install -q -c constraints.txt -e .[ros,robots] pytest pytest-xdist"
+    " hypothesis"
+)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A folder with `.ci/run` and the programs that it calls."""
+    programs = [NEWEST, "path/python3", "readme_command"]
+    programs += [f".venv-test/bin/{name}" for name in ("python", "ruff", "mypy")]
+    programs += [f".venv-ros/bin/{name}" for name in ("python", "pip")]
+    for name in programs:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(SCRIPT)
+        (tmp_path / name).chmod(0o755)
+    (tmp_path / ".ci").mkdir()
+    shutil.copy(ROOT / ".ci" / "run", tmp_path / ".ci" / "run")
+    command = "<!-- test command -->\n```bash\n./readme_command\n```\n"
+    (tmp_path / "README.md").write_text(command)
+    os.mkfifo(tmp_path / "ready")
+    return tmp_path
+
+
+def ci(folder: Path, **variables: str) -> subprocess.CompletedProcess:
+    """What a run prints and returns."""
+    path = os.pathsep.join([str(folder / "path"), os.environ["PATH"]])
+    return subprocess.run(
+        ["bash", ".ci/run"],
+        cwd=folder,
+        env=os.environ | {"PATH": path, "FAILS": "", "STAYS": ""} | variables,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        timeout=60,
+    )
+
+
+def test_every_step_is_called(folder):
+    done = ci(folder)
+    assert done.returncode == 0, done.stdout
+    calls = (folder / "calls").read_text().splitlines()
+    for call in (NEWEST, TESTS_OF_NEWEST, SITE, LINT, INSTALLATION_OF_ROS, TESTS_OF_ROS):
+        assert call in [line.strip() for line in calls]
+
+
+@pytest.mark.parametrize(
+    "step", [f"{NEWEST} ", TESTS_OF_NEWEST, SITE, LINT, INSTALLATION_OF_ROS, TESTS_OF_ROS]
+)
+def test_a_step_that_fails_is_shown(folder, step):
+    (folder / "ready").unlink()
+    (folder / "ready").write_text("")
+    done = ci(folder, FAILS=step)
+    assert done.returncode not in (0, 127)
+    assert "the reason" in done.stdout
+
+
+@pytest.mark.parametrize("background", [f"{NEWEST} ", SITE, INSTALLATION_OF_ROS, TESTS_OF_ROS])
+def test_what_runs_in_the_background_ends_with_a_failure(folder, background):
+    """The failure comes when the job in the background has a child, which holds a pipe open."""
+    os.mkfifo(folder / "pipe")
+    pipe = os.open(folder / "pipe", os.O_RDONLY | os.O_NONBLOCK)
+    step = "./readme_command " if background == f"{NEWEST} " else LINT
+    done = ci(folder, FAILS=step, STAYS=background)
+    assert done.returncode == 3
+    assert "the reason" in done.stdout
+    assert select.select([pipe], [], [], 10.0)[0], "the child is still there"
+    assert os.read(pipe, 1) == b""
+    os.close(pipe)
+    assert not re.search("Terminated|Killed", done.stdout)
