@@ -60,7 +60,7 @@ WARNINGS = "backend warnings"
 
 
 OUT_OF_MEMORY = "RESOURCE_EXHAUSTED"
-"""XLA's word for a lack of memory, which another executor does not mend."""
+"""XLA's word for a lack of memory, which another executor does not change."""
 
 
 def _warn_once(text: str) -> None:

@@ -255,6 +255,6 @@ def _plant_pairs(
         terms = jnp.abs(G.T) @ jnp.abs(above)
         yield f"transposed_gain of level {level}", (found, G.T @ above, terms)
         known = jnp.where(jnp.arange(plant.order)[:, None] < level, x, 0.0)
-        alone = plants.level_rate(plant, level, t, known, above)
+        without_levels = plants.level_rate(plant, level, t, known, above)
         name = f"drift and gain of level {level} without the levels above"
-        yield name, (alone, rate, size)
+        yield name, (without_levels, rate, size)

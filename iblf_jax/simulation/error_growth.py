@@ -273,15 +273,15 @@ def update(
     part = growth.error
     if now is not None:
         part = part[0]  # of the `_variables`
-    moving = (part, torque_error)
-    small, back = _scales(moving)
+    errors = (part, torque_error)
+    small, back = _scales(errors)
     base = integrated_part(state)
-    plain = _rate(scenario, t, state, base, dt, torque)
+    rate = _rate(scenario, t, state, base, dt, torque)
     if torque is not None:
         torque = torque + small * torque_error
     shifted = _rate(scenario, t, state, _moved(base, part, small), dt, torque)
     flat, unflatten = ravel_pytree(part)
-    grown = flat + dt * back * (ravel_pytree(shifted)[0] - ravel_pytree(plain)[0])
+    grown = flat + dt * back * (ravel_pytree(shifted)[0] - ravel_pytree(rate)[0])
     rounding = jnp.finfo(dt.dtype).eps * jnp.abs(ravel_pytree(base)[0])
     grown = grown + local_error
     grown = grown + jnp.where(grown < 0, -rounding, rounding)
@@ -361,11 +361,11 @@ def _reaches_code(
 ) -> jax.Array:
     """Whether an error of the levels, (r, n), reaches the next code of a reading, () bool."""
     step = _resolution(scenario, state.x)
-    rounded, plain = (
+    rounded, exact = (
         _reading(sensor, scenario, state, normal)
         for sensor in (scenario.sensor, unrounded(scenario.sensor))
     )
-    distance = 0.5 * step - jnp.abs(rounded - plain)
+    distance = 0.5 * step - jnp.abs(rounded - exact)
     blur = ARITHMETIC * jnp.finfo(step.dtype).eps * jnp.abs(rounded)
     return jnp.any((step > 0) & (jnp.abs(error) + blur >= distance))
 
@@ -384,8 +384,8 @@ def _after_law(
     sampling: Any = scenario.sampling
     always = dataclasses.replace(scenario, sampling=dataclasses.replace(sampling, trigger=None))
     part, memory, commands, sent = growth.error
-    held = before.sampled
-    states = (before.controller, before.observer, held.sensor)
+    sampled = before.sampled
+    states = (before.controller, before.observer, sampled.sensor)
     small, back = _scales((part.q, part.dq, part.higher, memory))
 
     def law(scale: Any) -> tuple[jax.Array, Any]:
@@ -394,28 +394,28 @@ def _after_law(
         )
         controller, observer, sensor = _moved(states, memory, scale)
         at = before._replace(q=q, dq=dq, higher=higher, controller=controller, observer=observer)
-        at = at._replace(sampled=held._replace(sensor=sensor, sent=()))
+        at = at._replace(sampled=sampled._replace(sensor=sensor, sent=()))
         after = run_sampled_law(always, t, at, normal)
         after_memory = (after.controller, after.observer, after.sampled.sensor)
         return after.sampled.commands[0], after_memory
 
-    plain, shifted = law(jnp.zeros_like(small)), law(small)
-    command = plain[0]
+    unshifted, shifted = law(jnp.zeros_like(small)), law(small)
+    command = unshifted[0]
     command_error, memory = _moved(
-        jax.tree.map(jnp.zeros_like, plain), _difference(plain, shifted), back
+        jax.tree.map(jnp.zeros_like, unshifted), _difference(unshifted, shifted), back
     )
     blur = ARITHMETIC * jnp.finfo(command.dtype).eps * jnp.abs(command)
     reaches, peak = jnp.zeros((), bool), growth.peak
     if sampling.trigger is not None:
         peak = jnp.maximum(peak, jnp.abs(command))
         relative = sampling.trigger.relative
-        size = jnp.abs(held.sent.input)
+        size = jnp.abs(sampled.sent.input)
         threshold = relative * size + sampling.trigger.absolute
-        distance = jnp.abs(jnp.max(jnp.abs(command - held.sent.input) - threshold))
+        distance = jnp.abs(jnp.max(jnp.abs(command - sampled.sent.input) - threshold))
         moved = jnp.abs(command_error - sent.input) + relative * jnp.abs(sent.input)
         rounding = blur + ARITHMETIC * jnp.finfo(size.dtype).eps * (size + threshold)
-        reaches = (jnp.max(moved + rounding) >= distance) & (held.sent.number > 0)
-        fires = state.sampled.sent.number > held.sent.number
+        reaches = (jnp.max(moved + rounding) >= distance) & (sampled.sent.number > 0)
+        fires = state.sampled.sent.number > sampled.sent.number
         command_error = jnp.where(fires, command_error, sent.input)
         sent = sent._replace(input=command_error, torque=command_error)
     if _rounds_torque(scenario):
