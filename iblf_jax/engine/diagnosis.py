@@ -485,7 +485,7 @@ def _inaccurate(result: Rollout, status: Status, steps: int) -> str:
             " differ by up to that bound, whatever dt is. Statistics of many such runs are not"
             " concerned. Refine the resolution, such as sensor.counts or actuator.step, to reduce"
             f" the bound, or compare this run with one at dt={float(result.dt) / 10.0:g}: where"
-            " its codes are certain, it has no such bound."
+            " no error reaches a code, it has no such bound."
         )
     step = _smaller_step(result, steps)
     if not step:
