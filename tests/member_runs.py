@@ -1,6 +1,6 @@
 """Runs of the scenarios of members, in processes that are told apart.
 
-Each line of the input names a backend and a member.  The answer is a line of JSON with position,
+Each line of the input names a backend, a method and a member.  The answer is a line of JSON with position,
 velocity and torque at the end of a short run.  With `--apart`, each line gets a process of its own;
 it starts with the package imported, and with nothing computed or compiled.
 """
@@ -23,11 +23,10 @@ def answer(line: str) -> None:
     """Runs the scenario that a line names and prints where it ends."""
     from scenarios_of_members import scenarios  # it computes, which a process that forks must not
 
-    backend, name = line.strip().split(" ", 1)
+    backend, method, name = line.strip().split(" ", 2)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         scenario = scenarios()[name]()
-        method = "rk4"
         if scenario.process_noise is not None:
             method = "euler_maruyama"
         run = ij.simulate(scenario, backend=backend, method=method, **RUN)
