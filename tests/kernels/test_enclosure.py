@@ -353,7 +353,9 @@ def test_a_kernel_that_does_not_round_outward_is_refused(monkeypatch):
         enclosure.library(source.replace("fesetround(FE_UPWARD)", "fesetround(FE_TONEAREST)"))
     # The flags of -ffast-math, which itself would change the rounding of the whole process.
     flags = ("-O2", "-fno-rounding-math", "-fassociative-math", "-fno-signed-zeros")
-    monkeypatch.setattr(enclosure, "ENCLOSURE_FLAGS", (*flags, "-freciprocal-math", "-ffinite-math-only"))
+    monkeypatch.setattr(
+        enclosure, "ENCLOSURE_FLAGS", (*flags, "-freciprocal-math", "-ffinite-math-only")
+    )
     with pytest.raises(ToolchainError, match="rounding mode"):
         enclosure.library(source + "\n// without the flags of the rounding mode")
 
