@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import marshal
 import site
 import sysconfig
 import types
@@ -35,6 +36,9 @@ import numpy as np
 CUSTOM_RULES = (jax.custom_jvp, jax.custom_vjp)
 PLAIN_TYPES = (int, str, bytes, types.NoneType, np.dtype)
 """Types whose values are equal only if they are the same to a program, given their class."""
+MARSHALLED = frozenset((bool, int, float, str, bytes, types.NoneType))
+MARSHAL_VERSION = 2
+"""Later formats depend on how often an object is referenced; earlier ones write floats as text."""
 NOT_BEHAVIOUR = {
     *("__module__", "__qualname__", "__doc__", "__dict__", "__weakref__", "__annotations__"),
     *("__firstlineno__", "__static_attributes__"),
@@ -42,7 +46,7 @@ NOT_BEHAVIOUR = {
     *("__dataclass_fields__", "__dataclass_params__", "__match_args__", "__init__", "__repr__"),
     *("__setattr__", "__delattr__", "__replace__"),
     # of components
-    *("__behaviour__", "__settled_key__"),
+    "__behaviour__",
 }
 """Attributes of a class that no program depends on."""
 INSTALLED = (
@@ -133,13 +137,20 @@ class _Keys:
         return Identity(function), function.__code__, self.of(parts, home)
 
 
-def is_settled(value: Any) -> bool:
-    """Whether the key of a static value is the same for as long as the value exists: the value
-    consists of numbers, strings and classes, in tuples.
+def key_of_fields(values: tuple) -> Hashable:
+    """The key of static fields, by `marshal` where they are numbers and texts: a component is
+    flattened at every call of a compiled function.
     """
-    if isinstance(value, tuple):
-        return all(map(is_settled, value))
-    return isinstance(value, (*PLAIN_TYPES, float, type))
+    if _is_written_exactly(values):
+        return marshal.dumps(values, MARSHAL_VERSION)
+    return exact_key(values)
+
+
+def _is_written_exactly(values: tuple) -> bool:
+    """Whether `marshal` writes types and all bits of values."""
+    return all(
+        type(x) in MARSHALLED or (type(x) is tuple and _is_written_exactly(x)) for x in values
+    )
 
 
 def _is_value(cls: type) -> bool:

@@ -28,7 +28,7 @@ from typing import Any, TypeAlias, TypeVar, dataclass_transform
 import jax
 
 from iblf_jax.core import checks, modules
-from iblf_jax.core.exact_keys import behaviour_of, exact_key, is_settled
+from iblf_jax.core.exact_keys import behaviour_of, key_of_fields
 from iblf_jax.core.optional import OptionalMembers, has_members
 
 T = TypeVar("T")
@@ -113,7 +113,6 @@ def component(cls: type[T]) -> type[T]:
         if has_members(self, "check"):
             self.check()
         _note_modules(self)
-        _note_structure(self)
 
     cls.__init__ = checked_init  # type: ignore[method-assign]
 
@@ -140,14 +139,6 @@ def _note_modules(part: Any) -> None:
     )
     if divisions:
         object.__setattr__(part, _DIVISIONS, divisions)
-
-
-def _note_structure(part: Any) -> None:
-    """Stores the exact key of the static fields, if it cannot change."""
-    values = field_values(part)
-    fixed = tuple([values[f.name] for f in dataclasses.fields(part) if f.metadata.get("static")])
-    if fixed and is_settled(fixed):
-        object.__setattr__(part, _SETTLED_KEY, exact_key(fixed))
 
 
 def register_component(cls: type[T]) -> type[T]:
@@ -180,14 +171,7 @@ def register_component(cls: type[T]) -> type[T]:
         if not has_key and not divisions:
             return values, ()
         fixed = structure_of(obj)
-        settled = obj.__settled_key__
-        return values, (
-            fixed,
-            divisions,
-            settled,
-            settled or exact_key(fixed),
-            getattr(cls, _BEHAVIOUR),
-        )
+        return values, (fixed, divisions, key_of_fields(fixed), getattr(cls, _BEHAVIOUR))
 
     def unflatten(aux, values):
         obj = object.__new__(cls)
@@ -195,10 +179,8 @@ def register_component(cls: type[T]) -> type[T]:
         attributes.update(zip(children, values, strict=True))
         if not aux:
             return obj
-        fixed, divisions, settled = aux[:3]
+        fixed, divisions = aux[:2]
         attributes.update(zip(structure, fixed, strict=True))
-        if settled:
-            attributes[_SETTLED_KEY] = settled
         if divisions:
             attributes[_DIVISIONS] = divisions
             for name, division in divisions:
@@ -208,7 +190,6 @@ def register_component(cls: type[T]) -> type[T]:
     jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
     setattr(cls, _REGISTERED, True)
     setattr(cls, _DIVISIONS, ())
-    setattr(cls, _SETTLED_KEY, None)
     behaviour = behaviour_of(cls)
     setattr(cls, _BEHAVIOUR, behaviour)
     has_key = bool(structure) or behaviour is not None
@@ -234,8 +215,6 @@ def _noted(part: Any) -> bool:
 
 _DIVISIONS = "_divisions"
 """Attribute with the divisions of those modules of a component that hold functions."""
-_SETTLED_KEY = "__settled_key__"
-"""Attribute with the exact key of an object's static fields, if this key cannot change."""
 _BEHAVIOUR = "__behaviour__"
 """Attribute of a class with the key of its methods, as `note_code` found them; None for a class of
 the package."""

@@ -88,6 +88,7 @@ RECORDS: dict[str, tuple[str, str]] = {
     "EffortSearch": ("studies.equal_effort", "EffortSearch"),
     "Explanation": ("engine.explain", "Explanation"),
     "FailedRuns": ("tuning.failures", "FailedRuns"),
+    "Influence": ("tuning.failures", "Influence"),
     "FailureProbability": ("studies.rare_events.result", "FailureProbability"),
     "FailureSamples": ("studies.rare_events.result", "FailureSamples"),
     "FirstExit": ("studies.first_exit", "FirstExit"),

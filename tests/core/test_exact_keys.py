@@ -262,6 +262,12 @@ def test_properties_of_a_class_are_part_of_its_behaviour(monkeypatch):
     assert behaviour_of(type(ij.barriers.Log())) is None
 
 
+def test_a_component_has_no_attributes_but_its_fields(paper):
+    again = jax.tree.map(lambda x: x, paper)
+    for part in (paper, again, paper.controller, again.plant, Push(factor=2)):
+        assert set(vars(part)) == {field.name for field in dataclasses.fields(part)}
+
+
 def test_a_component_with_functions_is_pickled():
     plant = ij.plants.StrictFeedback(drift=from_a_global, gain=from_a_table, n=1, order=2)
     copy = pickle.loads(pickle.dumps(plant))
