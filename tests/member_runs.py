@@ -15,8 +15,18 @@ import warnings
 import jax
 
 import iblf_jax as ij
+from iblf_jax.control.actuators._base import input_delay
 
 RUN = {"duration": 0.02, "dt": 2e-3}
+
+
+def fitting(scenario: ij.Scenario, method: str) -> str:
+    """The method, or the nearest one that the scenario admits."""
+    if scenario.process_noise is not None:
+        return "euler_maruyama"
+    if method == "euler" and input_delay(scenario.actuator) is not None:
+        return "heun"
+    return method
 
 
 def answer(line: str) -> None:
@@ -27,8 +37,7 @@ def answer(line: str) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         scenario = scenarios()[name]()
-        if scenario.process_noise is not None:
-            method = "euler_maruyama"
+        method = fitting(scenario, method)
         run = ij.simulate(scenario, backend=backend, method=method, **RUN)
     end = [getattr(run, x)[-1].tolist() for x in ("q", "dq", "tau")]
     print(json.dumps({"name": name, "backend": backend, "end": end}), flush=True)

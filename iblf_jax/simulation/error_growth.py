@@ -547,17 +547,16 @@ def with_growth(
     return found, {BOUND: jnp.where(jumped, of_codes, 0.0)}
 
 
-def errors_by_step(metrics: Any) -> jax.Array:
+def errors_by_step(metrics: Any) -> Any:
     """The stated error of runs relative to the tube, as far as a smaller step makes it tolerable;
     `metrics` are by name.
 
     No step makes a bound (A.4) above the tolerance tolerable. Of such a run it is the rest of the
     error, or 0 if that is tolerable.
     """
-    errors = jnp.asarray(metrics[RELATIVE])
     if BOUND not in metrics:
-        return errors
-    bounds = jnp.asarray(metrics[BOUND])
+        return metrics[RELATIVE]
+    errors, bounds = jnp.asarray(metrics[RELATIVE]), jnp.asarray(metrics[BOUND])
     # Less the rounding error of the sum, so that it does not count as an error by the step.
     rest = errors - (1.0 + ARITHMETIC * jnp.finfo(errors.dtype).eps) * bounds
     return jnp.where(bounds > TOLERANCE, jnp.where(rest > TOLERANCE, rest, 0.0), errors)
