@@ -21,11 +21,12 @@ import gc
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Sequence
-from functools import update_wrapper, wraps
+from functools import partial, update_wrapper, wraps
 from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 
 from iblf_jax.core import devices
 
@@ -41,6 +42,8 @@ MAPS_OF_A_PROGRAM = 300
 
 UNOPTIMISED = {"xla_backend_optimization_level": 0}
 """Compiler options of a program that is not optimised."""
+ZERO = np.zeros((), np.float32)
+"""The result of an operation on it is a tracer while JAX traces the code into a program."""
 MAX_PROGRAMS = 512
 """Programs that are kept.  `simulate` uses five for a scenario, a study two, `certify` twelve."""
 
@@ -148,23 +151,31 @@ class StructuredFunction:
         return sum(program._cache_size() for program in self._programs.of(self._function))
 
     def _program(self, args: tuple, kwargs: dict[str, Any]) -> Any:
-        """The copy of the function for the structure of these arguments."""
-        key = (self._function, *self._structure_of(args, kwargs))
-        return self._programs.get(key, self._copy)
+        """The copy of the function for the structure of these arguments.
 
-    def _structure_of(self, args: tuple, kwargs: dict[str, Any]) -> tuple:
-        """What a copy is made for: the static arguments, and structure and shapes of the others.
-
-        JAX distinguishes their types itself.
+        It is made for the static arguments, and for structure and shapes of the others. JAX
+        distinguishes their types itself.
         """
         static = [args[i] for i in self._static_argnums]
         static += [kwargs.get(name) for name in self._static_argnames]
         others = [x for i, x in enumerate(args) if i not in self._static_argnums]
         named = {name: x for name, x in kwargs.items() if name not in self._static_argnames}
         leaves, structure = jax.tree.flatten((others, named))
-        return tuple(static), structure, tuple([getattr(x, "shape", ()) for x in leaves])
+        options = self._compiler_options(leaves)
+        shapes = tuple([getattr(x, "shape", ()) for x in leaves])
+        key = (self._function, options is None, tuple(static), structure, shapes)
+        return self._programs.get(key, partial(self._copy, options))
 
-    def _copy(self) -> Any:
+    def _compiler_options(self, leaves: list) -> dict[str, Any] | None:
+        """Options for XLA.  JAX accepts them only where it neither transforms the function nor
+        makes it a part of another program.
+        """
+        if self._optimised or devices.platform() != "cpu":
+            return None
+        traced = any(isinstance(x, jax.core.Tracer) for x in (jax.lax.neg(ZERO), *leaves))
+        return None if traced else UNOPTIMISED
+
+    def _copy(self, options: dict[str, Any] | None) -> Any:
         """A copy of the function, to be compiled by JAX for one structure."""
         function = self._function
 
@@ -172,9 +183,6 @@ class StructuredFunction:
         def copy(*args: Any, **kwargs: Any) -> Any:
             return function(*args, **kwargs)
 
-        options = None
-        if not self._optimised and devices.platform() == "cpu":
-            options = UNOPTIMISED
         # JAX finds the positions of static arguments by their names if only the names are given.
         return jax.jit(
             copy,

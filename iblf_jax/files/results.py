@@ -503,7 +503,7 @@ class _Reader:
         try:
             return cls(node.get("value"))
         except (ValueError, TypeError) as error:
-            raise checks.fail(key, node.get("value"), f"a {cls.__name__}") from error
+            raise checks.fail(key, node.get("value"), checks.with_article(cls.__name__)) from error
 
     @jax.enable_x64(True)
     def scenario(self, node: dict[str, Any], key: str) -> Scenario:

@@ -63,7 +63,8 @@ def _digest_of(traced: Any) -> str:
     try:
         return program_digest(traced)
     except CallsPythonError as error:
-        remedy = f"It has a {error}: what that computes cannot be compared. Leave checkpoint out."
+        callback = checks.with_article(str(error))
+        remedy = f"It has {callback}: what that computes cannot be compared. Leave checkpoint out."
         raise checks.fail(
             "checkpoint", checks.Words("a program that calls Python"), "a compiled program", remedy
         ) from error

@@ -72,6 +72,15 @@ def maps_of_programs(number: int, size: int) -> int:
     return programs.count_maps() - before
 
 
+def test_a_program_that_is_not_optimised_may_be_a_part_of_another():
+    """JAX accepts options of the compiler for a whole program only."""
+    doubled = programs.jit(lambda x: 2 * x, optimised=False)
+    assert float(doubled(3.0)) == 6.0
+    assert float(jax.jit(doubled)(3.0)) == 6.0
+    assert float(jax.jit(lambda: doubled(3.0))()) == 6.0
+    assert float(jax.grad(doubled)(3.0)) == 2.0
+
+
 @pytest.mark.slow
 @needs_maps
 def test_the_number_of_memory_maps_stops_growing():

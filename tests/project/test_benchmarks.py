@@ -20,8 +20,9 @@ another start."""
 BEFORE_A_RELEASE = {"armour.py", "constraints.py", "tuning.py"}
 """Their quick sizes compile for a quarter of a minute."""
 
-NO_BENCHMARK = "comparison.py"
-"""It compares the results of the others, and `test_release.py` tests it."""
+NO_BENCHMARK = {"comparison.py", "withdrawn.py"}
+"""One compares the results of the others, and `test_release.py` tests it; one names the results that
+were removed."""
 NEEDED = {"ros2.py": ("mujoco", "rclpy")}
 """Benchmark -> libraries that not every environment has."""
 
@@ -39,7 +40,7 @@ RESULTS = sorted(
 
 def benchmarks():
     """Every benchmark, with its mark."""
-    for path in sorted(set(FOLDER.glob("[a-z]*.py")) - {FOLDER / NO_BENCHMARK}):
+    for path in sorted(set(FOLDER.glob("[a-z]*.py")) - {FOLDER / name for name in NO_BENCHMARK}):
         mark = pytest.mark.release if path.name in BEFORE_A_RELEASE else pytest.mark.slow
         yield pytest.param(path.name, marks=mark)
 
