@@ -21,8 +21,8 @@ BEFORE_A_RELEASE = {"armour.py", "constraints.py", "tuning.py"}
 """Their quick sizes compile for a quarter of a minute."""
 
 NO_BENCHMARK = {"comparison.py", "withdrawn.py"}
-"""One compares the results of the others, and `test_release.py` tests it; one names the results that
-were removed."""
+"""One compares the results of the others, and `test_release.py` tests it; one names the results
+that were removed."""
 NEEDED = {"ros2.py": ("mujoco", "rclpy")}
 """Benchmark -> libraries that not every environment has."""
 
