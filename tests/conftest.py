@@ -96,13 +96,9 @@ def memory() -> dict[str, int]:
     return {"most": MEMORY}
 
 
-def pytest_configure(config):
-    """What compilers are told, by this process and those that it starts, and what JAX refuses.
-
-    In the default run an array of another type is a slip, not a promotion; with the slow tests it
-    is as in a user's session.  Ranks are promoted in both: the package broadcasts leading axes
-    throughout.
-    """
+def choose_compilers(*, plain: bool) -> None:
+    """Has XLA and the compiler of kernels translate plainly, or as they do for users, in this
+    process and in those that it starts."""
     # A worker's environment is its parent's, which has been here: the tester's own words are kept
     # apart.
     own = os.environ.setdefault("TESTER_XLA_FLAGS", os.environ.get("XLA_FLAGS", ""))
@@ -110,12 +106,22 @@ def pytest_configure(config):
         "TESTER_CXX",
         os.environ.get("CXX") or next(filter(shutil.which, ("c++", "g++", "clang++")), ""),
     )
-    plain = config.option.markexpr != "release" and not os.environ.get("TEST_AS_USERS")
     os.environ["XLA_FLAGS"] = (
         f"{XLA_FLAGS if plain else ''} {own}".strip()
     )  # read at the first program, and the last of two flags wins
     if compiler:
         os.environ["CXX"] = str(ROOT / "tests" / "quick_compiler") if plain else compiler
+
+
+def pytest_configure(config):
+    """What compilers are told, by this process and those that it starts, and what JAX refuses.
+
+    In the default run an array of another type is a slip, not a promotion; with the slow tests it
+    is as in a user's session.  Ranks are promoted in both: the package broadcasts leading axes
+    throughout.
+    """
+    plain = config.option.markexpr != "release" and not os.environ.get("TEST_AS_USERS")
+    choose_compilers(plain=plain)
     if "not slow" in config.option.markexpr:
         jax.config.update("jax_numpy_dtype_promotion", "strict")
 
