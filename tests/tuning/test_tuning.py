@@ -1106,7 +1106,8 @@ o = ij.objectives
 slow = (lambda search: __import__("time").sleep(0.4)) if sys.argv[2] == "slow" else None
 goal = o.tracking() + 10 * o.peak_torque() + o.margin_above(0.11)
 best = ij.tune(ij.presets.zhang_yan_2024(), ["controller.k1", "controller.K2"], goal,
-               duration=0.1, method="euler", iterations=12, checkpoint=sys.argv[1], progress=slow)
+               duration=0.1, method="euler", effort=ij.tuning.Effort(iterations=12),
+               checkpoint=sys.argv[1], progress=slow)
 np.savez(sys.argv[3], **best.history, **{k.replace(".", "_"): v for k, v in best.values.items()})
 """
 
