@@ -166,7 +166,8 @@ def _study(backend: str, dtype: str, runs: int, steps: int, method: str):
     }
 
     def run(devices=None, runs=runs) -> None:
-        ij.monte_carlo(ij.presets.zhang_yan_2024(), ways, runs=runs, devices=devices, **options)
+        executor = ij.studies.ThisProcess(devices)
+        ij.monte_carlo(ij.presets.zhang_yan_2024(), ways, runs=runs, executor=executor, **options)
 
     run(runs=2 * block_size())
     return run

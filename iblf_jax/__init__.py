@@ -129,7 +129,6 @@ if TYPE_CHECKING:
     from iblf_jax.proofs import largest_parameters as largest_parameters
     from iblf_jax.proofs import prove as prove
     from iblf_jax.reports import report as report
-    from iblf_jax.studies import distributed as distributed
     from iblf_jax.studies.compare import compare as compare
     from iblf_jax.studies.comparison import Comparison as Comparison
     from iblf_jax.studies.monte_carlo import monte_carlo as monte_carlo
@@ -163,7 +162,6 @@ _ON_FIRST_USE = {
     "Counterexample": ("iblf_jax.certificates", "Counterexample"),
     "cvar": ("iblf_jax.tuning", "cvar"),
     "deployment": ("iblf_jax.deployment", None),
-    "distributed": ("iblf_jax.studies.distributed", None),
     "explore": ("iblf_jax.deployment.live", "explore"),
     "export": ("iblf_jax.deployment.export", "export"),
     "Exported": ("iblf_jax.deployment.export", "Exported"),

@@ -83,7 +83,7 @@ def _growth(scenario: Scenario) -> tuple[jax.Array, jax.Array]:
     return (proof.dV - 0.5 * proof.df @ proof.df) / Q, proof.excluded
 
 
-@checks.renamed(ranges="perturbations")
+@checks.known_keywords
 def counterexample(
     scenario: Scenario,
     perturbations: Mapping[str, Perturbation],

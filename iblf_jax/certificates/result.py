@@ -51,12 +51,6 @@ class Traces(NamedTuple):
     excluded: np.ndarray
     """bool: the guard or a torque limit was active; nothing is claimed there."""
 
-    def __getattr__(self, name: str) -> np.ndarray:
-        """`held`, the name of `excluded` in earlier versions."""
-        if name == "held":
-            return self.excluded
-        raise AttributeError(name)
-
 
 class LevelTraces(NamedTuple):
     """The curves of `Certificate.plot` for a plant in strict-feedback form, at the T recorded

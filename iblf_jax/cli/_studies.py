@@ -28,7 +28,7 @@ STUDY_EPILOG = (
 
 
 def add_study_arguments(parser: argparse.ArgumentParser) -> None:
-    """Adds --out, --devices, --chunk, --quiet, --dask and the deprecated options for processes."""
+    """Adds --out, --devices, --chunk, --quiet and --dask."""
     parser.add_argument("--out", metavar="FILE.nc", help="write the results as netCDF")
     parser.add_argument(
         "--devices",
@@ -48,12 +48,6 @@ def add_study_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="ADDRESS",
         help="compute on the workers of this Dask scheduler, such as tcp://10.0.0.1:8786",
     )
-    # Deprecated: use --dask, or the same sweep several times with --shared.
-    parser.add_argument("--distributed", action="store_true", help=argparse.SUPPRESS)
-    parser.add_argument("--coordinator", help=argparse.SUPPRESS)
-    parser.add_argument("--num-processes", type=int, help=argparse.SUPPRESS)
-    parser.add_argument("--process-id", type=int, help=argparse.SUPPRESS)
-    parser.add_argument("--heartbeat", type=int, default=10, help=argparse.SUPPRESS)
 
 
 def run_study(args: argparse.Namespace, work: Callable[[dict[str, Any]], int]) -> int:
@@ -68,18 +62,14 @@ def run_study(args: argparse.Namespace, work: Callable[[dict[str, Any]], int]) -
       The exit code.
     """
     from iblf_jax.cli import INTERRUPTED, complain
-    from iblf_jax.studies import WorkerError, distributed
+    from iblf_jax.studies import WorkerError
     from iblf_jax.studies.store import StoreError, StoreWriteError
 
     _check_out(args.out)
     _set_devices(args.devices)
-    job = (args.coordinator, args.num_processes, args.process_id)
     try:
-        if args.distributed or any(word is not None for word in job):
-            distributed.initialize(*job, heartbeat=args.heartbeat)
-        is_silent = args.quiet or distributed.rank() > 0
         with _executor(args) as executor:
-            return work({"executor": executor, "progress": False if is_silent else None})
+            return work({"executor": executor, "progress": False if args.quiet else None})
     except KeyboardInterrupt as stop:
         complain(str(stop) or "interrupted")
         return INTERRUPTED
@@ -140,9 +130,7 @@ def _check_out(name: str | None) -> None:
 
 
 def write_netcdf(data: xarray.Dataset, name: str | None) -> None:
-    """Writes the file of --out in the first process."""
-    from iblf_jax.studies import distributed
-
-    if name is not None and distributed.rank() == 0:
+    """Writes the file of --out."""
+    if name is not None:
         data.to_netcdf(name, engine="scipy")
         print(f"\nwritten to {name}")

@@ -62,4 +62,4 @@ def run(args: argparse.Namespace) -> int:
             f"\nwritten to {folder}: scenario.toml, identification.npz, identification.json,"
             " identification.html, identification.png"
         )
-    return int(any(number.value is None for number in result.wanted))
+    return int(any(number.value is None for number in result.requested_numbers))

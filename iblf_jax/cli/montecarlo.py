@@ -37,14 +37,12 @@ def run(args: argparse.Namespace) -> int:
     def work(execution: dict[str, Any]) -> int:
         from iblf_jax.cli._common import given_options
         from iblf_jax.files.study import load_study_file
-        from iblf_jax.studies import distributed
         from iblf_jax.studies.monte_carlo import monte_carlo
 
         file = load_study_file(args.file, "study")
         options = file.options | given_options(args, "runs", "seed") | execution
         study = monte_carlo(file.scenario, file.perturbations, **options)
-        if distributed.rank() == 0:
-            print(report(study))
+        print(report(study))
         write_netcdf(study.to_xarray(), args.out)
         return int(len(study.failed) > 0)
 

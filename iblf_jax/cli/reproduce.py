@@ -155,8 +155,6 @@ def _write_data(
     from iblf_jax.files.rollouts import save_rollouts
 
     save_rollouts(runs, folder / "rollouts.nc")
-    # The file calls the verdict of a claim "held", as in earlier versions.
-    keys = ("claim", "held", "detail", "numbers")
     report: dict[str, Any] = {
         "source": "Zhang & Yan 2024, section 4",
         "run": {"reading": args.reading, "duration": args.duration, "dt": args.dt, "method": "rk4"},
@@ -170,7 +168,7 @@ def _write_data(
             }
             for run, signals in findings["peaks"].items()
         },
-        "claims": [dict(zip(keys, claim, strict=True)) for claim in findings["claims"]],
+        "claims": [claim._asdict() for claim in findings["claims"]],
         "remark": findings["remark"],
         "seconds": {"with compilation": seconds["first"], "the two runs alone": seconds["again"]},
     }

@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
     def work(execution: dict[str, Any]) -> int:
         from iblf_jax.core.status import FAILED, has_flag
         from iblf_jax.files.study import load_study_file
-        from iblf_jax.studies import StoreOptions, distributed
+        from iblf_jax.studies import StoreOptions
         from iblf_jax.studies.sweep import sweep
 
         file = load_study_file(args.file, "sweep")
@@ -59,8 +59,7 @@ def run(args: argparse.Namespace) -> int:
             store=store,
             **options | execution,
         )
-        if distributed.rank() == 0:
-            print(report(data))
+        print(report(data))
         write_netcdf(data, args.out)
         return int(has_flag(data.status, FAILED).any())
 

@@ -236,24 +236,22 @@ def _kind_of(field: dataclasses.Field) -> str:
     return with_article(str(field.type))
 
 
-def renamed(**names: str) -> Callable[[F], F]:
-    """Decorator of a function whose keywords have new names, old=new: an old one raises a
-    ValueError that names the new one.
+def known_keywords(function: F) -> F:
+    """Decorator of a public function: an unknown keyword argument raises a TypeError that names the
+    expected ones.
     """
+    known = tuple(inspect.signature(function).parameters)
 
-    def decorated(function: F) -> F:
-        @functools.wraps(function)
-        def called(*args: Any, **options: Any) -> Any:
-            for old, new in names.items():
-                if old in options:
-                    field, expected = f"{function.__name__}: {old}", f"it as {new}"
-                    remedy = f"The keyword has a new name: {function.__name__}(..., {new}=...)."
-                    raise fail(field, options[old], expected, remedy)
-            return function(*args, **options)
+    @functools.wraps(function)
+    def called(*args: Any, **options: Any) -> Any:
+        for name in options:
+            if name not in known:
+                text = f"{function.__name__}() got an unexpected keyword argument {name!r}."
+                remedies = f"{nearest(name, known)} Its arguments are {', '.join(known)}.".lstrip()
+                raise TypeError(f"{text} {remedies}")
+        return function(*args, **options)
 
-        return cast(F, called)
-
-    return decorated
+    return cast(F, called)
 
 
 def with_location(where: str | os.PathLike, error: Exception) -> ValueError:

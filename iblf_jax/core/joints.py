@@ -30,17 +30,6 @@ SLICE = re.compile(r"(-?\d+)?:(-?\d+)?(?::(-?\d+)?)?")
 """A slice as text."""
 
 
-def holds_weights(joints: Any) -> bool:
-    """Whether an argument holds floating-point numbers, which earlier versions read as weights."""
-    if isinstance(joints, bool | str | slice) or joints is None:
-        return False
-    if isinstance(joints, jax.Array | np.ndarray | np.generic):
-        return bool(np.issubdtype(np.dtype(joints.dtype), np.floating))
-    if isinstance(joints, list | tuple):
-        return any(isinstance(x, float | np.floating) for x in joints)
-    return isinstance(joints, float)
-
-
 def selection(field: str, joints: Any) -> Selection:
     """A user's selection as a hashable tuple, with all checks that do not need the robot.
 
@@ -58,8 +47,6 @@ def selection(field: str, joints: Any) -> Selection:
         raise checks.fail(
             field, joints, EXPECTED, "It decides what is compiled, so it cannot be traced."
         )
-    if holds_weights(joints):
-        raise checks.fail(field, joints, EXPECTED, WEIGHTS)
     entries = _entries(field, joints)
     found = tuple(_entry(field, joints, x) for x in entries)
     if not found:
@@ -80,7 +67,7 @@ def _entries(field: str, joints: Any) -> Sequence[Any]:
         if array.ndim > 1:
             raise checks.fail(field, joints, EXPECTED, f"Its shape is {array.shape}.")
         return np.atleast_1d(array).tolist()
-    if isinstance(joints, int | str | slice):
+    if isinstance(joints, int | float | str | slice):
         return [joints]
     if isinstance(joints, list | tuple | range):
         return joints
@@ -96,7 +83,9 @@ def _entry(field: str, joints: Any, entry: Any) -> int | str:
         return entry
     if isinstance(entry, slice):
         return _slice_as_text(field, entry)
-    raise checks.fail(field, joints, EXPECTED)
+    raise checks.fail(
+        field, joints, EXPECTED, WEIGHTS if isinstance(entry, float | np.floating) else ""
+    )
 
 
 def _slice_as_text(field: str, given: slice) -> str:

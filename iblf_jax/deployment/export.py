@@ -175,7 +175,6 @@ def export(
     """
     checks.one_of("target", target, (*LAW_TARGETS, *LOOP_TARGETS))
     is_loop = target in LOOP_TARGETS
-    reference = _current_name(reference)
     _check_options(target, dtype, reference, is_loop)
     loop_options = {"dt": dt, "method": method, "seed": seed}
     ros_only = {"gains": gains, "torque_limits": torque_limits, "on_fault": on_fault}
@@ -216,15 +215,6 @@ def _without_parts_of_the_plant(scenario: Scenario) -> Scenario:
     if input_delay(scenario.actuator) is not None:
         scenario = dataclasses.replace(scenario, actuator=Ideal())
     return dataclasses.replace(scenario, process_noise=None)
-
-
-def _current_name(reference: str) -> str:
-    """The argument `reference`, with a former name of a value replaced by the present one."""
-    former = "told"
-    if not isinstance(reference, str) or reference != former:
-        return reference
-    notices.warn('reference="told" is named reference="given" now.', DeprecationWarning)
-    return "given"
 
 
 def _check_options(target: str, dtype: str, reference: str, is_loop: bool) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from iblf_jax.core import checks, notices
+from iblf_jax.core import checks
 from iblf_jax.engine.registry import backends
 from iblf_jax.engine.structural_constants import StructuralConstants, constants_of
 from iblf_jax.simulation.noise import check_method
@@ -62,12 +62,5 @@ class RunRequest(NamedTuple):
 
 def check_backend(backend: str) -> str:
     """The name of a backend; raises ValueError for an unknown one."""
-    if isinstance(backend, str) and backend == "xla":
-        notices.warn(
-            'backend="xla" was removed and means "vmap" now; "auto" is faster wherever there is a'
-            " C++ compiler.",
-            DeprecationWarning,
-        )
-        return "vmap"
     checks.one_of("backend", backend, backends())
     return backend

@@ -42,7 +42,6 @@ from iblf_jax.files.values import (
     by_path,
     decode_static,
     did_you_mean,
-    inline_table,
     known_keys,
     missing,
     numbers,
@@ -196,9 +195,6 @@ def _perturbation(table: Any, path: str) -> Perturbation:
         raise checks.fail(path, came, f"one of {', '.join(KINDS)}", EXAMPLE)
     (kind,) = kinds
     name = table[kind]
-    if isinstance(name, dict):
-        remedy = _new_spelling(kind, name, table)
-        raise checks.fail(f"{path}.{kind}", name, "the name of a distribution", remedy)
     if not isinstance(name, str) or name not in distributions.MEMBERS:
         remedy = did_you_mean(name, distributions.MEMBERS)
         raise checks.fail(f"{path}.{kind}", name, "the name of a distribution", remedy)
@@ -218,19 +214,3 @@ def _perturbation(table: Any, path: str) -> Perturbation:
             raise missing(key, "a number or a list of numbers", f"{name} needs it.")
     distribution = construct(_distribution_maker(name), values, path)
     return getattr(distributions, kind)(distribution, shared=shared)
-
-
-def _new_spelling(kind: str, old: dict[str, Any], table: dict[str, Any]) -> str:
-    """The remedy for the former spelling { factor = { uniform = [0.7, 1.3] } }, with the numbers of
-    the user's file.
-    """
-    name, given = next(iter(old.items()), ("", None))
-    if len(old) != 1 or name not in distributions.MEMBERS:
-        return EXAMPLE
-    arguments = _arguments(name)
-    if not isinstance(given, dict):
-        values = given if isinstance(given, list) and name != "choice" else [given]
-        given = dict(zip(arguments, values, strict=False))
-    missing = {word: Words("...") for word, is_required in arguments.items() if is_required}
-    rest = {key: value for key, value in table.items() if key != kind}
-    return f"This is now written {inline_table({kind: name} | missing | given | rest)}."

@@ -35,10 +35,6 @@ is that of a study file (`files.study`):
     "plant.mass[1]" = { factor = "uniform", low = 0.7, high = 1.3 }
     "initial.q" = { offset = "normal", mean = 0.0, std = 0.02, shared = true }
 
-Files of earlier versions are read with a DeprecationWarning.  They have the options of solver and
-report in [tune] itself, and `joints` is the list of weights that is called `weights` now: a list of
-floating-point numbers, or of whole numbers that do not select joints, is read as weights.
-
 Every value is checked, and each error is a ValueError that names the dotted key.  Earlier versions
 wrote the result of a tuning as JSON with all its numbers in full precision; `ij.load` reads it.
 """
@@ -55,8 +51,7 @@ from typing import Any
 
 import numpy as np
 
-from iblf_jax.core import checks, notices
-from iblf_jax.core.joints import holds_weights
+from iblf_jax.core import checks
 from iblf_jax.files import components
 from iblf_jax.files.scenario import from_dict, read_toml
 from iblf_jax.files.study import perturbations_of
@@ -69,19 +64,11 @@ from iblf_jax.studies.draws import targets_of
 from iblf_jax.tuning import objectives, quantities
 from iblf_jax.tuning._tune import tune
 from iblf_jax.tuning.objectives import Objective, checked
-from iblf_jax.tuning.options import (
-    EARLIER_NAMES,
-    OF_REPORT,
-    REPLACED,
-    Effort,
-    Report,
-    effort_of,
-)
+from iblf_jax.tuning.options import Effort, Report, effort_of
 from iblf_jax.tuning.parameters import tunable
 from iblf_jax.tuning.result import TuneResult, TuneSetup
 from iblf_jax.tuning.robust import KINDS, Risk, cvar
 from iblf_jax.tuning.solvers import SOLVERS
-from iblf_jax.world.robots import joint_names
 
 components.FAMILIES.setdefault(
     quantities.Quantity, components.family("tuning.quantities", quantities.MEMBERS)
@@ -120,8 +107,6 @@ HISTORY = dict.fromkeys(
 """Name of an array in the history of a result -> the kinds of number that it may have."""
 ARGUMENTS = ("runs", "seed", "backend")
 """Keys of [tune] besides `parameters`, `risk`, `level`, `solver`, `effort` and `report`."""
-EARLIER_ARGUMENTS = tuple(name for name in REPLACED if name != "callback")
-"""Keys that [tune] had in earlier versions."""
 
 
 def load_tuning_file(
@@ -142,7 +127,7 @@ def load_tuning_file(
     file = from_dict(data, source, other_tables=TABLES, folder=folder, modules=modules)
     try:
         options = _options(as_table(data.get("tune", {}), "tune"))
-        options["objective"] = _objective(data, joint_names(file.scenario.plant, file.scenario.n))
+        options["objective"] = _objective(data)
         options["perturbations"] = perturbations_of(data)
     except ValueError as error:
         raise checks.with_location(source, error) from error
@@ -169,8 +154,7 @@ def tune_file(
 def _options(table: dict[str, Any]) -> dict[str, Any]:
     """The arguments of `tune` in the table [tune]."""
     own = ("parameters", "risk", "level", "solver", "effort", "report")
-    allowed = (*own, *ARGUMENTS, *EARLIER_ARGUMENTS)
-    known_keys(table, "tune", allowed)
+    known_keys(table, "tune", (*own, *ARGUMENTS))
     parameters = table.get("parameters", Words("nothing"))
     if not isinstance(parameters, list):
         expected = 'a list of paths, such as ["controller.K2"]'
@@ -178,7 +162,7 @@ def _options(table: dict[str, Any]) -> dict[str, Any]:
     options: dict[str, Any] = {
         "parameters": [_parameter(x, f"tune.parameters[{i}]") for i, x in enumerate(parameters)]
     }
-    options |= {key: table[key] for key in (*ARGUMENTS, *EARLIER_ARGUMENTS) if key in table}
+    options |= {key: table[key] for key in ARGUMENTS if key in table}
     if "solver" in table:
         options["solver"] = _solver(table["solver"])
     if isinstance(table.get("effort"), dict):
@@ -226,7 +210,6 @@ def _term(
     allowed: tuple[str, ...],
     entry: Any,
     key: str,
-    names: tuple[str, ...],
     other_keys: tuple[str, ...] = (),
 ) -> Any:
     """The objective or requirement that a table describes.
@@ -235,10 +218,9 @@ def _term(
       allowed: the functions of `objectives` that `kind` may name.
       entry: the table.
       key: dotted key of the table.
-      names: names of the robot's joints.
       other_keys: further keys that the table may have.
     """
-    table = _with_weights(as_table(entry, key), key, names)
+    table = as_table(entry, key)
     checks.one_of(f"{key}.kind", table.get("kind"), allowed)
     function = getattr(objectives, table["kind"])
     if function is objectives.metric and "fold" not in table:
@@ -255,32 +237,6 @@ def _term(
 
 _TEXT_ARGUMENTS = {"fold": "a metric", "name": "the name of one of its results"}
 """Argument of an objective that is not a number -> its description in words."""
-
-
-def _with_weights(table: dict[str, Any], key: str, names: tuple[str, ...]) -> dict[str, Any]:
-    """The table with `joints` as a selection; in earlier versions `joints` were weights, which move
-    to the key `weights`.
-    """
-    given: Any = table.get("joints")
-    is_integers = isinstance(given, list) and bool(given) and all(type(x) is int for x in given)
-    if not (holds_weights(given) or is_integers):
-        return table
-    n = len(names)
-    # Earlier versions took one weight a joint, so another number of integers is a selection.
-    if is_integers and len(given) != n:
-        return table
-    if is_integers and {x % n for x in given if -n <= x < n} == set(range(n)):
-        notices.warn(
-            f"{key}.joints = {given} selects all joints. Earlier versions read it as weights: write"
-            f" weights = {given} if you mean these."
-        )
-        return table
-    notices.warn(
-        f"{key}.joints selects joints now; {given} is read as weights, as in earlier versions:"
-        f" write weights = {given}.",
-        DeprecationWarning,
-    )
-    return {name: value for name, value in table.items() if name != "joints"} | {"weights": given}
 
 
 def _argument(name: str, value: Any, key: str) -> Any:
@@ -305,8 +261,8 @@ def _fold_of(result: Any, key: str) -> str:
     return owners[result]
 
 
-def _objective(data: dict[str, Any], names: tuple[str, ...]) -> Objective:
-    """The objective with its requirements; `names` are those of the robot's joints."""
+def _objective(data: dict[str, Any]) -> Objective:
+    """The objective with its requirements."""
     terms, requirements = data.get("objective", []), data.get("requirement", [])
     if not isinstance(terms, list) or not terms:
         came = terms or Words("nothing")
@@ -315,14 +271,14 @@ def _objective(data: dict[str, Any], names: tuple[str, ...]) -> Objective:
     total = Objective()
     for i, entry in enumerate(terms):
         key = f"objective[{i}]"
-        term = _term(OBJECTIVES, entry, key, names, ("weight",))
+        term = _term(OBJECTIVES, entry, key, ("weight",))
         weight = numbers(entry.get("weight", 1.0), f"{key}.weight")
         total += components.construct(term.__mul__, {"weight": weight}, key)
     if not isinstance(requirements, list):
         remedy = 'Such as kind = "margin_above".'
         raise checks.fail("requirement", requirements, "[[requirement]] tables", remedy)
     for i, entry in enumerate(requirements):
-        total += _term(REQUIREMENTS, entry, f"requirement[{i}]", names)
+        total += _term(REQUIREMENTS, entry, f"requirement[{i}]")
     return total
 
 
@@ -363,16 +319,23 @@ def _array(entry: dict[str, Any], kinds: str) -> np.ndarray:
 
 def _with_new_names(table: Any) -> Any:
     """The table of an objective with the key `weights` in place of `joints`, as earlier versions
-    called the weights of a quantity.
+    called the weights of a quantity: floating-point numbers.
     """
     if isinstance(table, list):
         return [_with_new_names(x) for x in table]
     if not isinstance(table, dict):
         return table
     found = {key: _with_new_names(value) for key, value in table.items()}
-    if table.get("kind") in quantities.MEMBERS and holds_weights(table.get("joints")):
-        found["weights"] = found.pop("joints")
+    if table.get("kind") in quantities.MEMBERS and "joints" in table:
+        joints = table["joints"]
+        entries = joints if isinstance(joints, list) else [joints]
+        if any(isinstance(x, float) for x in entries):
+            found["weights"] = found.pop("joints")
     return found
+
+
+OF_REPORT = {"report_runs": "runs", "report_seed": "seed", "confidence": "confidence"}
+"""Name of an option in these files -> its name in `Report`."""
 
 
 def _decoded_setup(data: dict[str, Any]) -> TuneSetup:
@@ -430,8 +393,8 @@ def _decoded(data: dict[str, Any], modules: Mapping[str, Any] | None) -> TuneRes
         name: checks.string(name, data[name], "a string")
         for name in ("stopped", "optimiser", "mode")
     }
-    # Earlier versions called SQP "newton".
-    words["optimiser"] = EARLIER_NAMES.get(words["optimiser"], words["optimiser"])
+    if words["optimiser"] == "newton":  # as earlier versions called SQP
+        words["optimiser"] = "sqp"
     names = tuple(checks.string("names", name, "a string") for name in data["names"])
     history = _decoded_history(data["history"], len(names))
     starts = history["x"].shape[1]

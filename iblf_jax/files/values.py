@@ -5,7 +5,6 @@ Every error is a ValueError that names the dotted key, what came, what was expec
 
 from __future__ import annotations
 
-import json
 import math
 import tomllib
 import types
@@ -43,21 +42,6 @@ def toml_tables(text: str) -> dict[str, Any]:
     if checks.is_deep(tables):
         raise ValueError(problem)
     return tables
-
-
-def inline_table(table: dict[str, Any]) -> str:
-    """A table of numbers, strings, booleans and lists as a TOML inline table,
-    { factor = "uniform", low = 0.7 }.
-    """
-
-    def written(value: Any) -> str:
-        if isinstance(value, list):
-            return f"[{', '.join(map(written, value))}]"
-        if isinstance(value, dict):
-            return inline_table(value)
-        return json.dumps(value) if isinstance(value, bool) or type(value) is str else str(value)
-
-    return f"{{ {', '.join(f'{key} = {written(value)}' for key, value in table.items())} }}"
 
 
 def as_table(value: Any, path: str) -> dict[str, Any]:

@@ -157,12 +157,7 @@ class Identification(Result):
         return tuple(number.name for number in self.numbers)
 
     @property
-    def asked(self) -> int:
-        """The former name of `requested`."""
-        return self.requested
-
-    @property
-    def wanted(self) -> tuple[Number, ...]:
+    def requested_numbers(self) -> tuple[Number, ...]:
         """The requested parameters, without the added widths."""
         leaves = self._leaves()[: self.requested]
         return self.numbers[: sum(len(entries) for _, _, entries in leaves)]
@@ -209,7 +204,7 @@ class Identification(Result):
         """
         identified = [
             i
-            for i, number in enumerate(self.wanted)
+            for i, number in enumerate(self.requested_numbers)
             if number.error is not None and number.verdict == IDENTIFIED
         ]
         size, axes = np.linalg.eigh(self.covariance[np.ix_(identified, identified)])

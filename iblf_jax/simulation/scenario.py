@@ -362,11 +362,6 @@ class Scenario:
             self.state_bounds,
         )
 
-    @property
-    def setting(self) -> LawContext:
-        """The name that earlier versions gave `context`."""
-        return self.context
-
     def _repr_html_(self) -> str:
         return present("card", self)
 

@@ -22,13 +22,14 @@ from iblf_jax.simulation.stability import RADIUS
 from iblf_jax.studies.blocks import case_bytes
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.execution import run_all_cases
-from iblf_jax.studies.options import RunOptions, ThisProcess, check_deprecated, executor_of
+from iblf_jax.studies.options import RunOptions, ThisProcess, executor_of
 from iblf_jax.studies.study import Study
 from iblf_jax.studies.study_setup import prepare
 from iblf_jax.studies.time_step import warn_of_sampling, warn_of_step
 
 
 @notices.each_warning_once
+@checks.known_keywords
 @announced("compiling the program of a study")
 def monte_carlo(
     scenario: Scenario,
@@ -45,7 +46,6 @@ def monte_carlo(
     backend: str = "auto",
     executor: ThisProcess | Executor | None = None,
     progress: bool | None = None,
-    **deprecated: Any,
 ) -> Study:
     """Runs a scenario many times with parameters drawn at random.
 
@@ -85,8 +85,7 @@ def monte_carlo(
 
     Source: design of this package.
     """
-    check_deprecated("monte_carlo", deprecated, ("chunk", "memory", "devices"))
-    executor = executor_of(executor, deprecated)
+    executor = executor_of(executor)
     options = RunOptions(
         duration=duration,
         dt=dt,

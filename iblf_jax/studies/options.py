@@ -2,20 +2,19 @@
 what a sweep samples.
 
 `RunOptions` are the arguments that all studies share; the others change no number of a result.
-`executor_of`, `store_of` and `design_of` accept the keyword arguments of earlier versions, too.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Executor
 from typing import Any, TypeVar
 
 import jax
 
-from iblf_jax.core import checks, notices
+from iblf_jax.core import checks
 from iblf_jax.engine import STUDY_MEMORY
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.studies.designs import MAX_RUNS, check_sampler
@@ -134,45 +133,14 @@ class Design:
     """Number of points; None for a grid."""
 
 
-REPLACED = {
-    "unit": ("store", "StoreOptions(path, unit=...)"),
-    "points": ("design", "Design(kind, points=...)"),
-    "chunk": ("executor", "ThisProcess(chunk=...)"),
-    "memory": ("executor", "ThisProcess(memory=...)"),
-    "devices": ("executor", "ThisProcess(devices=...)"),
-}
-"""Keyword argument of earlier versions -> the argument and the object that replace it."""
-
-
-def check_deprecated(call: str, given: Mapping[str, Any], accepted: Sequence[str]) -> None:
-    """Warns about keyword arguments of earlier versions; TypeError for an unknown one."""
-    for name in given:
-        if name not in accepted:
-            near = checks.did_you_mean(name, accepted)
-            text = f"{call}() got an unexpected keyword argument {name!r}. {near}"
-            raise TypeError(text.rstrip())
-        argument, replacement = REPLACED[name]
-        notices.warn(
-            f"The keyword argument {name} of ij.{call} is deprecated: write"
-            f" {argument}=ij.studies.{replacement}.",
-            DeprecationWarning,
-        )
-
-
-def executor_of(executor: Any, deprecated: Mapping[str, Any]) -> ThisProcess | Executor:
-    """The checked `executor` of a study.
-
-    Args:
-      executor: as the user gave it; None for this process.
-      deprecated: keyword arguments of earlier versions; `chunk`, `memory` and `devices` are used.
+def executor_of(executor: Any) -> ThisProcess | Executor:
+    """The checked `executor` of a study; None for this process.
 
     Raises:
-      ValueError: it is neither a `ThisProcess` nor a `concurrent.futures.Executor`, or comes with
-        one of the deprecated arguments.
+      ValueError: it is neither a `ThisProcess` nor a `concurrent.futures.Executor`.
     """
-    replaced = _replaced("executor", executor is not None, deprecated)
     if executor is None:
-        executor = ThisProcess(**replaced)
+        executor = ThisProcess()
     if isinstance(executor, ThisProcess):
         return executor.checked()
     if not isinstance(executor, Executor):
@@ -185,39 +153,17 @@ def executor_of(executor: Any, deprecated: Mapping[str, Any]) -> ThisProcess | E
     return executor
 
 
-def store_of(store: Any, deprecated: Mapping[str, Any]) -> StoreOptions | None:
-    """The checked `store` of a sweep, from a path or an object; arguments as `executor_of`."""
-    is_object = isinstance(store, StoreOptions)
-    replaced = _replaced("store", is_object, deprecated)
+def store_of(store: Any) -> StoreOptions | None:
+    """The checked `store` of a sweep, from a path or an object."""
     if store is None:
-        if replaced.get("unit") is not None:
-            checks.positive_integer("unit", replaced["unit"], most=checks.MAX_STEPS)
         return None
-    if not is_object:
-        store = StoreOptions(store, **replaced)
+    if not isinstance(store, StoreOptions):
+        store = StoreOptions(store)
     return store.checked()
 
 
-def design_of(design: Any, deprecated: Mapping[str, Any]) -> Design:
-    """The `design` of a sweep, from a word or an object; arguments as `executor_of`."""
-    is_object = isinstance(design, Design)
-    replaced = _replaced("design", is_object, deprecated)
-    if is_object:
+def design_of(design: Any) -> Design:
+    """The `design` of a sweep, from a word or an object."""
+    if isinstance(design, Design):
         return design
-    return Design(design, **replaced)
-
-
-def _replaced(argument: str, is_object: bool, deprecated: Mapping[str, Any]) -> dict[str, Any]:
-    """The deprecated keyword arguments that an argument replaces; ValueError if the argument is
-    given as an object, too.
-    """
-    found = {name: x for name, x in deprecated.items() if REPLACED[name][0] == argument}
-    if found and is_object:
-        names = ", ".join(found)
-        raise checks.fail(
-            argument,
-            checks.Words(f"{argument}= and {names}"),
-            "one of them",
-            f"Put {names} into {argument}.",
-        )
-    return found
+    return Design(design)

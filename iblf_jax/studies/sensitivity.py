@@ -35,7 +35,7 @@ from iblf_jax.studies.designs import MAX_SOBOL, split
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.draws import draw_shapes
 from iblf_jax.studies.execution import run_all_cases
-from iblf_jax.studies.options import RunOptions, ThisProcess, check_deprecated, executor_of
+from iblf_jax.studies.options import RunOptions, ThisProcess, executor_of
 from iblf_jax.studies.study_setup import PreparedStudy, prepare
 
 if TYPE_CHECKING:
@@ -104,6 +104,7 @@ class Sensitivity(Result):
 
 
 @notices.each_warning_once
+@checks.known_keywords
 @announced("compiling the program of a sensitivity analysis")
 def sensitivity(
     scenario: Scenario,
@@ -119,7 +120,6 @@ def sensitivity(
     backend: str = "auto",
     executor: ThisProcess | Executor | None = None,
     progress: bool | None = None,
-    **deprecated: Any,
 ) -> Sensitivity:
     """Which of the perturbed parameters matter for a metric: first-order and total Sobol indices.
 
@@ -149,8 +149,7 @@ def sensitivity(
 
     Source: A. Saltelli et al., Computer Physics Communications 181 (2010) 259-270.
     """
-    check_deprecated("sensitivity", deprecated, ("memory", "devices"))
-    executor = executor_of(executor, deprecated)
+    executor = executor_of(executor)
     points = _checked_points(points)
     _check_arguments(perturbations, output)
     options = RunOptions(

@@ -15,7 +15,6 @@ from concurrent.futures import Executor
 from contextlib import closing
 from typing import TYPE_CHECKING, Any
 
-import jax
 import numpy as np
 
 from iblf_jax.core import checks, notices
@@ -33,12 +32,10 @@ from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.execution import run_all_cases, run_spans
 from iblf_jax.studies.interrupt import Interrupted, StopRequest
 from iblf_jax.studies.options import (
-    REPLACED,
     Design,
     RunOptions,
     StoreOptions,
     ThisProcess,
-    check_deprecated,
     design_of,
     executor_of,
     store_of,
@@ -53,6 +50,7 @@ if TYPE_CHECKING:
 
 
 @notices.each_warning_once
+@checks.known_keywords
 @announced("compiling the program of a sweep")
 def sweep(
     scenario: Scenario,
@@ -72,7 +70,6 @@ def sweep(
     backend: str = "auto",
     executor: ThisProcess | Executor | None = None,
     progress: bool | None = None,
-    **deprecated: Any,
 ) -> xarray.Dataset:
     """Runs a scenario over many values of its parameters, with perturbed runs at each.
 
@@ -124,10 +121,9 @@ def sweep(
 
     Source: design of this package.
     """
-    check_deprecated("sweep", deprecated, tuple(REPLACED))
-    executor = executor_of(executor, deprecated)
-    store_options = store_of(store, deprecated)
-    design = design_of(design, deprecated)
+    executor = executor_of(executor)
+    store_options = store_of(store)
+    design = design_of(design)
     progress = checks.boolean("progress", progress, optional=True)
     if perturbations is None:
         perturbations = {}
@@ -172,7 +168,7 @@ def _check_something_varies(grid: Any, perturbations: Any, runs: int) -> None:
         raise checks.fail("grid", grid, "something to vary", remedy)
 
 
-@checks.renamed(store="path")
+@checks.known_keywords
 def load_sweep(path: str | os.PathLike) -> xarray.Dataset:
     """The data of a store, complete or not.
 
@@ -297,12 +293,11 @@ def _spans(
     those that another process has written meanwhile.  Where two of them do compute the same unit,
     they write the same bytes.
     """
-    is_shared = options.shared or jax.process_count() > 1
     units = list(pending)
-    if is_shared:
+    if options.shared:
         random.SystemRandom().shuffle(units)
     for unit in units:
-        if is_shared and unit not in damaged and store.marks()[unit]:
+        if options.shared and unit not in damaged and store.marks()[unit]:
             advance(store.size(unit))
         else:
             yield store.span(unit)

@@ -200,7 +200,7 @@ def failure_probability(
     options = _checked(method, margin, limit, confidence, runs)
     scenario = canonical(scenario)
     _check_integrator(scenario, integrator)
-    executor = executor_of(executor, {})
+    executor = executor_of(executor)
     run_options = RunOptions(
         duration=duration,
         dt=dt,

@@ -111,7 +111,7 @@ class Attack(Result):
 
 
 @notices.each_warning_once
-@checks.renamed(sets="perturbations")
+@checks.known_keywords
 @announced("compiling the programs of a search for a failure")
 def falsify(
     scenario: Scenario,

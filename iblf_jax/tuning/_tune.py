@@ -58,6 +58,7 @@ POLISH_STEPS = 15
 
 
 @notices.each_warning_once
+@checks.known_keywords
 @announced("compiling the programs of a search for gains")
 def tune(
     scenario: Scenario,
@@ -77,7 +78,6 @@ def tune(
     report: Report | None = None,
     checkpoint: str | os.PathLike | None = None,
     progress: bool | Callable[[Search], None] | None = None,
-    **deprecated: Any,
 ) -> TuneResult:
     """Tunes leaves of a scenario, its gains for example, by derivatives through the closed loop.
 
@@ -123,7 +123,6 @@ def tune(
         from it.
       progress: whether to show a progress bar, or a function that is called with the `Search` after
         each step.  If not given, a progress bar is shown on a terminal and in a notebook.
-      deprecated: keyword arguments of earlier versions, which are options of solver and report now.
 
     Returns:
       A `TuneResult`: scenario, history, report, plot.
@@ -136,7 +135,7 @@ def tune(
     Source: design of this package; see the modules of `iblf_jax.tuning` for the methods.
     """
     began = time.perf_counter()
-    options = options_of(solver, effort, report, progress, deprecated)
+    options = options_of(solver, effort, report, progress)
     if checkpoint is not None:
         checkpoint = checks.file_to_write("checkpoint", checkpoint)
     problem = TuningProblem.build(
@@ -152,7 +151,7 @@ def tune(
         seed=seed,
         risk=risk,
     )
-    solver, mode = chosen_solver(options, problem.size)
+    solver, mode = chosen_solver(options.solver, problem.size)
     search = search_of(problem, solver, mode, options.effort)
     stopped = _run(search, mode, options.effort.iterations, checkpoint, options)
     if not np.any(np.isfinite(search.state["incumbent_key"])):

@@ -38,7 +38,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks, notices
-from iblf_jax.core.joints import Selection, holds_weights, indices, selection
+from iblf_jax.core.joints import Selection, indices, selection
 from iblf_jax.core.pytree import component, leaf, note_code, static
 from iblf_jax.engine import Outer as Outer
 from iblf_jax.simulation.metrics import Fold, Settling, Tracking, check_needs
@@ -437,28 +437,12 @@ def _share(function: str, name: str, share: Any) -> jax.Array:
     return number
 
 
-def _selected(
-    function: str, joints: Any, weights: Any, sign: str | None = "nonnegative"
-) -> tuple[Selection, Any]:
-    """The joints that count, and their weights, of the sign that the function takes.
-
-    Floating-point numbers as `joints` were weights in earlier versions.  They are no indices, so
-    they still mean that.
-    """
-    if holds_weights(joints):
-        if weights is not None:
-            expected = "indices, names or a slice of joints"
-            remedy = "The weights are in weights=."
-            raise checks.fail(f"{function}: joints", joints, expected, remedy)
-        notices.warn(
-            f"{function}(joints=...) selects joints by index, name or slice. Floating-point numbers"
-            f" are read as weights, as in earlier versions: write {function}(weights=...).",
-            DeprecationWarning,
-        )
-        joints, weights = None, joints
+def _selected(function: str, joints: Any, weights: Any) -> tuple[Selection, Any]:
+    """The joints that count, and their weights."""
     chosen = selection(f"{function}: joints", joints)
-    found = _number(function, "weights", 1.0 if weights is None else weights, sign, most=1)
-    if sign is not None and checks.is_concrete(found) and not jnp.any(found > 0):
+    given = 1.0 if weights is None else weights
+    found = _number(function, "weights", given, "nonnegative", most=1)
+    if checks.is_concrete(found) and not jnp.any(found > 0):
         raise checks.fail(f"{function}: weights", weights, "at least one weight > 0")
     return chosen, found
 
@@ -711,11 +695,8 @@ def metric(
     Source: design of this package.
     """
     name = checks.string("name", name, "the name of one of the fold's results")
-    if holds_weights(joints):
-        chosen, w = _selected("metric", joints, weights, sign=None)
-    else:
-        chosen = selection("metric: joints", joints)
-        w = 1.0 if weights is None else weights
+    chosen = selection("metric: joints", joints)
+    w: Any = 1.0 if weights is None else weights
     return _one_term("metric", MetricResult(fold, name, w, chosen), scale, name)
 
 

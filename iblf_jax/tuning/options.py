@@ -1,28 +1,21 @@
-"""The options of `tune`: those of its runs, of its report and of its search.
-
-Keyword arguments of earlier versions are still accepted; `options_of` maps them to these options.
-"""
+"""The options of `tune`: those of its runs, of its report and of its search."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple, Self
 
 import jax
 
-from iblf_jax.core import checks, notices
+from iblf_jax.core import checks
 from iblf_jax.engine import check_backend, differentiates_forward
 from iblf_jax.studies.designs import MAX_RUNS
 from iblf_jax.studies.options import checked_run_options
 from iblf_jax.studies.statistics import check_confidence
 from iblf_jax.tuning.robust import as_risk
 from iblf_jax.tuning.solvers import SOLVERS, Solver
-from iblf_jax.tuning.solvers._base import CHECKS
-
-EARLIER_NAMES = {"auto": "auto", "newton": "sqp", "lbfgs": "lbfgs", "adam": "adam"}
-"""Value of `optimiser` in earlier versions -> name of the solver."""
 
 
 @partial(
@@ -86,10 +79,10 @@ class Report:
     confidence: float = 0.95
 
     def __post_init__(self) -> None:
-        runs = checks.positive_integer("report_runs", self.runs, most=MAX_RUNS)
+        runs = checks.positive_integer("report.runs", self.runs, most=MAX_RUNS)
         object.__setattr__(self, "runs", runs)
         if self.seed is not None:
-            object.__setattr__(self, "seed", checks.seed(self.seed, "report_seed"))
+            object.__setattr__(self, "seed", checks.seed(self.seed, "report.seed"))
         object.__setattr__(self, "confidence", check_confidence(self.confidence))
 
 
@@ -122,8 +115,6 @@ class Effort:
             least, most = limits.get(field.name, (1, checks.MAX_STEPS))
             number = getattr(self, field.name)
             name = f"effort.{field.name}"
-            if field.name == "iterations":  # a keyword argument of `tune` in earlier versions
-                name = "iterations"
             checked = checks.positive_integer(name, number, least=least, most=most)
             object.__setattr__(self, field.name, checked)
 
@@ -148,39 +139,11 @@ def effort_of(given: str | Effort) -> Effort:
     return EFFORTS[given]
 
 
-REPLACED = {
-    "iterations": "effort=ij.tuning.Effort(iterations=...)",
-    "optimiser": "solver=ij.tuning.SQP(), ij.tuning.LBFGS() or ij.tuning.Adam()",
-    "mode": "solver=ij.tuning.LBFGS(mode=...)",
-    "resample": "solver=ij.tuning.Adam(resample=...)",
-    "learning_rate": "solver=ij.tuning.Adam(learning_rate=...)",
-    "starts": "solver=ij.tuning.SQP(starts=...)",
-    "sharpenings": "solver=ij.tuning.SQP(sharpenings=...)",
-    "tolerance": "solver=ij.tuning.SQP(tolerance=...)",
-    "patience": "solver=ij.tuning.SQP(patience=...)",
-    "report_runs": "report=ij.tuning.Report(runs=...)",
-    "report_seed": "report=ij.tuning.Report(seed=...)",
-    "confidence": "report=ij.tuning.Report(confidence=...)",
-    "callback": "progress=callback",
-}
-"""Keyword argument of `tune` in earlier versions -> what replaces it."""
-OF_REPORT = {"report_runs": "runs", "report_seed": "seed", "confidence": "confidence"}
-"""Name of an option in earlier versions and in stored files -> its name in `Report`."""
-ARGUMENTS = (
-    *("scenario", "parameters", "objective"),
-    *(field.name for field in dataclasses.fields(TuningRunOptions)),
-    *("solver", "effort", "report", "checkpoint", "progress"),
-)
-"""The keyword arguments of `tune`."""
-
-
 class SearchOptions(NamedTuple):
     """The options of a search, of its report and of the progress that it shows."""
 
     solver: Solver | None
     """The solver; None if `chosen_solver` decides by the number of coordinates."""
-    of_automatic: dict[str, Any]
-    """Options from deprecated keyword arguments, for a solver that is chosen automatically."""
     report: Report
     show: bool | None
     """Whether a progress bar is shown; None to show it on a terminal or in a notebook."""
@@ -194,71 +157,23 @@ def options_of(
     effort: str | Effort,
     report: Report | None,
     progress: bool | Callable[[Any], None] | None,
-    deprecated: Mapping[str, Any],
 ) -> SearchOptions:
-    """Checks the options of the search and of the report.
-
-    Args:
-      solver, effort, report, progress: arguments of `tune`.
-      deprecated: further keyword arguments, those of earlier versions.
+    """Checks the options of the search and of the report, which are arguments of `tune`.
 
     Raises:
-      TypeError: an unknown keyword argument.
       ValueError: an option that is not valid.
     """
-    _warn_of_deprecated(deprecated)
-    given = dict(deprecated)
     budget = effort_of(effort)
-    if "iterations" in given:
-        budget = dataclasses.replace(budget, iterations=given.pop("iterations"))
-    callback = given.pop("callback", None)
-    if callback is not None and not callable(callback):
-        expected = "a function that is called with the search after each step"
-        raise checks.fail("callback", callback, expected)
+    callback = None
     if callable(progress):
         callback = progress
         progress = False
-    of_report = {OF_REPORT[name]: given.pop(name) for name in OF_REPORT if name in given}
-    _check_not_given_twice("report", report, of_report)
-    _check_not_given_twice("solver", solver, given)
     if report is None:
-        report = Report(**of_report)
+        report = Report()
     if not isinstance(report, Report):
         remedy = "Such as ij.tuning.Report(runs=200)."
         raise checks.fail("report", report, "an ij.tuning.Report", remedy)
-    checked = {name: _checked(name, value) for name, value in given.items()}
-    return SearchOptions(_solver(solver), checked, report, progress, callback, budget)
-
-
-def _warn_of_deprecated(deprecated: Mapping[str, Any]) -> None:
-    """Warns of each keyword argument of an earlier version; raises TypeError if there was none of
-    this name.
-    """
-    for name in deprecated:
-        if name not in REPLACED:
-            near = checks.did_you_mean(name, (*ARGUMENTS, *REPLACED))
-            text = f"tune() got an unexpected keyword argument {name!r}. {near}".rstrip()
-            raise TypeError(f"{text} Its arguments are {', '.join(ARGUMENTS)}.")
-        notices.warn(
-            f"The keyword argument {name} of ij.tune is deprecated: write {REPLACED[name]}.",
-            DeprecationWarning,
-        )
-
-
-def _check_not_given_twice(name: str, value: Any, further: Mapping[str, Any]) -> None:
-    """Raises ValueError if an object is given together with deprecated arguments for its fields."""
-    if further and value is not None:
-        names = ", ".join(further)
-        came = checks.Words(f"{name}= and {names}")
-        raise checks.fail(name, came, "one of them", f"Put {names} into {name}.")
-
-
-def _checked(name: str, value: Any) -> Any:
-    """The value of a deprecated option of a solver after its check."""
-    if name == "optimiser":
-        checks.one_of(name, value, EARLIER_NAMES)
-        return EARLIER_NAMES[value]
-    return CHECKS[name](name, value)
+    return SearchOptions(_solver(solver), report, progress, callback, budget)
 
 
 def _solver(given: Any) -> Solver | None:
@@ -274,33 +189,13 @@ def _solver(given: Any) -> Solver | None:
     return given
 
 
-def chosen_solver(options: SearchOptions, size: int) -> tuple[Solver, str]:
-    """The solver for a problem of `size` coordinates, and its mode of differentiation."""
-    solver = options.solver or _automatic(options.of_automatic, size)
+def chosen_solver(given: Solver | None, size: int) -> tuple[Solver, str]:
+    """The solver for a problem of `size` coordinates, and its mode of differentiation.
+
+    If none is given, SQP in forward mode, and L-BFGS in reverse mode.
+    """
+    is_forward = differentiates_forward(size)
+    solver = given or SOLVERS["sqp" if is_forward else "lbfgs"]()
     if solver.mode != "auto":
         return solver, solver.mode
-    return solver, "forward" if differentiates_forward(size) else "reverse"
-
-
-def _automatic(given: Mapping[str, Any], size: int) -> Solver:
-    """The default solver: SQP in forward mode, L-BFGS in reverse mode, Adam if runs are resampled.
-
-    The deprecated arguments `mode`, `resample` and `optimiser` may change this choice.
-    """
-    mode = given.get("mode", "auto")
-    resample = given.get("resample", False)
-    name = given.get("optimiser", "auto")
-    if name == "auto" and resample:
-        name = "adam"
-    elif name == "auto":
-        is_forward = mode == "forward" or (mode == "auto" and differentiates_forward(size))
-        name = "sqp" if is_forward else "lbfgs"
-    if name == "sqp" and mode == "reverse":
-        remedy = "Reverse mode has no Gauss-Newton matrix: take solver=ij.tuning.LBFGS()."
-        raise checks.fail("mode", mode, '"forward" with SQP', remedy)
-    if name != "adam" and resample:
-        remedy = "It compares losses of the same runs: take solver=ij.tuning.Adam(resample=True)."
-        raise checks.fail("resample", resample, f"False with {name}", remedy)
-    solver: Any = SOLVERS[name]
-    fields = [field.name for field in dataclasses.fields(solver)]
-    return solver(**{option: x for option, x in given.items() if option in fields})
+    return solver, "forward" if is_forward else "reverse"

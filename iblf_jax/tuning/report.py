@@ -235,11 +235,6 @@ class TuningReport(Result):
         return not (self.bounds_kept or allows_violations)
 
     @property
-    def halved(self) -> str:
-        """`step_check` in words, as earlier versions had it; empty if there is none."""
-        return str(self.step_check or "")
-
-    @property
     def headline(self) -> str:
         """Bounds and requirements in a few words, what failed first."""
         words = [*self._bounds_in_few_words(), *self._requirements_in_few_words()]
@@ -365,7 +360,7 @@ class TuningReport(Result):
     def to_dict(self) -> dict[str, Any]:
         """Everything as numbers and strings."""
         changes = [{**dataclasses.asdict(c), "significant": c.significant} for c in self.changes]
-        further = {"changes": changes, "halved": self.halved, "headline": self.headline}
+        further = {"changes": changes, "headline": self.headline}
         return dataclasses.asdict(self) | further
 
 

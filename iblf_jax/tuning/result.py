@@ -193,11 +193,6 @@ class TuneResult(Result):
         return {r.name: multiplier / float(r.scale) for r, multiplier in pairs}
 
     @property
-    def prices(self) -> dict[str, float]:
-        """The former name of `limit_multipliers`."""
-        return self.limit_multipliers
-
-    @property
     def notes(self) -> tuple[str, ...]:
         """What to consider before these gains are used, in words: why the search ended, gains far
         from their start, an objective without a cost of torque.

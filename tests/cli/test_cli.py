@@ -74,7 +74,7 @@ def test_reproduce(command, tmp_path):
     assert "DID NOT HOLD" not in out
 
     report = strict_json(tmp_path / "out" / "metrics.json")
-    assert [claim["held"] for claim in report["claims"]] == [True] * 8
+    assert [claim["confirmed"] for claim in report["claims"]] == [True] * 8
     assert report["runs"]["integral BLF"]["metrics"]["first_violation_time"]["value"] is None
     assert "masses 2 / 0.85 kg, lengths 0.35 / 0.31 m" in report["assumed"]
     torques = report["peaks"]["integral BLF"]["tau"]

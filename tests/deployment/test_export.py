@@ -560,14 +560,6 @@ def test_a_closed_loop_in_webassembly_is_simulate(lab, tmp_path):
     np.testing.assert_allclose(run()["q"], slower.q, atol=1e-10)
 
 
-def test_the_former_name_of_a_given_reference_still_works(tmp_path):
-    with (
-        pytest.warns(DeprecationWarning, match="given"),
-        pytest.raises(ValueError, match="reference"),
-    ):
-        ij.export(ij.presets.zhang_yan_2024(), tmp_path, target="wasm", reference="told")
-
-
 @pytest.mark.slow
 def test_the_command_line_exports(tmp_path, capsys):
     from iblf_jax.cli import main

@@ -103,16 +103,6 @@ def test_every_executor_says_why_it_is_unavailable():
         assert reason is None or "\n" not in reason
 
 
-def test_a_removed_backend_is_vmap(scenario):
-    """For one release its name is accepted."""
-    with pytest.warns(DeprecationWarning, match=r'backend="xla".*"vmap"'):
-        assert check_backend("xla") == "vmap"
-    with pytest.warns(DeprecationWarning, match=r'backend="xla".*"vmap"') as given:
-        request = RunRequest.of(canonical(scenario), steps=10, backend="xla")
-    assert len(given) == 1
-    assert request.backend == "vmap"
-
-
 @pytest.mark.slow
 def test_where_no_kernel_can_be_compiled_auto_runs_by_the_scan(scenario, monkeypatch):
     """One warning names the remedy, for a run and for a batch."""

@@ -446,10 +446,11 @@ def test_the_default_device_decides_on_a_machine_with_a_gpu(paper, monkeypatch):
     backend and its devices."""
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     perturbations = {"plant.mass[1]": ij.value(ij.uniform(0.7, 0.9))}
+    executor = ij.studies.ThisProcess(devices=jax.devices("cpu"))
     with pytest.raises(
         ValueError, match=r"platform that JAX computes on, gpu.*jax\.default_device"
     ):
-        ij.monte_carlo(paper, perturbations, runs=3, duration=0.05, devices=jax.devices("cpu"))
+        ij.monte_carlo(paper, perturbations, runs=3, duration=0.05, executor=executor)
     monkeypatch.setattr(jax, "local_devices", lambda **_: pytest.fail("these would be GPUs"))
     with jax.default_device(jax.devices("cpu")[0]):
         assert registry.default_backend() == ("native", None)

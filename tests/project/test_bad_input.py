@@ -479,6 +479,8 @@ GOOD = {
     "sweep": lambda **x: ij.sweep(
         **({"scenario": WEAK, "grid": {"controller.K2": [10.0, 20.0]}, **SHORT} | x)
     ),
+    "ThisProcess": lambda **x: GOOD["monte_carlo"](executor=ij.studies.ThisProcess(**x)),
+    "StoreOptions": lambda **x: GOOD["sweep"](store=ij.studies.StoreOptions("never.zarr", **x)),
     "sensitivity": lambda **x: ij.sensitivity(
         **({"scenario": WEAK, "perturbations": DRAWN, "points": 2, **SHORT} | x)
     ),
@@ -612,12 +614,14 @@ REFUSED = {
     "compare record_every": (NO_COUNTS, ["whole number"]),
     "certify method": (NO_WORDS, ["'rk4'"]),
     "monte_carlo backend": (NO_WORDS, ["'auto'", "'native'"]),
-    "monte_carlo chunk": (NO_COUNTS[1:], ["whole number"]),
-    "monte_carlo memory": ((None, "x", [], 0, -1, 5e-324, 1e300, 10**30, np.inf), ["bytes"]),
+    "ThisProcess chunk": (NO_COUNTS[1:], ["whole number"]),
+    "ThisProcess memory": ((None, "x", [], 0, -1, 5e-324, 1e300, 10**30, np.inf), ["bytes"]),
     "monte_carlo runs": (NO_COUNTS, ["whole number"]),
     "monte_carlo seed": (NO_SEEDS, ["whole number"]),
     "sweep backend": (NO_WORDS, ["'auto'"]),
-    "sweep unit": (NO_COUNTS[1:], ["whole number"]),
+    "StoreOptions unit": (NO_COUNTS[1:], ["whole number"]),
+    "StoreOptions writer": (NO_WORDS, ["'client'", "'worker'"]),
+    "StoreOptions shared": ((None, "yes", 1, []), ["True or False"]),
     "sweep store": (NO_PATHS[:7], ["path of a folder"]),
     "sensitivity backend": (NO_WORDS, ["'auto'"]),
     "sensitivity output": ((None, [], 3, "nope", "", LONG_NAME), []),

@@ -60,7 +60,6 @@ PROMISED = [
     *("gains_for_guarantee", "GuaranteedGains"),
     *("failure_probability", "FailureProbability", "joint_samples"),
     *(
-        "distributed",
         "certificates",
         "Study",
         "TuneResult",
@@ -315,12 +314,29 @@ def test_what_is_kept_comes_first_and_then_the_path():
             assert hasattr(ij, name.replace("save_", "load_")) or name == "save_rollouts", name
         else:
             assert first == "path", name
-    with pytest.raises(ValueError, match=r"store: got 'x.zarr', expected it as path"):
-        ij.load_sweep(store="x.zarr")
 
 
-def test_distributed_shows_what_users_call():
-    assert dir(ij.distributed) == ["ProcessLostError", "initialize", "rank", "size"]
+@pytest.mark.parametrize(
+    ("call", "name", "known"),
+    [
+        (ij.tune, "optimiser", "scenario, parameters, objective, "),
+        (ij.sweep, "unit", "scenario, grid, "),
+        (ij.monte_carlo, "chunk", "scenario, perturbations, runs, "),
+        (ij.sensitivity, "devices", "scenario, perturbations, "),
+        (ij.falsify, "sets", "scenario, perturbations, "),
+        (ij.certificates.counterexample, "ranges", "scenario, perturbations, starts, seed."),
+        (ij.load_sweep, "store", "path."),
+    ],
+)
+def test_an_unknown_keyword_is_refused_with_the_known_ones(call, name, known):
+    first = re.escape(f"{call.__name__}() got an unexpected keyword argument {name!r}. ")
+    with pytest.raises(TypeError, match=rf"{first}(Did you mean .*\? )?Its arguments are {known}"):
+        call(**{name: 1})
+
+
+def test_a_misspelt_keyword_is_refused_with_the_nearest_one():
+    with pytest.raises(TypeError, match=r"argument 'point'\. Did you mean points\? Its arguments"):
+        ij.sensitivity(point=4)
 
 
 def test_an_unknown_name_is_an_attribute_error():

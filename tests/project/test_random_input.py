@@ -343,6 +343,14 @@ NASTY = {
 }
 WAYS = {"controller.K2": ij.factor(ij.uniform(0.9, 1.1))}
 GOAL = ij.objectives.tracking(scale=1.0)
+
+
+def with_a_design(scenario, kind, points):
+    """A sweep over random gains."""
+    grid = {"controller.K2": ij.uniform(1.0, 2.0)}
+    return ij.sweep(scenario, grid, design=ij.studies.Design(kind, points), duration=0.01)
+
+
 ENTRIES = {
     "simulate": (
         ij.simulate,
@@ -361,10 +369,9 @@ ENTRIES = {
             "seed": 0,
             "sampler": "sobol",
             "replicates": 2,
-            "chunk": 8,
-            "memory": 1e9,
-        }
-        | {"devices": None, "progress": False},
+            "executor": None,
+            "progress": False,
+        },
     ),
     "sweep": (
         ij.sweep,
@@ -373,14 +380,24 @@ ENTRIES = {
             "grid": {"controller.K2": [1.0, 2.0]},
             "perturbations": None,
             "runs": 1,
-            "points": None,
+            "design": "grid",
             "store": None,
-        }
-        | {"unit": None, "memory": 1e9, "devices": None, "progress": False},
+            "executor": None,
+            "progress": False,
+        },
+    ),
+    "Design": (with_a_design, {"scenario": None, "kind": "random", "points": 4}),
+    "ThisProcess": (
+        lambda **options: ij.studies.ThisProcess(**options).checked(),
+        {"devices": None, "memory": 1e9, "chunk": 8},
+    ),
+    "StoreOptions": (
+        lambda **options: ij.studies.StoreOptions(**options).checked(),
+        {"path": "sweep.zarr", "unit": None, "writer": "client", "shared": False},
     ),
     "sensitivity": (
         ij.sensitivity,
-        {"scenario": None, "perturbations": WAYS, "points": 4, "memory": 1e9, "devices": None},
+        {"scenario": None, "perturbations": WAYS, "points": 4, "executor": None},
     ),
     "tune": (
         ij.tune,
@@ -706,8 +723,7 @@ def depth_left(n: int) -> bool:
             lambda s: ij.sweep(
                 s,
                 {"controller.K2": ij.uniform(1.0, 2.0)},
-                design="random",
-                points=2**31,
+                design=ij.studies.Design("random", points=2**31),
                 duration=0.01,
             ),
             ("points", "GiB"),
@@ -717,16 +733,22 @@ def depth_left(n: int) -> bool:
             ("points", "at most", "GiB"),
         ),
         (
-            lambda s: ij.tune(s, ["controller.K2"], GOAL, starts=2**40, duration=0.01),
+            lambda s: ij.tune(
+                s, ["controller.K2"], GOAL, solver=ij.tuning.SQP(starts=2**40), duration=0.01
+            ),
             ("starts", "at most", "GiB"),
         ),
         (lambda s: ij.falsify(s, WAYS, starts=2**40, duration=0.01), ("GiB",)),
         (
-            lambda s: ij.monte_carlo(s, WAYS, runs=2, devices=[], duration=0.01),
+            lambda s: ij.monte_carlo(
+                s, WAYS, runs=2, executor=ij.studies.ThisProcess(devices=[]), duration=0.01
+            ),
             ("devices", "at least one"),
         ),
         (
-            lambda s: ij.monte_carlo(s, WAYS, runs=2, devices=["cpu"], duration=0.01),
+            lambda s: ij.monte_carlo(
+                s, WAYS, runs=2, executor=ij.studies.ThisProcess(devices=["cpu"]), duration=0.01
+            ),
             ("devices", "cpu"),
         ),
         (
@@ -737,9 +759,9 @@ def depth_left(n: int) -> bool:
         ),
         (
             lambda s: ij.tune(
-                s, ["controller.K2"], ij.objectives.effort(joints=[1.0] * 3), duration=0.01
+                s, ["controller.K2"], ij.objectives.effort(weights=[1.0] * 3), duration=0.01
             ),
-            ("joints", "(3,)"),
+            ("weights", "(3,)"),
         ),
         (lambda s: ij.objectives.margin_above(0.1, allowed=5.0), ("allowed", "0 to 1")),
     ],
@@ -1048,7 +1070,6 @@ def test_any_word_in_the_place_of_any_other_on_the_command_line(
     """Exit code 2 and one line that can be read, or the command goes on to its runs; `presets` and
     `parameters` print."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("jax.distributed.initialize", entered)
     monkeypatch.setitem(sys.modules, "distributed", types.SimpleNamespace(Client=entered))
     monkeypatch.setattr("iblf_jax.cli.prepare_jax", lambda: None)
     for name in ("study", "failure", "sweep", "tune"):

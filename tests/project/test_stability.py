@@ -1,16 +1,13 @@
-"""The page on stability names every public name once, and every deprecated argument."""
+"""The page on stability names every public name once."""
 
 from __future__ import annotations
 
 import pkgutil
 import re
 
-import pytest
 from conftest import ROOT
 
 import iblf_jax as ij
-from iblf_jax.studies.options import REPLACED as STUDY_ARGUMENTS
-from iblf_jax.tuning.options import REPLACED as TUNE_ARGUMENTS
 
 PAGE = (ROOT / "docs" / "stability.md").read_text(encoding="utf-8")
 LISTS = ("stable", "provisional", "internal")
@@ -47,20 +44,6 @@ def test_every_public_name_is_in_one_list():
         "unknown": set(),
         "twice": set(),
     }
-
-
-def test_every_deprecated_argument_is_listed():
-    deprecated = table(PAGE, "deprecated")
-    for name in (*TUNE_ARGUMENTS, *STUDY_ARGUMENTS):
-        assert f"{name}=" in deprecated, name
-
-
-@pytest.mark.parametrize("call", [ij.sweep, ij.monte_carlo, ij.sensitivity, ij.tune])
-def test_deprecated_arguments_are_accepted_until_the_next_major_version(call):
-    import inspect
-
-    parameters = inspect.signature(call).parameters.values()
-    assert any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters)
 
 
 def test_these_tests_can_fail():

@@ -57,13 +57,6 @@ PROSE = re.compile(
     r"|way of|said by)\b",
     re.IGNORECASE,
 )
-PUBLIC_NAMES = {
-    "identification/result.py": {"asked", "wanted"},
-    "tuning/result.py": {"prices"},
-    "control/controllers/__init__.py": {"Setting"},
-    "simulation/scenario.py": {"setting"},
-}
-"""File -> names of earlier versions that users may still use."""
 UNFINISHED: frozenset[str] = frozenset()
 """Folders whose names and prose are still to be revised."""
 FOLDERS = sorted(
@@ -120,7 +113,7 @@ def test_names_are_standard_terms(folder):
     found = {}
     for path in sources(folder):
         name = path.relative_to(PACKAGE).as_posix()
-        names = private_names(path.read_text()) - PUBLIC_NAMES.get(name, set())
+        names = private_names(path.read_text())
         if names:
             found[name] = sorted(names)
     assert not found

@@ -10,13 +10,12 @@ import subprocess
 import sys
 from pathlib import Path
 
-import jax
 import numpy as np
 import pytest
 import study_cases as cases
 
 import iblf_jax as ij
-from iblf_jax.studies import distributed, store, workers
+from iblf_jax.studies import store, workers
 
 SCENARIO = ij.presets.zhang_yan_2024()
 
@@ -158,34 +157,6 @@ def test_what_is_no_executor_is_refused(wrong):
         cases.study(executor=wrong)
 
 
-@pytest.mark.slow
-def test_keyword_arguments_of_earlier_versions_still_work(table, tmp_path):
-    with pytest.warns(DeprecationWarning, match=r"unit of ij.sweep.*StoreOptions"):
-        old = ij.sweep(
-            SCENARIO,
-            cases.GRID,
-            perturbations=cases.perturbations(),
-            runs=cases.RUNS,
-            store=tmp_path / "sweep.zarr",
-            unit=cases.UNIT,
-            chunk=300,
-            **cases.options(),
-        )
-    assert old.identical(table)
-    with pytest.warns(DeprecationWarning, match=r"points of ij.sweep.*Design"):
-        ij.sweep(
-            SCENARIO,
-            {"controller.K2": ij.uniform(10.0, 40.0)},
-            design="random",
-            points=3,
-            **cases.options(),
-        )
-    with pytest.raises(ValueError, match="one of them"):
-        cases.study(executor=ij.studies.ThisProcess(), chunk=3)
-    with pytest.raises(TypeError, match=r"unexpected keyword argument 'chunks'.*chunk"):
-        cases.study(chunks=3)
-
-
 def test_a_store_of_an_earlier_version_is_read():
     """Made by the code of commit d674b34: 4 points with 3 runs each."""
     folder = Path(__file__).parents[1] / "data"
@@ -193,18 +164,6 @@ def test_a_store_of_an_earlier_version_is_read():
     with np.load(folder / "sweep_d674b34.npz") as expected:
         assert cases.same(cases.arrays(found), dict(expected))
     assert found.attrs["computed_cases"] == 12
-
-
-def test_jobs_of_jax_distributed_are_deprecated(monkeypatch):
-    seen = []
-    monkeypatch.setattr(jax.distributed, "initialize", lambda *words, **more: seen.append(words))
-    with pytest.warns(DeprecationWarning, match="executor"):
-        distributed.initialize("localhost:1", 2, 0)
-    assert seen == [("localhost:1", 2, 0)]
-    with pytest.raises(ValueError, match="all three"):
-        distributed.initialize("localhost:1", None, None)
-    assert (distributed.rank(), distributed.size()) == (0, 1)
-    assert issubclass(distributed.ProcessLostError, RuntimeError)
 
 
 @pytest.mark.slow

@@ -470,7 +470,7 @@ def test_bad_perturbations_are_refused(perturbation, message):
         ({"runs": 100, "sampler": "sobol"}, "128"),
         ({"runs": 10, "replicates": 2}, "replicates"),
         ({"backend": "fast"}, "backend"),
-        ({"chunk": 0.5}, "chunk"),
+        ({"executor": ij.studies.ThisProcess(chunk=0.5)}, "chunk"),
         ({"duration": 0.0105}, "duration"),
     ],
 )

@@ -72,11 +72,11 @@ FILE = (
         ),
         (
             (
-                'name = "overshoot"\nfold = { kind = "settling", tolerance = 0.02 }\njoints = [1.0,'
-                " 0.0]\nscale = 0.1"
+                'name = "overshoot"\nfold = { kind = "settling", tolerance = 0.02 }\n'
+                "weights = [1.0, 0.0]\nscale = 0.1"
             ),
             ij.objectives.metric(
-                ij.metrics.Settling(tolerance=0.02), "overshoot", joints=[1.0, 0.0], scale=0.1
+                ij.metrics.Settling(tolerance=0.02), "overshoot", weights=[1.0, 0.0], scale=0.1
             ),
         ),
     ],
@@ -408,17 +408,6 @@ def test_limits_of_single_joints_and_weights(three_joints):
     )
 
 
-def test_floating_point_numbers_as_joints_are_weights_with_a_warning(three_joints):
-    with pytest.warns(DeprecationWarning, match=r"effort\(weights=...\)") as caught:
-        old = ij.objectives.effort(joints=[1.0, 0.0, 2.0])
-    assert caught[0].filename == __file__
-    np.testing.assert_array_equal(
-        exact(old, three_joints), exact(ij.objectives.effort(weights=[1, 0, 2]), three_joints)
-    )
-    with pytest.raises(ValueError, match="weights="):
-        ij.objectives.effort(joints=[1.0, 0.0], weights=[1.0, 0.0])
-
-
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -437,6 +426,9 @@ def test_floating_point_numbers_as_joints_are_weights_with_a_warning(three_joint
         (lambda o: o.violation_probability_below(1.5), "violation_probability_below: probability"),
         (lambda o: o.tracking(joints=[True, 1]), "tracking: joints.*cannot be mixed"),
         (lambda o: o.tracking(joints=True), "tracking: joints"),
+        (lambda o: o.effort(joints=[1.0, 0.0]), r"effort: joints: got \[1.0.*weights="),
+        (lambda o: o.effort(joints=np.array([0.5])), "effort: joints: got .*weights="),
+        (lambda o: o.effort(joints=2.0), "effort: joints: got 2.0.*weights="),
         (lambda o: o.tracking(joints=[]), "tracking: joints.*at least one joint"),
         (lambda o: o.tracking(joints={0}), "tracking: joints"),
         (lambda o: o.tracking(weights=[[1.0]]), "tracking: weights"),
@@ -519,17 +511,9 @@ def test_a_tuning_file_selects_joints_by_name_index_and_slice(tmp_path):
         'weights = [1.0, 0.5]\n[[requirement]]\nkind = "peak_torque_below"\nlimit = [14.0, 2.0]'
     )
     np.testing.assert_allclose(1 / limits.weights, [14.0, 2.0])
-    for old in (
-        "[1.0, 0.5]",
-        "[2, 2]",
-        "[1, 3]",
-    ):  # what earlier versions meant, where it is no selection
-        with pytest.warns(DeprecationWarning, match="weights = "):
-            found = loaded(f"joints = {old}")
-        np.testing.assert_allclose(found.weights, eval(old))
-        assert found.joints is None
-    with pytest.warns(UserWarning, match="selects all joints"):
-        assert loaded("joints = [0, 1]").joints == (0, 1)
+    assert loaded("joints = [0, 1]").joints == (0, 1)
+    with pytest.raises(ValueError, match=r"objective\[\d\].*joints.*weights="):
+        loaded("joints = [1.0, 0.5]")
 
 
 def test_a_result_that_was_saved_with_weights_as_joints_means_what_it_meant():

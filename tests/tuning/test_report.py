@@ -430,8 +430,6 @@ def test_a_report_as_numbers_goes_through_json():
     assert first["requirement"] is None and second["requirement"] == "a"
     assert first["influence"]["statistic"] == 0.97 and first["first"] == [3, 8]
     assert numbers["headline"] == report.headline
-    assert numbers["halved"] == report.halved == str(report.step_check)
-    assert made_up_report(0, {}).halved == ""
 
 
 # ----------------------------------------------------------------------------------- made from runs
@@ -533,7 +531,7 @@ def test_without_failures_there_is_no_explanation(paper):
     options = TuningRunOptions(**BRIEF, perturbations=DRAWS).checked()
     request = ReportRequest(paper, paper, ("controller.K2",), goal, options, Report(runs=8, seed=2))
     report = make_report(request)
-    assert report.failures == () and report.step_check is None and report.halved == ""
+    assert report.failures == () and report.step_check is None
 
 
 @pytest.mark.slow

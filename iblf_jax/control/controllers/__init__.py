@@ -35,9 +35,6 @@ from iblf_jax.control.controllers.terminal_sliding_mode import (
 )
 from iblf_jax.control.controllers.with_drive import WithDrive as WithDrive
 
-Setting = LawContext
-"""The name that earlier versions gave `LawContext`."""
-
 MEMBERS = {
     "backstepping": Backstepping,
     "barrier_backstepping": BarrierBackstepping,
@@ -80,7 +77,6 @@ __all__ = [
     "ReferenceGovernor",
     "SafetyFilter",
     "Saturated",
-    "Setting",
     "State",
     "SurfaceBarrier",
     "TerminalSlidingMode",

@@ -327,7 +327,7 @@ def test_a_recording_identifies_what_the_same_csv_file_identifies(logged, tmp_pa
     of_csv = ij.identify(scenario, ROOT / "examples" / "log.csv", paths, widths=False)
     with pytest.warns(UserWarning, match="no joint names"):
         of_bag = ij.identify(scenario, f"{folder}/", paths, widths=False)
-    for one, two in zip(of_bag.wanted, of_csv.wanted, strict=True):
+    for one, two in zip(of_bag.requested_numbers, of_csv.requested_numbers, strict=True):
         assert one.name == two.name
         np.testing.assert_allclose(one.value, two.value, rtol=1e-6)
         np.testing.assert_allclose(one.error, two.error, rtol=1e-4)
@@ -347,7 +347,7 @@ def test_the_latency_of_the_efforts_is_estimated(tmp_path):
     known = ij.identify(scenario, log, ["robot.mass", "disturbance.viscous"], widths=False)
     np.testing.assert_allclose(known.delay, 2e-3, atol=5e-5)
     true = np.concatenate([*bag_files.EXAMPLE.values()])
-    np.testing.assert_allclose([x.value for x in known.wanted], true, rtol=1e-3)
+    np.testing.assert_allclose([x.value for x in known.requested_numbers], true, rtol=1e-3)
 
 
 @pytest.mark.slow
@@ -377,7 +377,7 @@ def test_the_recording_of_the_examples_is_a_run_of_its_arm(tmp_path):
     paths = ["robot.mass", "disturbance.viscous"]
     known = ij.identify(scenario, log, paths, widths=False)
     true = np.concatenate([*bag_files.EXAMPLE.values()])
-    np.testing.assert_allclose([x.value for x in known.wanted], true, rtol=0.03)
+    np.testing.assert_allclose([x.value for x in known.requested_numbers], true, rtol=0.03)
 
 
 # --- runs ----------------------------------------------------------------------------------------
