@@ -62,7 +62,7 @@ class Wrapping:
 
 
 @ij.component
-class Barrier:
+class Barrier(ij.barriers.Barrier):
     """A barrier of a user's."""
 
     guard: float = ij.static(default=1e-3)

@@ -206,7 +206,7 @@ def decay_phi(law: FullState, gain: Any = None) -> jax.Array | None:
 
 def _decay_of(barrier: Any, gain: jax.Array) -> jax.Array | None:
     """Decay rate that a barrier states for a gain, (n,) [1/s], or None."""
-    stated = optional_member(barrier, "decay_rate")
+    stated = barrier.decay_rate
     return None if stated is None else stated(gain)
 
 

@@ -21,7 +21,6 @@ from iblf_jax.certificates.lines import (
     not_applicable,
     verdict_of,
 )
-from iblf_jax.certificates.optional import optional_member
 from iblf_jax.certificates.run_summary import Segment
 from iblf_jax.certificates.theorem_lines import (
     REFERENCE_INSIDE,
@@ -322,7 +321,7 @@ def error_bounds(segment: Segment, V: np.ndarray) -> np.ndarray:
             continue
         k_l, k_u = claim.k_l[:, i], claim.k_u[:, i]
         tube = Tube(zero, zero, -k_l, k_u, zero, zero)
-        stated = optional_member(barrier, "xi_bound")(level, tube)
+        stated = barrier.xi_bound(level, tube)
         if stated is None:
             stated = np.full_like(zero, np.nan)
         rows.append(np.asarray(stated))

@@ -16,7 +16,7 @@ d_tilde = d.  A torque observer of the robot inside the plant gives f_hat, which
 d_hat = M0^-1 f_hat in the second level is not: T has dV/df_hat . f_hat' then, and
 f_hat' = kf f_tilde.
 
-For barriers that decay exactly (`barrier_member`, "exact_decay"), (S.3) is an equality.
+For barriers that decay exactly (`Barrier.exact_decay`), (S.3) is an equality.
 
 With filters, beta_i takes the place of alpha_i in the errors and its rate is known exactly, so that
 T = sum w_i s_i . d_tilde_i + sum w_i s_i . G_i (beta_i - alpha_i).  The last sum is the effect of
@@ -282,12 +282,12 @@ def _claim_terms(
         w, x = law.weights[i], at.x[i]
         # The claim holds for the gain of the instant, which a decay makes a function of t and V_i.
         gain = gain_at(decay_of(law, i), at.t, law.k[i], barrier, tube, x)
-        stated = optional_member(barrier, "decay_rate")(gain)
+        stated = barrier.decay_rate(gain)
         if stated is not None:
             decay += jnp.sum(w * stated * barrier.value(tube, x))
         by_slopes += jnp.sum(law.c[i] * level.slope**2 / w)
         xi = _relative_error(scenario, i, tube, x)
-        gap = _gap(xi, optional_member(barrier, "guard"))
+        gap = _gap(xi, barrier.guard)
         gaps.append(gap)
         size += jnp.sum(jnp.abs(level.slope) / gap * (jnp.abs(tube.dq_d) + gain * jnp.abs(x)))
         near = jnp.abs(x) + jnp.abs(tube.q_d)
@@ -354,7 +354,7 @@ def _gap(xi: jax.Array, guard: float) -> jax.Array:
 
 def _ratio_at_centre(barrier: Any, tube: Tube) -> jax.Array:
     """e/s at e = 0, (n,); that of k^2/2 for a barrier without one."""
-    stated = optional_member(barrier, "error_over_slope")(tube, tube.q_d)
+    stated = barrier.error_over_slope(tube, tube.q_d)
     if stated is None:
         return 0.5 * jnp.minimum(tube.k_l, tube.k_u) ** 2
     return stated  # type: ignore[no-any-return]

@@ -6,13 +6,11 @@ declared here.
 
 from __future__ import annotations
 
-from iblf_jax.control.barriers._base import barrier_member
 from iblf_jax.control.controllers._base import law_member
 from iblf_jax.core.optional import OptionalMembers
 
 optional_member = OptionalMembers(
     **law_member.defaults,
-    **barrier_member.defaults,
     # laws that state a claim of their own, and fields of laws, barriers and observers
     lyapunov=None,
     decay=None,

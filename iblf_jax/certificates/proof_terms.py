@@ -45,7 +45,7 @@ from iblf_jax.certificates.claims import adaptive_law, decay_phi, decay_rate, ow
 from iblf_jax.certificates.optional import optional_member
 from iblf_jax.control.controllers import Backstepping, FullState
 from iblf_jax.control.controllers._base import decay_of
-from iblf_jax.control.decays._base import decay_member, energy_gain, gain_at
+from iblf_jax.control.decays._base import energy_gain, gain_at
 from iblf_jax.control.observers import Printed
 from iblf_jax.control.observers._base import observer_member
 from iblf_jax.core.linalg import matvec, solve_spd
@@ -330,7 +330,7 @@ def _decay_of_backstepping(scenario: Scenario, t: jax.Array, state: LoopState, M
     decay = jnp.sum(law.weight * stated * law.barrier.value(tube, state.q)) + e2 @ (law.K2 * e2)
     W = 0.5 * e2 @ (M0 @ e2)
     second = decay_of(law, 1)
-    if decay_member(second, "constant"):
+    if second.constant:
         return decay
     return decay + 2.0 * energy_gain(second, t, W, e2) * W
 
@@ -388,7 +388,7 @@ def _term_sizes(
     K2 = _leaf(law, "K2", zero)
     kf = _leaf(scenario.observer, "kf", zero)
     barrier = optional_member(law, "barrier")
-    gap = _gap(now["xi"], optional_member(barrier, "guard"))
+    gap = _gap(now["xi"], barrier.guard)
     speeds = jnp.abs(state.dq) + jnp.abs(now["alpha"]) + jnp.abs(now["dq_d"])
     accelerations = jnp.abs(now["ddq"]) + jnp.abs(rates["alpha"])
     torque = (

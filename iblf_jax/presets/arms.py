@@ -39,7 +39,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.control.barriers import Barrier
-from iblf_jax.control.barriers._base import CLAIMS
 from iblf_jax.control.controllers import LAWS, Controller, PDGravity, law_by_name, within_effort
 from iblf_jax.control.controllers._base import law_member
 from iblf_jax.control.controllers.systems import observer_of
@@ -184,7 +183,7 @@ def inertial_weight(
     """
     checks.conforms("robot", robot, Robot)
     checks.conforms("reference", reference, Reference)
-    checks.conforms("barrier", barrier, Barrier, optional=CLAIMS)
+    checks.conforms("barrier", barrier, Barrier)
     if not isinstance(bounds, Bounds):
         raise checks.fail(
             "bounds",

@@ -30,13 +30,13 @@ from iblf_jax.control.sensors import Sensor
 from iblf_jax.control.sensors._base import sensor_member
 from iblf_jax.core import checks, modules, notices, programs
 from iblf_jax.core.disk_cache import keep_programs
+from iblf_jax.core.families import statements_of
 from iblf_jax.core.modules import NUMBERS
 from iblf_jax.core.presentation import present
 from iblf_jax.core.pytree import (
     Leaf,
     astype,
     component,
-    component_member,
     field_values,
     is_leaf_field,
     layers,
@@ -608,7 +608,7 @@ def fit_joints(part: Any, n: int, path: str) -> Any:
         return part
     new: dict[str, Any] = {}
     values = field_values(part)
-    own_joints = component_member(part, "own_joints")
+    own_joints = statements_of(part).own_joints
     for field in dataclasses.fields(part):
         old = values[field.name]
         name = f"{path}.{field.name}"

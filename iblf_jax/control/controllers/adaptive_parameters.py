@@ -50,7 +50,6 @@ from iblf_jax.control.controllers._base import (
     wrapped_advice,
     wrapped_switching,
 )
-from iblf_jax.control.decays._base import decay_member
 from iblf_jax.core import checks
 from iblf_jax.core.component_paths import member_of, replaced, resolve
 from iblf_jax.core.linalg import inner, solve_spd
@@ -164,7 +163,7 @@ class AdaptiveParameters:
             remedy = "With C0 q' the term 1/2 e2^T M0' e2 remains. Take reading=\"corrected\"."
             raise checks.fail(f"{field}.reading", "printed", "corrected", remedy)
         second = decay_of(law, 1)
-        if law_member(law, "reading") and not decay_member(second, "constant"):
+        if law_member(law, "reading") and not second.constant:
             remedy = "The energy of the second step contains the parameters, so that the torque is"
             remedy += " not affine in them."
             name = type(second).__name__

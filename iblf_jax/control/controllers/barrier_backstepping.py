@@ -47,11 +47,8 @@ import numpy as np
 
 from iblf_jax.control.barriers import Barrier, Mapping, Quadratic
 from iblf_jax.control.barriers._base import (
-    barrier_member,
     guard_is_active,
     has_ratio,
-    ratio_jumps,
-    value_unit,
 )
 from iblf_jax.control.controllers._base import Command, LawContext, decay_of
 from iblf_jax.control.controllers._levels import Design, Level, exact_levels, surface_levels
@@ -62,7 +59,6 @@ from iblf_jax.control.controllers.backstepping import (
     stated_decay,
 )
 from iblf_jax.control.decays import Decay
-from iblf_jax.control.decays._base import decay_member
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.core.units import ByLevel, PlantUnit, resolved
@@ -176,7 +172,7 @@ class BarrierBackstepping:
         c, weights = [], []
         for i, barrier in enumerate(self.barriers):
             level = f"x{i + 1}"
-            if value_unit(barrier) == "1":
+            if barrier.value_unit == "1":
                 c.append(PlantUnit("1", f"{level}^2/s"))
                 weights.append(PlantUnit("1", "energy"))
             else:
@@ -189,7 +185,7 @@ class BarrierBackstepping:
         if field != "decays":
             return symbols
         size: Any = "1"
-        if value_unit(self.barriers[index]) != "1":
+        if self.barriers[index].value_unit != "1":
             size = resolved(PlantUnit("1", f"x{index + 1}"), symbols)
         return {**symbols, "z": size}
 
@@ -289,8 +285,8 @@ class BarrierBackstepping:
             return
         # Row i is level i + 1, whose slope u contains with r - (i + 1) - 1 derivatives.
         needed = self.order - i - 2
-        smooth = barrier_member(barrier, "slope_derivatives")
-        if i > 0 and ratio_jumps(barrier):
+        smooth = barrier.slope_derivatives
+        if i > 0 and barrier.ratio_jumps:
             expected = "a barrier whose e/s does not jump at e = 0"
         elif smooth < needed:
             expected = f"a barrier whose slope has {needed} continuous derivatives at e = 0"
@@ -308,7 +304,7 @@ class BarrierBackstepping:
         if self.filter is not None:
             return
         decay = decay_of(self, i)
-        needed, smooth = self.order - i - 1, decay_member(decay, "smooth_derivatives")
+        needed, smooth = self.order - i - 1, decay.smooth_derivatives
         if smooth >= needed:
             return
         expected = f"a decay with {needed} continuous derivatives, as u contains them"
@@ -412,7 +408,7 @@ class BarrierBackstepping:
         self, t: jax.Array, x: jax.Array, d_hat: jax.Array, context: LawContext, state: Any
     ) -> jax.Array | None:
         """e_r, (n,), where u jumps at e_r = 0; None for a last barrier without a jump."""
-        if not ratio_jumps(self.barriers[-1]):
+        if not self.barriers[-1].ratio_jumps:
             return None
         _, tubes = self.levels(t, x, d_hat, context, state)
         return x[-1] - tubes[-1].q_d
@@ -423,7 +419,7 @@ class BarrierBackstepping:
 
 def _ratio(barrier: Barrier, tube: Tube, x: jax.Array) -> jax.Array:
     """The ratio e/s of a barrier; 1 for a barrier that does not state it."""
-    stated = barrier_member(barrier, "error_over_slope")(tube, x)
+    stated = barrier.error_over_slope(tube, x)
     if stated is None:
         return jnp.ones_like(x)
     return stated  # type: ignore[no-any-return]
