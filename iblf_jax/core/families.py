@@ -91,16 +91,14 @@ def required_members(base: type) -> list[str]:
 
 def _reduced(part: Any) -> tuple:
     cls = type(part)
-    return _restored, (cls, cls._adopted_by, vars(part))
+    return _restored, (cls, cls._adopted_by), part.__getstate__()
 
 
-def _restored(cls: type, bases: tuple[type, ...], values: dict[str, Any]) -> Any:
-    """An object of a class that `bases` have adopted."""
+def _restored(cls: type, bases: tuple[type, ...]) -> Any:
+    """An empty object of a class that `bases` have adopted."""
     for base in bases:
         adopt(cls, base)
-    part: Any = object.__new__(cls)
-    vars(part).update(values)
-    return part
+    return object.__new__(cls)
 
 
 def _lines_of(base: type) -> Iterator[type]:

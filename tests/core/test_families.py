@@ -1,0 +1,141 @@
+"""Base classes of families, and the adoption of classes that inherit from none."""
+
+from __future__ import annotations
+
+import copy
+import math
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import jax.numpy as jnp
+import pytest
+
+import iblf_jax as ij
+from iblf_jax.core.families import adopt, required_members
+
+OWN = """
+import iblf_jax as ij
+
+@ij.component
+class Steep:
+    gain: ij.Leaf = ij.leaf("1", default=3.0)
+    guard: float = ij.static(default=1e-3)
+    uses_o = False
+
+    def value(self, tube, q):
+        return self.gain * (q - tube.q_d) ** 2
+
+    def slope(self, tube, q):
+        return 2 * self.gain * (q - tube.q_d)
+
+    def virtual_velocity(self, tube, q, k1, o):
+        return tube.dq_d - k1 * (q - tube.q_d)
+"""
+
+
+def own_class(module: str = "__main__") -> type:
+    names = {"__name__": module}
+    exec(OWN, names)
+    return names["Steep"]
+
+
+def law_with(barrier):
+    return ij.controllers.Backstepping(k1=2.0, K2=20.0, barrier=barrier)
+
+
+def test_a_class_without_a_base_class_gets_what_it_lacks_and_keeps_what_it_has():
+    own = own_class()
+    barrier = law_with(own()).barrier
+    assert type(barrier) is own and isinstance(barrier, ij.barriers.Barrier)
+    assert barrier.uses_o is False
+    assert barrier.value_unit == "1" and barrier.slope_derivatives == math.inf
+    assert barrier.decay_rate(jnp.ones(2)) is None
+
+
+def test_a_field_is_not_replaced_by_a_property_of_the_base_class():
+    @ij.component
+    class Kinked(own_class()):
+        slope_derivatives: int = ij.static(default=1)
+
+    del Kinked.slope_derivatives  # as a dataclass does for a field without a default
+    part = law_with(Kinked(slope_derivatives=2)).barrier
+    assert part.slope_derivatives == 2
+
+
+def test_a_field_without_a_value_is_required_although_the_base_class_has_a_default():
+    @ij.component
+    class Timed(ij.decays.Decay):
+        smooth_derivatives: int = ij.static()
+
+        def effective_gain(self, t, k, V):
+            return k
+
+    with pytest.raises(ValueError, match="smooth_derivatives"):
+        Timed()
+    assert Timed(smooth_derivatives=3).smooth_derivatives == 3
+
+
+def test_a_method_that_is_missing_is_an_error_at_the_definition():
+    with pytest.raises(ValueError, match=r"It lacks slope, virtual_velocity\."):
+
+        @ij.component
+        class Half(ij.barriers.Barrier):
+            guard: float = ij.static(default=1e-3)
+
+            def value(self, tube, q):
+                return q
+
+
+def test_a_class_without_a_base_class_that_lacks_a_method_is_refused_where_it_is_used():
+    @ij.component
+    class Half:
+        guard: float = ij.static(default=1e-3)
+
+    with pytest.raises(ValueError, match="It lacks slope, value, virtual_velocity"):
+        law_with(Half())
+
+
+def test_required_members_are_abstract_methods_and_attributes_without_a_value():
+    found = required_members(ij.barriers.Barrier)
+    assert found == ["guard", "slope", "value", "virtual_velocity"]
+
+
+def test_adoption_is_done_once_and_is_inherited():
+    own = own_class()
+    adopt(own, ij.barriers.Barrier)
+    first = dict(vars(own))
+    adopt(own, ij.barriers.Barrier)
+    assert dict(vars(own)) == first
+
+    class Steeper(own):
+        pass
+
+    assert issubclass(Steeper, ij.barriers.Barrier)
+
+
+def test_copies_have_the_members():
+    barrier = law_with(own_class()(gain=4.0)).barrier
+    for twin in (copy.copy(barrier), copy.deepcopy(barrier)):
+        assert float(twin.gain) == 4.0 and twin.value_unit == "1"
+
+
+def test_a_process_that_imports_the_class_adopts_it(tmp_path, monkeypatch):
+    (tmp_path / "own_barriers.py").write_text(OWN)
+    monkeypatch.syspath_prepend(tmp_path)
+    from own_barriers import Steep  # type: ignore[import-not-found]
+
+    packed = pickle.dumps(law_with(Steep(gain=5.0)))
+    code = (
+        "import pickle, sys; law = pickle.loads(sys.stdin.buffer.read());"
+        "print(float(law.barrier.gain), law.barrier.value_unit)"
+    )
+    path = [str(tmp_path), str(Path(ij.__file__).parents[1])]
+    done = subprocess.run(
+        [sys.executable, "-c", f"import sys; sys.path[:0] = {path}; {code}"],
+        input=packed,
+        capture_output=True,
+        check=True,
+    )
+    assert done.stdout.split() == [b"5.0", b"1"]
