@@ -20,7 +20,7 @@ def of_a_run(scenario: ij.Scenario) -> None:
 
 
 @ij.component
-class Drive:
+class Drive(ij.actuators.Actuator):
     """An actuator of a user's, with the public types that its methods return."""
 
     gain: ij.Leaf = ij.leaf("1", sign="positive")
@@ -102,7 +102,7 @@ class Barrier(ij.barriers.Barrier):
 
 
 @ij.component
-class Observer:
+class Observer(ij.observers.Observer):
     """An observer of a user's."""
 
     gain: ij.Leaf = ij.leaf("1/s", sign="positive")
@@ -158,7 +158,7 @@ class Push:
 
 
 @ij.component
-class Sensor:
+class Sensor(ij.sensors.Sensor):
     """A sensor of a user's."""
 
     draws: ClassVar[int] = 0

@@ -36,7 +36,6 @@ from iblf_jax.certificates.reconstruction import is_valid, time_grid
 from iblf_jax.certificates.result import Certificate, LevelTraces, Traces
 from iblf_jax.certificates.run_summary import THEOREM, WEIGHTED, RunSummary, Segment, summarise
 from iblf_jax.control import actuators, sensors
-from iblf_jax.control.actuators._base import input_delay
 from iblf_jax.control.controllers import EventCompensated
 from iblf_jax.control.controllers.event_compensated import excess
 from iblf_jax.core import checks, notices
@@ -159,7 +158,7 @@ def _with_history_of(scenario: Scenario, run: Any, dt: float) -> Scenario:
     """The scenario with as many past commands as the run has, where its input has a delay."""
     if run is not None:
         dt = optional_member(run, "dt")
-    if dt is None or input_delay(scenario.actuator) is None:
+    if dt is None or scenario.actuator.input_delay is None:
         return scenario
     return with_history(scenario, float(dt))
 
@@ -255,7 +254,7 @@ def _checked_claims(run: Rollout) -> Certificate:
         return _certificate_by_comparison(run, "noisy", NOISY)
     if run.scenario.sampling is not None:
         return _certificate_by_comparison(run, "sampled", SAMPLED)
-    if input_delay(run.scenario.actuator) is not None:
+    if run.scenario.actuator.input_delay is not None:
         return _certificate_by_comparison(run, "delayed", DELAYED)
     if is_about_levels(run.scenario):
         return level_certificate(run)

@@ -21,7 +21,6 @@ from iblf_jax.certificates.run_summary import (
     Segment,
 )
 from iblf_jax.control.actuators import Ideal
-from iblf_jax.control.observers._base import observer_member
 from iblf_jax.core import checks
 
 TORQUE_OF_ESTIMATES = " + dV/dq' . M0^-1 (tau(x_hat) - tau(x))"
@@ -50,7 +49,7 @@ def _why_not_with_estimates(scenario: Any, law: Any) -> str:
     The claim is about a measured state.  For a law of robots without a state of its own and with
     the general T, the error of the estimates acts through the torque alone, which T then contains.
     """
-    if observer_member(scenario.observer, "complete") is None:
+    if not scenario.observer.completes:
         return ""
     kind = type(scenario.observer).__name__
     about = f"the law's own claim is about a measured state, and {kind} estimates levels"
@@ -78,7 +77,7 @@ def own_segment_lines(segment: Segment) -> list[Line]:
     states_terms = optional_member(law, "disturbance_terms") is not None
     general = LEVEL_TERMS if is_about_levels(summary.run.scenario) else GENERAL_TERMS
     right_side = "what the law states" if states_terms else general
-    if observer_member(summary.run.scenario.observer, "complete") is not None:
+    if summary.run.scenario.observer.completes:
         right_side += TORQUE_OF_ESTIMATES
     decay = "W >= 0: the decay that the law states"
     inequality = f"V' <= -W + T,  T: {right_side}"

@@ -29,7 +29,6 @@ from iblf_jax.certificates.theorem_lines import (
     with_status,
 )
 from iblf_jax.control.observers import NoObserver
-from iblf_jax.control.observers._base import observer_member
 from iblf_jax.core import checks
 from iblf_jax.core.status import Status
 from iblf_jax.core.units import Unit, of_component, per_second
@@ -206,7 +205,7 @@ def _estimate(segment: Segment) -> Line:
     observer = summary.run.scenario.observer
     if isinstance(observer, NoObserver):
         return not_applicable(ESTIMATE, "there is no observer: d_hat = 0 and d_tilde = d")
-    if observer_member(observer, "error_gain") is None:
+    if observer.error_gain is None:
         kind = type(observer).__name__
         return not_applicable(ESTIMATE, f"{NO_ESTIMATE} ({kind})")
     if summary.why_invalid:

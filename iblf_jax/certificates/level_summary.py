@@ -24,7 +24,6 @@ from iblf_jax.certificates.reconstruction import Steps, TimeGrid, check_status, 
 from iblf_jax.certificates.run_summary import Decay
 from iblf_jax.control.actuators import Ideal
 from iblf_jax.control.controllers import BarrierBackstepping
-from iblf_jax.control.observers._base import observer_member
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.status import UNTRUSTED, describe
@@ -152,7 +151,7 @@ def why_no_level_claim(scenario: Scenario) -> str:
         if barrier.decay_rate(k) is None:
             kind = type(barrier).__name__
             return f"the barrier {kind} of level {i + 1} states no decay rate of its V"
-    if observer_member(scenario.observer, "complete") is not None:
+    if scenario.observer.completes:
         kind = type(scenario.observer).__name__
         return f"(S.3) is about a measured state, and the law receives levels that {kind} estimates"
     if not isinstance(scenario.actuator, Ideal):

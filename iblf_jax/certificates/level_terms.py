@@ -11,7 +11,7 @@ for any observer, because the law replaces x' by the flow of the model with the 
 the estimate.  dV/dx contains w_i s_i in level i, and dV_i/dalpha_{i-1} times the derivatives of
 alpha_{i-1} in the levels below it; dV_i/dalpha_{i-1} is taken at fixed x_i and t, so that it moves
 the error and the tube.  An observer with d_tilde' = d' - kappa d_tilde has d_hat' = kappa d_tilde
-(`observer_member`, "error_gain"), which is checked by itself.  Without an observer d_hat = 0 and
+(`Observer.error_gain`), which is checked by itself.  Without an observer d_hat = 0 and
 d_tilde = d.  A torque observer of the robot inside the plant gives f_hat, which is held, while
 d_hat = M0^-1 f_hat in the second level is not: T has dV/df_hat . f_hat' then, and
 f_hat' = kf f_tilde.
@@ -45,7 +45,6 @@ from iblf_jax.certificates.proof_terms import TORQUE_ROUNDING, OwnTerms
 from iblf_jax.control.controllers import BarrierBackstepping
 from iblf_jax.control.controllers._base import decay_of, law_member
 from iblf_jax.control.decays._base import gain_at
-from iblf_jax.control.observers._base import observer_member
 from iblf_jax.core.linalg import solve_spd
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, plant_input
@@ -381,7 +380,7 @@ def _estimate_error(
 ) -> tuple[jax.Array, jax.Array]:
     """The error of d_hat' = kappa d_tilde and the size of its terms; 0 without a stated kappa."""
     zero = jnp.zeros_like(at.estimate)
-    kappa = observer_member(scenario.observer, "error_gain")
+    kappa = scenario.observer.error_gain
     if kappa is None:
         return zero, zero
     x = at.x

@@ -47,7 +47,6 @@ from iblf_jax.control.controllers import Backstepping, FullState
 from iblf_jax.control.controllers._base import decay_of
 from iblf_jax.control.decays._base import energy_gain, gain_at
 from iblf_jax.control.observers import Printed
-from iblf_jax.control.observers._base import observer_member
 from iblf_jax.core.linalg import matvec, solve_spd
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.time import as_at
@@ -479,7 +478,7 @@ def _own_terms(
     stated = optional_member(law, "disturbance_terms")
     if stated is None:
         terms = slopes[2] @ solve_spd(M0, f_tilde) + slopes[3] @ df
-        if observer_member(scenario.observer, "complete") is not None:
+        if scenario.observer.completes:
             # The law received estimates: what that changes of the torque acts like f_tilde.
             f_hat = now["disturbance_estimate"]
             command, _ = law.command(t, q, dq, f_hat, context, state.controller)

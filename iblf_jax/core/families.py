@@ -47,10 +47,6 @@ class Part(metaclass=abc.ABCMeta):  # noqa: B024 (the families have abstract met
         """The units of the symbols in a part, from those of the symbols in this component."""
         return symbols
 
-    def advice(self) -> list[str]:
-        """Warnings about the values of the fields."""
-        return []
-
 
 class _Nothing(Part):
     """A part that states nothing."""

@@ -84,10 +84,14 @@ def component(cls: type[T]) -> type[T]:
         raise checks.fail(
             "component", cls, "a class of annotated fields, those with defaults last", f"{error}."
         ) from error
-    if inspect.isabstract(cls):
-        missing = sorted(cls.__abstractmethods__)  # type: ignore[attr-defined]
-        raise checks.fail("component", cls, "a complete class", f"It lacks {', '.join(missing)}.")
     fields = dataclasses.fields(cls)  # type: ignore[arg-type]
+    if inspect.isabstract(cls):
+        # A field takes the place of a property that a base class requires.
+        cls.__abstractmethods__ -= {field.name for field in fields}  # type: ignore[attr-defined]
+        missing = sorted(cls.__abstractmethods__)  # type: ignore[attr-defined]
+        if missing:
+            lacks = f"It lacks {', '.join(missing)}."
+            raise checks.fail("component", cls, "a complete class", lacks)
     for field in fields:
         inherited = inspect.getattr_static(cls, field.name, None)
         if isinstance(inherited, property):  # it would hide the values of the field

@@ -12,7 +12,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.control.actuators._base import input_delay
 from iblf_jax.control.barriers import Quadratic
 from iblf_jax.control.controllers._base import law_member
 from iblf_jax.core import checks, notices
@@ -505,7 +504,7 @@ def _smaller_step(result: Rollout, steps: int) -> str:
     """
     if not checks.is_concrete(result.scenario):
         return "a smaller one"
-    if input_delay(result.scenario.actuator) is not None:
+    if result.scenario.actuator.input_delay is not None:
         # Every number of steps in a delay is a program of its own.
         return "a smaller one, a whole part of actuator.delay"
     duration = steps * float(result.dt)

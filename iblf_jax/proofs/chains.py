@@ -559,7 +559,7 @@ def _check_observer(scenario: Scenario) -> None:
         reason = "V contains d_tilde of observers with d_tilde' = d' - kappa d_tilde only."
         expected = "observers.LevelObserver or NoObserver"
         raise unsupported("observer", type(observer).__name__, expected, reason)
-    order = scenario.plant.order
+    order = plants.order_of(scenario.plant)
     gain, eta0 = (np.asarray(_rows(x, order)) for x in (observer.gain, observer.eta0))
     if np.any(eta0[gain == 0.0]):
         reason = "A level without a gain keeps this estimate, which is taken as 0."

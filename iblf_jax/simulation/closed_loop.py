@@ -25,13 +25,10 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.control.actuators import Ideal
-from iblf_jax.control.actuators import _base as actuators
 from iblf_jax.control.controllers import Command
 from iblf_jax.control.controllers import _base as controllers
 from iblf_jax.control.controllers._base import law_member, state_of_levels
-from iblf_jax.control.observers._base import observer_member
 from iblf_jax.control.sensors import Measurement
-from iblf_jax.control.sensors._base import unrounded
 from iblf_jax.core.linalg import inner
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.time import as_at
@@ -517,10 +514,7 @@ def discrete_observer(scenario: Scenario) -> Any:
     sampling, observer = scenario.sampling, scenario.observer
     if sampling is None or sampling.observer != "poles":
         return observer
-    at_period = observer_member(observer, "at_period")
-    if at_period is None:
-        return observer
-    return at_period(sampling.period)
+    return observer.at_period(sampling.period)
 
 
 def law_update(
@@ -575,9 +569,10 @@ def _with_sent_input(command: Command, sent: SentCommand) -> Command:
 
 def _next_observer_state(sampling: Any, observer: Any, arguments: tuple) -> Any:
     """The observer's state one period later; `arguments` are those of `Observer.derivative`."""
-    advance = observer_member(observer, "advance")
-    if sampling.observer == "exact" and advance is not None:
-        return advance(*arguments, sampling.period)
+    if sampling.observer == "exact":
+        exact = observer.advance(*arguments, sampling.period)
+        if exact is not None:
+            return exact
     return _euler(arguments[-1], observer.derivative(*arguments), sampling.period)
 
 
@@ -694,7 +689,7 @@ def perturbed_rate(
         arguments to `evaluate` elsewhere shares the traced function.
     """
     if not isinstance(perturbed, PerturbedState):
-        actuator = actuators.smooth(scenario.actuator)
+        actuator = scenario.actuator.smooth
         if actuator is not scenario.actuator:
             scenario = dataclasses.replace(scenario, actuator=actuator)
         arguments = [scenario, t, perturbed]
@@ -704,9 +699,9 @@ def perturbed_rate(
     sampling: Any = scenario.sampling
     scenario = dataclasses.replace(
         scenario,
-        sensor=unrounded(scenario.sensor),
+        sensor=scenario.sensor.unrounded,
         controller=controllers.unlimited(scenario.controller),
-        actuator=actuators.smooth(actuators.unlimited(scenario.actuator)),
+        actuator=scenario.actuator.unlimited.smooth,
         sampling=dataclasses.replace(sampling, trigger=None),
     )
     controller, observer, sensor = perturbed.memory

@@ -26,7 +26,6 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.control.controllers._base import law_member
-from iblf_jax.control.observers._base import observer_member
 from iblf_jax.core import checks
 from iblf_jax.core.optional import OptionalMembers
 from iblf_jax.core.pytree import Leaf, component, layers, leaf, note_code
@@ -752,7 +751,7 @@ def has_signal(scenario: Scenario, signal: str) -> bool:
         levels = range(3, plants.order_of(scenario.plant) + 1)
         return any(context.level_bounds(level) is not None for level in levels)
     if signal == "x_hat":
-        return observer_member(scenario.observer, "complete") is not None
+        return scenario.observer.completes
     has_regions = len(scenario.regions) > 0
     if signal == "region_margin":
         return has_regions

@@ -20,14 +20,11 @@ import numpy as np
 
 from iblf_jax.control.actuators import Actuator
 from iblf_jax.control.actuators import Ideal as IdealActuator
-from iblf_jax.control.actuators._base import actuator_member, input_delay
 from iblf_jax.control.controllers import Controller, LawContext
 from iblf_jax.control.controllers._base import law_member, state_of_levels
 from iblf_jax.control.observers import NoObserver, Observer
-from iblf_jax.control.observers._base import observer_member
 from iblf_jax.control.sensors import Ideal as IdealSensor
 from iblf_jax.control.sensors import Sensor
-from iblf_jax.control.sensors._base import sensor_member
 from iblf_jax.core import checks, modules, notices, programs
 from iblf_jax.core.disk_cache import keep_programs
 from iblf_jax.core.families import statements_of
@@ -304,7 +301,7 @@ class Scenario:
             got, expected = type(self.sensor).__name__, "an Ideal sensor where no law is sampled"
             remedy = "Add sampling=ij.Sampling(period=...): a sensor is read once a period."
             raise checks.fail("Scenario.sensor", got, expected, remedy)
-        if self.sampling is not None and input_delay(self.actuator) is not None:
+        if self.sampling is not None and self.actuator.input_delay is not None:
             expected = "no Delay where the law is sampled"
             remedy = "Give ij.Sampling(period=..., delay=...) instead."
             raise checks.fail("Scenario.actuator", self.actuator, expected, remedy)
@@ -457,8 +454,8 @@ def _check_observer(scenario: Scenario) -> None:
     observer, model = scenario.observer, scenario.model
     if isinstance(observer, NoObserver):
         return
-    if observer_member(observer, "receives_x"):
-        observer_member(observer, "check_model")(plants.as_plant(model))
+    if observer.receives_x:
+        observer.check_model(plants.as_plant(model))
         return
     if plants.is_chain(model) and plants.plant_member(model, "joint_torque") is None:
         expected = "an observer of plants in strict-feedback form, such as LevelObserver"
@@ -497,17 +494,17 @@ UNKNOWN_UNIT = "1"
 def _check_measured_levels(scenario: Scenario) -> None:
     """Raises ValueError for levels that are neither measured nor estimated."""
     order = plants.order_of(scenario.plant)
-    covered = sensor_member(scenario.sensor, "order")
+    covered = scenario.sensor.order
     if covered not in (None, order):
         expected = f"sensors of {order} levels, as the plant has"
         remedy = "None is for a level that is not measured."
         raise checks.fail("Scenario.sensor", f"sensors of {covered} levels", expected, remedy)
     every = tuple(range(1, plants.order_of(scenario.model) + 1))
-    measured = sensor_member(scenario.sensor, "measured") or every
+    measured = scenario.sensor.measured or every
     observer = scenario.observer
     needed = every
-    if observer_member(observer, "complete") is not None:
-        needed = observer_member(observer, "measured") or every
+    if observer.completes:
+        needed = observer.measured or every
     missing = [str(level) for level in needed if level not in measured]
     if not missing:
         return
@@ -722,10 +719,10 @@ def advice_of(scenario: Scenario) -> list[str]:
     """The warnings of the parts about their parameter values."""
     advice = law_member(scenario.controller, "advice")()
     if all(law_member(part, "uses_observer") for part in layers(scenario.controller)):
-        advice = advice + observer_member(scenario.observer, "advice")()
+        advice = advice + scenario.observer.advice()
     advice = advice + motors_advice(scenario)
     if scenario.sampling is not None:
-        advice = advice + sensor_member(scenario.sensor, "advice")(scenario.sampling.period)
+        advice = advice + scenario.sensor.advice(scenario.sampling.period)
         advice = advice + noise_advice(scenario)
     return advice
 
@@ -810,10 +807,7 @@ def fitted_to_step(scenario: Scenario, dt: float) -> Scenario:
 
 def with_history(scenario: Scenario, dt: float) -> Scenario:
     """`fitted_to_step` without the check of the sampling period."""
-    fitted = actuator_member(scenario.actuator, "with_history")
-    if fitted is None:
-        return scenario
-    actuator = fitted(dt)
+    actuator = scenario.actuator.with_history(dt)
     if actuator is scenario.actuator:
         return scenario
     return dataclasses.replace(scenario, actuator=actuator)

@@ -162,13 +162,16 @@ def _has_members(findings: Findings, member: Any, base: type) -> None:
     for name in required_members(base):
         if hasattr(member, name):
             continue
-        method = getattr(base, name, None)
-        if method is None:
+        required = getattr(base, name, None)
+        if required is None:
             findings.add(f"the attribute {name!r} is missing", f"See {base.__name__}")
             continue
-        names = [word for word in inspect.signature(method).parameters if word != "self"]
-        text = (inspect.getdoc(method) or "").split("\n")[0]
-        findings.add(f"{name}({', '.join(names)}) is missing", text)
+        arguments = ""
+        if callable(required):
+            names = [word for word in inspect.signature(required).parameters if word != "self"]
+            arguments = f"({', '.join(names)})"
+        text = (inspect.getdoc(required) or "").split("\n")[0]
+        findings.add(f"{name}{arguments} is missing", text)
 
 
 def shape_of(findings: Findings, label: str, call: Callable, *args: Any) -> Any:

@@ -224,3 +224,20 @@ def output_of(code: str, packed: bytes, *folders: str) -> list[bytes]:
         check=True,
     )
     return done.stdout.split()
+
+
+def test_a_field_may_have_the_name_of_a_property_of_the_base_class():
+    @ij.component
+    class Counting(ij.sensors.Sensor):
+        draws: int = ij.static()
+        resolution: ij.Leaf = ij.leaf("rad")
+
+        def init(self, q, dq, period):
+            return ()
+
+        def measure(self, q, dq, normal, period, state):
+            return ij.sensors.Measurement(q, dq), ()
+
+    sensor = Counting(draws=2, resolution=0.1)
+    assert sensor.draws == 2 and float(sensor.resolution) == pytest.approx(0.1)
+    assert sensor.unrounded is sensor

@@ -137,21 +137,32 @@ ELSEWHERE = (
     "dict",
     "float",
     "int",
+    "list",
     "str",
     "tuple",
     "None",
     "ClassVar",
+    "Self",
 )
 """What annotations of the protocols name that is not of this package."""
 
 
+CONTRACTS = {"Protocol", "Part", "LevelReading"}
+"""The base classes of the classes that are contracts."""
+
+
+def is_contract(node: ast.ClassDef) -> bool:
+    is_private = node.name.startswith("_")
+    return not is_private and not CONTRACTS.isdisjoint(map(ast.unparse, node.bases))
+
+
 def protocols() -> dict[str, ast.ClassDef]:
-    """Every Protocol of the package, "module:Name" -> its definition."""
+    """Every contract of the package, "module:Name" -> its definition."""
     found = {}
     for path in sorted((ROOT / "iblf_jax").rglob("*.py")):
         module = ".".join(path.relative_to(ROOT).with_suffix("").parts)
         for node in ast.parse(path.read_text(encoding="utf-8")).body:
-            if isinstance(node, ast.ClassDef) and "Protocol" in map(ast.unparse, node.bases):
+            if isinstance(node, ast.ClassDef) and is_contract(node):
                 found[f"{module}:{node.name}"] = node
     return found
 
