@@ -37,7 +37,7 @@ class Drive(ij.actuators.Actuator):
 
 
 @ij.component
-class Wrapping:
+class Wrapping(ij.controllers.Controller):
     """A law of a user's that wraps another, and states a claim of its own."""
 
     law: ij.controllers.Controller

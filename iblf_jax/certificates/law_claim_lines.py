@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from iblf_jax.certificates.claims import states_disturbance_terms
 from iblf_jax.certificates.decay_lines import check_steps
 from iblf_jax.certificates.level_terms import LEVEL_TERMS, is_about_levels
 from iblf_jax.certificates.lines import (
@@ -15,7 +16,6 @@ from iblf_jax.certificates.lines import (
     Statement,
     not_applicable,
 )
-from iblf_jax.certificates.optional import optional_member
 from iblf_jax.certificates.proof_terms import GENERAL_TERMS
 from iblf_jax.certificates.run_summary import (
     Segment,
@@ -55,7 +55,7 @@ def _why_not_with_estimates(scenario: Any, law: Any) -> str:
     about = f"the law's own claim is about a measured state, and {kind} estimates levels"
     if is_about_levels(scenario):
         return about
-    if optional_member(law, "disturbance_terms") is not None:
+    if states_disturbance_terms(law):
         return f"{about}; the T that the law states does not contain their error"
     start = jax.eval_shape(law.init, scenario.initial.q, scenario.initial.dq, scenario.context)
     if jax.tree.leaves(start):
@@ -74,7 +74,7 @@ def own_segment_lines(segment: Segment) -> list[Line]:
     if law is None:
         return []
     own = proof.own
-    states_terms = optional_member(law, "disturbance_terms") is not None
+    states_terms = states_disturbance_terms(law)
     general = LEVEL_TERMS if is_about_levels(summary.run.scenario) else GENERAL_TERMS
     right_side = "what the law states" if states_terms else general
     if summary.run.scenario.observer.completes:

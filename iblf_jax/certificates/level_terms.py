@@ -40,10 +40,9 @@ from jax.flatten_util import ravel_pytree
 
 from iblf_jax.certificates.auxiliary import covers_limit, inner_context, inner_state
 from iblf_jax.certificates.claims import adaptive_law, own_claim
-from iblf_jax.certificates.optional import optional_member
 from iblf_jax.certificates.proof_terms import TORQUE_ROUNDING, OwnTerms
 from iblf_jax.control.controllers import BarrierBackstepping
-from iblf_jax.control.controllers._base import decay_of, law_member
+from iblf_jax.control.controllers._base import decay_of
 from iblf_jax.control.decays._base import gain_at
 from iblf_jax.core.linalg import solve_spd
 from iblf_jax.core.pytree import unwrapped
@@ -127,7 +126,7 @@ def is_about_levels(scenario: Scenario) -> bool:
     """Whether the law of a scenario receives the levels of the plant, so that (S.3), and not
     Theorem 2, is the claim to check.
     """
-    return bool(law_member(unwrapped(scenario.controller), "receives_x"))
+    return bool(unwrapped(scenario.controller).receives_x)
 
 
 def level_terms_at(scenario: Scenario, t: jax.Array, state: LoopState) -> LevelTerms:
@@ -405,7 +404,7 @@ def _own_terms(
     """
     law: Any = own_claim(scenario)
     context = scenario.context._replace(plant=scenario.plant)
-    uses_observer = optional_member(law, "uses_observer")
+    uses_observer = law.uses_observer
 
     def disturbances(t, state):
         state_rate, sample = evaluate(scenario, t, state)
@@ -429,11 +428,11 @@ def _own_terms(
     V, dV = jax.jvp(lyapunov, point, direction)
     decay = jnp.sum(law.decay(*point[:3], context, at.law_state))
     slopes = jax.grad(lyapunov, argnums=(0, 1, 2, 3))(*point)
-    stated = optional_member(law, "disturbance_terms")
+    stated = law.disturbance_terms(*point[:3], dd, context, at.law_state)
     if stated is None:
         terms = jnp.sum(slopes[1] * d_tilde) + jnp.sum(slopes[2] * dd)
     else:
-        terms = jnp.sum(stated(*point[:3], dd, context, at.law_state))
+        terms = jnp.sum(stated)
     sizes = _rate_sizes(scenario, at, d, d_tilde, tangent.x)
     products = jax.tree.map(lambda a, b: jnp.sum(jnp.abs(a * b)), slopes, direction)
     size = sum(jax.tree.leaves(products)) + jnp.sum(jnp.abs(slopes[1]) * sizes)

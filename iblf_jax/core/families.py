@@ -43,7 +43,7 @@ class Part(metaclass=abc.ABCMeta):  # noqa: B024 (the families have abstract met
         """The units of leaves that depend on other fields, by name."""
         return NO_NAMES
 
-    def symbols_of_part(self, field: str, index: int | None, symbols: Any) -> Any:
+    def symbols_of_part(self, field: str, index: int, symbols: Any) -> Any:
         """The units of the symbols in a part, from those of the symbols in this component."""
         return symbols
 

@@ -13,7 +13,7 @@ from typing import Any
 
 
 class OptionalMembers:
-    """Reads the optional members of a family: `law_member(law, "uses_observer")`.
+    """Reads the optional members of a family: `law.uses_observer`.
 
     Args:
       defaults: name of a member -> its value for a class that does not have it.

@@ -408,7 +408,7 @@ def _parts_of(scenario: Scenario) -> ArmParts:
         jnp.broadcast_to(observer.kf, (scenario.n,)),
         scenario.reference,
         scenario.bounds,
-        jnp.asarray(scenario.controller.barrier.guard),  # type: ignore[attr-defined]
+        jnp.asarray(scenario.controller.barrier.guard),  # type: ignore[union-attr]
     )
 
 

@@ -26,8 +26,7 @@ import jax.numpy as jnp
 
 from iblf_jax.control.actuators import Ideal
 from iblf_jax.control.controllers import Command
-from iblf_jax.control.controllers import _base as controllers
-from iblf_jax.control.controllers._base import law_member, state_of_levels
+from iblf_jax.control.controllers._base import state_of_levels
 from iblf_jax.control.sensors import Measurement
 from iblf_jax.core.linalg import inner
 from iblf_jax.core.pytree import unwrapped
@@ -426,7 +425,7 @@ def _robot_uncertain_signals(
     f_hat = estimate_as_torque(model, q, signals.f_hat)
     e2, f_tilde = dq - signals.alpha, f - f_hat
     V = jnp.sum(signals.V1)
-    if law_member(unwrapped(scenario.controller), "includes_e2"):
+    if unwrapped(scenario.controller).includes_e2:
         V = V + 0.5 * inner(f_tilde, f_tilde)
     else:
         V = V + 0.5 * (inner(e2, momentum(model, q, e2)) + inner(f_tilde, f_tilde))
@@ -700,7 +699,7 @@ def perturbed_rate(
     scenario = dataclasses.replace(
         scenario,
         sensor=scenario.sensor.unrounded,
-        controller=controllers.unlimited(scenario.controller),
+        controller=scenario.controller.unlimited,
         actuator=scenario.actuator.unlimited.smooth,
         sampling=dataclasses.replace(sampling, trigger=None),
     )

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.controllers._base import law_member, state_of_levels
+from iblf_jax.control.controllers._base import state_of_levels
 from iblf_jax.control.observers import NoObserver
 from iblf_jax.control.sensors._base import Measurement
 from iblf_jax.core import taylor
@@ -114,7 +114,7 @@ def model_state(scenario: Any, q: jax.Array, dq: jax.Array, higher: Any) -> jax.
 
 def law_state(scenario: Any, q: jax.Array, dq: jax.Array, higher: Any) -> tuple[jax.Array, ...]:
     """The state as the law receives it: (q, q'), or (x,)."""
-    if law_member(unwrapped(scenario.controller), "receives_x"):
+    if unwrapped(scenario.controller).receives_x:
         return (model_state(scenario, q, dq, higher),)
     return q, dq
 
@@ -144,7 +144,7 @@ def observer_estimate(
     if observer.receives_x:
         x, plant = model_state(scenario, q, dq, higher), plants.as_plant(scenario.model)
         d_hat: jax.Array = observer.estimate(t, x, plant, state)
-        if law_member(unwrapped(scenario.controller), "receives_x"):
+        if unwrapped(scenario.controller).receives_x:
             return d_hat
         return estimate_as_torque(scenario.model, q, d_hat)
     if plants.is_chain(scenario.model) and isinstance(observer, NoObserver):

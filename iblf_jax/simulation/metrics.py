@@ -25,7 +25,6 @@ from typing import Any, ClassVar, NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.controllers._base import law_member
 from iblf_jax.core import checks
 from iblf_jax.core.optional import OptionalMembers
 from iblf_jax.core.pytree import Leaf, component, layers, leaf, note_code
@@ -756,10 +755,10 @@ def has_signal(scenario: Scenario, signal: str) -> bool:
     if signal == "region_margin":
         return has_regions
     if signal == "auxiliary":
-        return any(law_member(law, "has_auxiliary") for law in layers(scenario.controller))
+        return any(law.has_auxiliary for law in layers(scenario.controller))
     if signal == "events":
         return scenario.sampling is not None and scenario.sampling.trigger is not None
-    has_filter = any(law_member(law, "filters") for law in layers(scenario.controller))
+    has_filter = any(law.filters for law in layers(scenario.controller))
     return has_filter and (signal == "slack" or has_regions)
 
 

@@ -21,7 +21,7 @@ import numpy as np
 from iblf_jax.control.actuators import Actuator
 from iblf_jax.control.actuators import Ideal as IdealActuator
 from iblf_jax.control.controllers import Controller, LawContext
-from iblf_jax.control.controllers._base import law_member, state_of_levels
+from iblf_jax.control.controllers._base import adopt_layers, state_of_levels
 from iblf_jax.control.observers import NoObserver, Observer
 from iblf_jax.control.sensors import Ideal as IdealSensor
 from iblf_jax.control.sensors import Sensor
@@ -230,6 +230,7 @@ class Scenario:
         parts = field_values(self)
         for name, (protocol, remedy) in PROTOCOLS.items():
             checks.conforms(f"Scenario.{name}", parts[name], protocol, remedy, OPTIONAL_MEMBERS)
+        adopt_layers(self.controller)
         self._check_classes()
         self._fit_state_bounds()
         self._check_combination()
@@ -244,11 +245,10 @@ class Scenario:
     def _complete_law(self) -> None:
         """Gives the law what it derives from its model and the start, such as weights."""
         law = unwrapped(self.controller)
-        completed = law_member(law, "completed")
-        if completed is None:
+        if type(law).completed is Controller.completed:
             return
         with jax.ensure_compile_time_eval():
-            new = completed(self.context, model_state(self, *start_levels(self)))
+            new = law.completed(self.context, model_state(self, *start_levels(self)))
         if new is not law:
             object.__setattr__(self, "controller", rewrapped(self.controller, new))
 
@@ -293,7 +293,7 @@ class Scenario:
             expected = f"{plants.counted_components(self.plant, self.plant.n)}, as the plant has"
             raise checks.fail("Scenario.model", got, expected)
         law = unwrapped(self.controller)
-        if self.context.level_bounds(2) is None and law_member(law, "needs_velocity_bounds"):
+        if self.context.level_bounds(2) is None and law.needs_velocity_bounds:
             expected = f"the bounds that {type(law).__name__} keeps"
             remedy = "Such as velocity_bounds=Bounds(lower=Constant(-1.0), upper=Constant(1.0))."
             raise checks.fail("Scenario.velocity_bounds", None, expected, remedy)
@@ -429,7 +429,7 @@ def check_levels(scenario: Scenario) -> None:
         raise checks.fail("Scenario.model", f"a plant of order {known}", expected)
     law = unwrapped(scenario.controller)
     kind = type(law).__name__
-    if plants.is_chain(model) and not law_member(law, "receives_x"):
+    if plants.is_chain(model) and not law.receives_x:
         expected = f"a robot as the model of the law {kind}"
         robot = plants.robot_of(model)
         remedy = "Take controllers.BarrierBackstepping"
@@ -469,13 +469,13 @@ def _check_input(scenario: Scenario) -> None:
     """
     outermost, *wrapped = layers(scenario.controller)
     for law in wrapped:
-        if law_member(law, "input_unit") is not None:
+        if law.input_unit is not None:
             kind = type(law).__name__
             expected = f"{kind} as the outermost law"
             remedy = f"Such as {kind}(law={type(outermost).__name__}(...), ...)."
             raise checks.fail("Scenario.controller", type(outermost).__name__, expected, remedy)
     needed = plants.units_of(scenario.plant)[-1]
-    given = law_member(outermost, "input_unit") or plants.units_of(scenario.model)[-1]
+    given = outermost.input_unit or plants.units_of(scenario.model)[-1]
     if given == needed or UNKNOWN_UNIT in (given, needed):
         return
     kind = type(scenario.plant).__name__
@@ -698,7 +698,7 @@ def canonical(scenario: Scenario) -> Scenario:
         return scenario
     _check_start(scenario)
     for law in layers(scenario.controller):
-        law_member(law, "check_start")(scenario.context)
+        law.check_start(scenario.context)
     for text in advice_of(scenario):
         notices.warn(text)
     return scenario
@@ -717,8 +717,8 @@ def _with_sufficient_queue(scenario: Scenario) -> Scenario:
 
 def advice_of(scenario: Scenario) -> list[str]:
     """The warnings of the parts about their parameter values."""
-    advice = law_member(scenario.controller, "advice")()
-    if all(law_member(part, "uses_observer") for part in layers(scenario.controller)):
+    advice = scenario.controller.advice()
+    if all(part.uses_observer for part in layers(scenario.controller)):
         advice = advice + scenario.observer.advice()
     advice = advice + motors_advice(scenario)
     if scenario.sampling is not None:

@@ -13,7 +13,6 @@ from scipy.integrate import solve_ivp
 import iblf_jax as ij
 from iblf_jax import barriers, bounds, controllers
 from iblf_jax.certificates.proof_terms import rounding, terms_at
-from iblf_jax.control.controllers._base import switching_functions
 from iblf_jax.simulation.closed_loop import initial_state
 
 H = np.pi / 2
@@ -647,8 +646,8 @@ def test_a_barrier_states_whether_its_ratio_jumps(name):
     scenario = ij.with_parts(ij.presets.zhang_yan_2024_full_state(), controller=law)
     wrapped = controllers.Saturated(law=law, limit=50.0)
     for each in (law, wrapped):
-        found = switching_functions(
-            each, jnp.zeros(()), scenario.initial.q, scenario.initial.dq, scenario.context, ()
+        found = each.switching(
+            jnp.zeros(()), scenario.initial.q, scenario.initial.dq, scenario.context, ()
         )
         assert (found is not None) == FAMILY[name].ratio_jumps
 

@@ -40,6 +40,7 @@ from iblf_jax.control.barriers import Barrier, Integral
 from iblf_jax.control.barriers._base import guard_is_active
 from iblf_jax.control.controllers._base import (
     Command,
+    Controller,
     LawContext,
     decay_of,
     no_state,
@@ -76,7 +77,7 @@ def symbols_of_energy(law: Any, field: str, index: int, symbols: Any) -> Any:
 
 
 @component
-class Backstepping:
+class Backstepping(Controller):
     """tau = C0 v + G0 + M0 alpha' - f_hat - K2 e2 - w s,   v = q' (printed) or alpha (corrected).
 
     It is (3.14) of the paper.

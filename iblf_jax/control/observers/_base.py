@@ -13,6 +13,7 @@ from typing import Any, ClassVar, Self
 import jax
 
 from iblf_jax.core.families import Part
+from iblf_jax.core.pytree import Leaf
 from iblf_jax.world.robots import Robot
 
 State = Any
@@ -30,6 +31,8 @@ class Observer(Part):
 
     receives_x: ClassVar[bool] = False
     """Whether it is an observer of plants in strict-feedback form."""
+    kf: Leaf = None
+    """Gain of an observer of the form (3.11), (n,) [1/s]; None for another one."""
 
     @property
     def error_gain(self) -> jax.Array | None:
