@@ -430,7 +430,8 @@ def conforms(
         raise fail(name, value, expected, "It is a class: make an instance, with brackets.")
     if _is_plain(value):
         raise fail(name, value, expected, remedy)
-    offers(name, value, sorted({*required_members(base)} - {*optional}), expected, remedy)
+    required = [x for x in required_members(base) if x not in optional]
+    offers(name, value, required, expected, remedy)
     fields = vars(value) if has_members(value, "__dict__") else {}
     for field, part in fields.items():
         flat_enough(f"{name}.{field}", part)

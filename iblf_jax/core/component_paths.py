@@ -107,7 +107,7 @@ def steps_of(part: Any, tokens: list[str | int]) -> tuple[list[str | int], list[
         raise KeyError(token)
     if has_field(part, token):
         return [token], tokens[1:]
-    rows = statements_of(part).rows
+    rows = statements_of(part).named_rows
     if token in rows:
         names, fields = rows[token]
         row, field = tokens[1:3]

@@ -13,9 +13,12 @@ from __future__ import annotations
 
 import abc
 import inspect
+import threading
 from collections.abc import Iterator, Mapping
 from types import MappingProxyType
 from typing import Any, ClassVar
+
+from iblf_jax.core.caches import CACHE
 
 NO_NAMES: Mapping[str, Any] = MappingProxyType({})
 
@@ -25,7 +28,7 @@ class Part(metaclass=abc.ABCMeta):  # noqa: B024 (the families have abstract met
 
     wraps: ClassVar[str | None] = None
     """The name of the field that holds a wrapped component. Paths then reach through it."""
-    rows: ClassVar[Mapping[str, Any]] = NO_NAMES
+    named_rows: ClassVar[Mapping[str, Any]] = NO_NAMES
     """Rows of leaves with names."""
     stacked: ClassVar[Mapping[str, Any]] = NO_NAMES
     """Names for several leaves as the rows of one array."""
@@ -61,6 +64,27 @@ def statements_of(part: Any) -> Part:
     return part if isinstance(part, Part) else _NOTHING
 
 
+class Default:
+    """A member of a base class in a class that does not inherit from it.
+
+    What an object has, and what a class of its own has, come first: in whatever order the classes
+    of the object stand, and whenever they are adopted.
+
+    Args:
+      name: of the member.
+      member: the value, function or property of the base class.
+    """
+
+    def __init__(self, name: str, member: Any) -> None:
+        self.name = name
+        self.member = member
+
+    def __get__(self, part: Any, cls: type) -> Any:
+        found = (vars(owner).get(self.name, self) for owner in cls.__mro__)
+        member = next((x for x in found if not isinstance(x, Default)), self.member)
+        return member.__get__(part, cls) if hasattr(member, "__get__") else member
+
+
 def adopt(cls: type, base: type) -> None:
     """Gives a class the members of `base` that it lacks, and makes its objects instances of `base`.
 
@@ -68,30 +92,48 @@ def adopt(cls: type, base: type) -> None:
     """
     if not issubclass(base, Part) or issubclass(cls, base):
         return
-    own = {*dir(cls), *_annotated(cls)}
-    for owner in _lines_of(base):
-        for name, member in vars(owner).items():
-            if name not in own and not _is_of_python(name) and not _is_abstract(member):
-                setattr(cls, name, member)
-    base.register(cls)  # type: ignore[attr-defined]
-    if cls.__reduce__ is object.__reduce__:
-        # Another process that imports the class by its name adopts it, too.
-        cls.__reduce__ = _reduced  # type: ignore[assignment, method-assign]
-    cls._adopted_by = (*vars(cls).get("_adopted_by", ()), base)  # type: ignore[attr-defined]
+    with _ADOPTING:
+        own = {*dir(cls), *_annotated(cls)}
+        for owner in _lines_of(base):
+            for name, member in vars(owner).items():
+                if name not in own and not _is_of_python(name) and not _is_abstract(member):
+                    own.add(name)
+                    setattr(cls, name, Default(name, member))
+        if cls.__reduce__ is object.__reduce__:
+            # Another process that imports the class by its name adopts it, too.
+            cls.__reduce__ = _reduced  # type: ignore[assignment, method-assign]
+        known = getattr(cls, _BASES, ())
+        setattr(cls, _BASES, (*(x for x in known if x is not base), base))
+        base.register(cls)  # type: ignore[attr-defined]
 
 
-def required_members(base: type) -> list[str]:
+def adopt_again(cls: type) -> None:
+    """Makes a class that has come from another process by value an instance of what it was there:
+    it has the members, but no base class knows it.
+    """
+    for base in getattr(cls, _BASES, ()):
+        adopt(cls, base)
+
+
+_ADOPTING = threading.RLock()
+_BASES = "_adopted_by"
+"""Attribute of a class with the base classes that have adopted it."""
+
+
+@CACHE.memoised(64)
+def required_members(base: type) -> tuple[str, ...]:
     """The names of the members without a default."""
     if not issubclass(base, Part):  # a Protocol, until the last family has its base class
-        return [x for x in {*vars(base), *inspect.get_annotations(base)} if not x.startswith("_")]
+        members = {*vars(base), *inspect.get_annotations(base)}
+        return tuple(sorted(x for x in members if not x.startswith("_")))
     abstract = set(base.__abstractmethods__)  # type: ignore[attr-defined]
     without_value = {name for name in _annotated(base) if not hasattr(base, name)}
-    return sorted(abstract | without_value)
+    return tuple(sorted(abstract | without_value))
 
 
 def _reduced(part: Any) -> tuple:
     cls = type(part)
-    return _restored, (cls, cls._adopted_by), part.__getstate__()
+    return _restored, (cls, getattr(cls, _BASES)), part.__getstate__()
 
 
 def _restored(cls: type, bases: tuple[type, ...]) -> Any:

@@ -29,7 +29,7 @@ import jax
 
 from iblf_jax.core import checks, modules
 from iblf_jax.core.exact_keys import behaviour_of, key_of_fields
-from iblf_jax.core.families import Part, adopt, statements_of
+from iblf_jax.core.families import Default, Part, adopt, statements_of
 
 T = TypeVar("T")
 
@@ -88,6 +88,10 @@ def component(cls: type[T]) -> type[T]:
         missing = sorted(cls.__abstractmethods__)  # type: ignore[attr-defined]
         raise checks.fail("component", cls, "a complete class", f"It lacks {', '.join(missing)}.")
     fields = dataclasses.fields(cls)  # type: ignore[arg-type]
+    for field in fields:
+        inherited = inspect.getattr_static(cls, field.name, None)
+        if isinstance(inherited, property):  # it would hide the values of the field
+            setattr(cls, field.name, Default(field.name, inherited))
     dataclass_init = cls.__init__
 
     @functools.wraps(dataclass_init)

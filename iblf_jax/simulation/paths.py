@@ -5,7 +5,7 @@ Sweeps, perturbations, tuning and scenario files address leaves by these paths.
 
 - Names follow the fields of the components; `[i]` selects a part of a `Sum` or one entry of an
   array.
-- A component whose rows have names (class attribute `rows`, such as `robots.Arm`) can be addressed
+- A component whose rows have names (class attribute `named_rows`, such as `robots.Arm`) can be addressed
   by them: "plant.link[forearm].mass", "plant.joint[elbow].damping"; numbers from 0 work as well. A
   name without a letter, or with a bracket, a line break or the like, is written as a JSON string:
   'plant.link["a]b"].mass'.
@@ -231,7 +231,7 @@ def _named_rows(part: Any, path: str) -> Iterator[Parameter]:
     """The rows of leaves that have names."""
     units = {field.name: field.metadata.get("unit", "") for field in dataclasses.fields(part)}
     values = field_values(part)
-    for kind, (names, fields) in statements_of(part).rows.items():
+    for kind, (names, fields) in statements_of(part).named_rows.items():
         for i, name in enumerate(values[names]):
             for field in fields:
                 value = values[field]

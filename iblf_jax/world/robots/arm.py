@@ -166,7 +166,7 @@ class Arm:
     )
     """Fields of which zeros, ones, minus ones and equal numbers may be compiled in
     (`engine.structural_constants`)."""
-    rows: ClassVar[dict[str, tuple[str, tuple[str, ...]]]] = {
+    named_rows: ClassVar[dict[str, tuple[str, tuple[str, ...]]]] = {
         "link": ("links", ("mass", "centre", "inertia")),
         "joint": ("joints", ("position", "rotation", "axis", *NUMBERS_OF_A_JOINT)),
     }
