@@ -16,7 +16,7 @@ import inspect
 import threading
 from collections.abc import Iterator, Mapping
 from types import MappingProxyType
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 from iblf_jax.core.caches import CACHE
 
@@ -123,10 +123,10 @@ _BASES = "_adopted_by"
 @CACHE.memoised(64)
 def required_members(base: type) -> tuple[str, ...]:
     """The names of the members without a default."""
-    if not issubclass(base, Part):  # a Protocol, until the last family has its base class
+    if Protocol in base.__mro__:  # until the last family has its base class
         members = {*vars(base), *inspect.get_annotations(base)}
         return tuple(sorted(x for x in members if not x.startswith("_")))
-    abstract = set(base.__abstractmethods__)  # type: ignore[attr-defined]
+    abstract = set(getattr(base, "__abstractmethods__", ()))
     without_value = {name for name in _annotated(base) if not hasattr(base, name)}
     return tuple(sorted(abstract | without_value))
 
