@@ -40,7 +40,7 @@ from iblf_jax.control.actuators._base import input_delay
 from iblf_jax.control.controllers import EventCompensated
 from iblf_jax.control.controllers.event_compensated import excess
 from iblf_jax.core import checks, notices
-from iblf_jax.core.optional import has_members
+from iblf_jax.core.attributes import has_members
 from iblf_jax.core.progress import announced
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.status import Status, has_flag

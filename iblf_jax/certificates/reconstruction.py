@@ -27,7 +27,7 @@ import numpy as np
 from iblf_jax.certificates.level_terms import is_about_levels, level_terms_and_sample
 from iblf_jax.certificates.proof_terms import ProofTerms, mass_over_gain, terms_and_sample
 from iblf_jax.core import checks
-from iblf_jax.core.optional import attributes
+from iblf_jax.core.attributes import attributes
 from iblf_jax.core.status import UNTRUSTED, Status, describe, has_flag
 from iblf_jax.engine import Step, step_states
 from iblf_jax.simulation import discontinuities

@@ -25,9 +25,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.core.attributes import has_members, missing_members
 from iblf_jax.core.devices import default_devices, platform
 from iblf_jax.core.families import adopt, required_members
-from iblf_jax.core.optional import has_members, missing_members
 
 F = TypeVar("F", bound=Callable)
 

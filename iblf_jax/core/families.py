@@ -47,10 +47,6 @@ class Part(metaclass=abc.ABCMeta):  # noqa: B024 (the families have abstract met
         """The units of the symbols in a part, from those of the symbols in this component."""
         return symbols
 
-    def advice(self) -> list[str]:
-        """Warnings about the values of the fields."""
-        return []
-
 
 class _Nothing(Part):
     """A part that states nothing."""
@@ -71,17 +67,17 @@ class Default:
     of the object stand, and whenever they are adopted.
 
     Args:
+      base: the base class that defines the member.
       name: of the member.
-      member: the value, function or property of the base class.
     """
 
-    def __init__(self, name: str, member: Any) -> None:
+    def __init__(self, base: type, name: str) -> None:
+        self.base = base
         self.name = name
-        self.member = member
 
     def __get__(self, part: Any, cls: type) -> Any:
-        found = (vars(owner).get(self.name, self) for owner in cls.__mro__)
-        member = next((x for x in found if not isinstance(x, Default)), self.member)
+        found = (vars(owner).get(self.name, self) for owner in (*cls.__mro__, self.base))
+        member = next(x for x in found if not isinstance(x, Default))
         return member.__get__(part, cls) if hasattr(member, "__get__") else member
 
 
@@ -93,12 +89,12 @@ def adopt(cls: type, base: type) -> None:
     if not issubclass(base, Part) or issubclass(cls, base):
         return
     with _ADOPTING:
-        own = {*dir(cls), *_annotated(cls)}
+        own = {name for name in (*dir(cls), *_annotated(cls)) if not _yields(cls, name, base)}
         for owner in _lines_of(base):
             for name, member in vars(owner).items():
                 if name not in own and not _is_of_python(name) and not _is_abstract(member):
                     own.add(name)
-                    setattr(cls, name, Default(name, member))
+                    setattr(cls, name, Default(owner, name))
         if cls.__reduce__ is object.__reduce__:
             # Another process that imports the class by its name adopts it, too.
             cls.__reduce__ = _reduced  # type: ignore[assignment, method-assign]
@@ -141,6 +137,12 @@ def _restored(cls: type, bases: tuple[type, ...]) -> Any:
     for base in bases:
         adopt(cls, base)
     return object.__new__(cls)
+
+
+def _yields(cls: type, name: str, base: type) -> bool:
+    """Whether what a class has under a name is the default of a class that `base` refines."""
+    known = inspect.getattr_static(cls, name, None)
+    return isinstance(known, Default) and issubclass(base, known.base)
 
 
 def _lines_of(base: type) -> Iterator[type]:

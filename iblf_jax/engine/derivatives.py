@@ -47,7 +47,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from iblf_jax.core.optional import attributes
+from iblf_jax.core.attributes import attributes
 from iblf_jax.engine import thresholds
 from iblf_jax.engine.batch import Batch, StepLoop, finalize, initialize
 from iblf_jax.engine.carry import Carry, Inputs, Step, StepOptions

@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.core.optional import attributes
+from iblf_jax.core.attributes import attributes
 from iblf_jax.core.status import Status, flag
 from iblf_jax.engine.carry import Carry, Inputs, Nearest, Step, StepOptions, keep_if
 from iblf_jax.engine.metric_folds import begun_at, updated, weighed

@@ -31,8 +31,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.core.attributes import has_members
 from iblf_jax.core.families import Part, adopt, required_members
-from iblf_jax.core.optional import has_members
 from iblf_jax.core.pytree import component, leaf, static
 
 KINDS = ("factor", "offset", "value")

@@ -16,7 +16,7 @@ from iblf_jax.control.actuators._base import smooth
 from iblf_jax.control.sensors import Measurement, Sensor
 from iblf_jax.control.sensors._base import sensor_member, unrounded
 from iblf_jax.core import checks
-from iblf_jax.core.optional import has_members
+from iblf_jax.core.attributes import has_members
 from iblf_jax.testing._contract import (
     Findings,
     check_function,

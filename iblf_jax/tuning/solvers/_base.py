@@ -9,7 +9,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.core.optional import has_members
+from iblf_jax.core.attributes import has_members
 from iblf_jax.core.pytree import field_values
 from iblf_jax.studies.designs import MAX_RUNS
 from iblf_jax.tuning.parameters import Box
