@@ -25,9 +25,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.core.attributes import has_members, missing_members
 from iblf_jax.core.devices import default_devices, platform
 from iblf_jax.core.families import adopt, required_members
-from iblf_jax.core.optional import has_members, missing_members
 
 F = TypeVar("F", bound=Callable)
 
@@ -416,15 +416,21 @@ def one_of(name: str, value: Any, allowed: Any) -> None:
         raise fail(name, value, "one of " + ", ".join(repr(x) for x in allowed))
 
 
+PUBLIC_MODULES = {
+    "iblf_jax.simulation.metrics": "iblf_jax.metrics",
+    "iblf_jax.tuning.quantities": "iblf_jax.objectives",
+}
+"""Module with the base class of a family -> where users find it."""
+
+
 def conforms(
     name: str, value: Any, base: type, remedy: str = "", optional: tuple[str, ...] = ()
 ) -> None:
     """Raises unless `value` is an object that JAX can flatten and that has what the family `base`
     requires; its class is then adopted by the family.
     """
-    public = base.__module__.removesuffix("._base").replace(
-        "iblf_jax.simulation.metrics", "iblf_jax.metrics"
-    )
+    module = base.__module__
+    public = PUBLIC_MODULES.get(module, module.removesuffix("._base"))
     expected = f"a component that fits {public}.{base.__name__}"
     if isinstance(value, type):
         raise fail(name, value, expected, "It is a class: make an instance, with brackets.")

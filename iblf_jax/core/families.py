@@ -16,7 +16,7 @@ import inspect
 import threading
 from collections.abc import Iterator, Mapping
 from types import MappingProxyType
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 from iblf_jax.core.caches import CACHE
 
@@ -67,17 +67,17 @@ class Default:
     of the object stand, and whenever they are adopted.
 
     Args:
+      base: the base class that defines the member.
       name: of the member.
-      member: the value, function or property of the base class.
     """
 
-    def __init__(self, name: str, member: Any) -> None:
+    def __init__(self, base: type, name: str) -> None:
+        self.base = base
         self.name = name
-        self.member = member
 
     def __get__(self, part: Any, cls: type) -> Any:
-        found = (vars(owner).get(self.name, self) for owner in cls.__mro__)
-        member = next((x for x in found if not isinstance(x, Default)), self.member)
+        found = (vars(owner).get(self.name, self) for owner in (*cls.__mro__, self.base))
+        member = next(x for x in found if not isinstance(x, Default))
         return member.__get__(part, cls) if hasattr(member, "__get__") else member
 
 
@@ -89,12 +89,12 @@ def adopt(cls: type, base: type) -> None:
     if not issubclass(base, Part) or issubclass(cls, base):
         return
     with _ADOPTING:
-        own = {*dir(cls), *_annotated(cls)}
+        own = {name for name in (*dir(cls), *_annotated(cls)) if not _yields(cls, name, base)}
         for owner in _lines_of(base):
             for name, member in vars(owner).items():
                 if name not in own and not _is_of_python(name) and not _is_abstract(member):
                     own.add(name)
-                    setattr(cls, name, Default(name, member))
+                    setattr(cls, name, Default(owner, name))
         if cls.__reduce__ is object.__reduce__:
             # Another process that imports the class by its name adopts it, too.
             cls.__reduce__ = _reduced  # type: ignore[assignment, method-assign]
@@ -119,10 +119,10 @@ _BASES = "_adopted_by"
 @CACHE.memoised(64)
 def required_members(base: type) -> tuple[str, ...]:
     """The names of the members without a default."""
-    if not issubclass(base, Part):  # a Protocol, until the last family has its base class
+    if Protocol in base.__mro__:  # until the last family has its base class
         members = {*vars(base), *inspect.get_annotations(base)}
         return tuple(sorted(x for x in members if not x.startswith("_")))
-    abstract = set(base.__abstractmethods__)  # type: ignore[attr-defined]
+    abstract = set(getattr(base, "__abstractmethods__", ()))
     without_value = {name for name in _annotated(base) if not hasattr(base, name)}
     return tuple(sorted(abstract | without_value))
 
@@ -137,6 +137,12 @@ def _restored(cls: type, bases: tuple[type, ...]) -> Any:
     for base in bases:
         adopt(cls, base)
     return object.__new__(cls)
+
+
+def _yields(cls: type, name: str, base: type) -> bool:
+    """Whether what a class has under a name is the default of a class that `base` refines."""
+    known = inspect.getattr_static(cls, name, None)
+    return isinstance(known, Default) and issubclass(base, known.base)
 
 
 def _lines_of(base: type) -> Iterator[type]:

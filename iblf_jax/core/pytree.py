@@ -93,9 +93,11 @@ def component(cls: type[T]) -> type[T]:
             lacks = f"It lacks {', '.join(missing)}."
             raise checks.fail("component", cls, "a complete class", lacks)
     for field in fields:
-        inherited = inspect.getattr_static(cls, field.name, None)
-        if isinstance(inherited, property):  # it would hide the values of the field
-            setattr(cls, field.name, Default(field.name, inherited))
+        name = field.name
+        if isinstance(inspect.getattr_static(cls, name, None), property):
+            # It would hide the values of the field.
+            base = next(x for x in cls.__mro__ if name in vars(x))
+            setattr(cls, name, Default(base, name))
     dataclass_init = cls.__init__
 
     @functools.wraps(dataclass_init)

@@ -17,7 +17,7 @@ import jax
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.core.optional import attributes
+from iblf_jax.core.attributes import attributes
 from iblf_jax.core.pytree import layers, wrapped_field
 from iblf_jax.kernels import Known
 from iblf_jax.simulation.scenario import Scenario

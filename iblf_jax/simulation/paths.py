@@ -5,10 +5,10 @@ Sweeps, perturbations, tuning and scenario files address leaves by these paths.
 
 - Names follow the fields of the components; `[i]` selects a part of a `Sum` or one entry of an
   array.
-- A component whose rows have names (class attribute `named_rows`, such as `robots.Arm`) can be addressed
-  by them: "plant.link[forearm].mass", "plant.joint[elbow].damping"; numbers from 0 work as well. A
-  name without a letter, or with a bracket, a line break or the like, is written as a JSON string:
-  'plant.link["a]b"].mass'.
+- A component whose rows have names (class attribute `named_rows`, such as `robots.Arm`) can be
+  addressed by them: "plant.link[forearm].mass", "plant.joint[elbow].damping"; numbers from 0 work
+  as well. A name without a letter, or with a bracket, a line break or the like, is written as a
+  JSON string: 'plant.link["a]b"].mass'.
 - `robot.` stands for `plant.` and `model.` together and changes both robots alike.
 - Several leaves may be addressed as the rows of one array (class attribute `stacked`):
   "initial.x[2]" is the third level of the start of a plant, "initial.x[0]" its initial.q.

@@ -33,7 +33,7 @@ from iblf_jax.control.controllers._base import adopt_layers
 from iblf_jax.control.controllers.systems import observer_of
 from iblf_jax.control.observers import NoObserver
 from iblf_jax.core import checks, notices, programs
-from iblf_jax.core.optional import attributes
+from iblf_jax.core.attributes import attributes
 from iblf_jax.core.progress import announced
 from iblf_jax.core.pytree import field_values, layers, unwrapped
 from iblf_jax.core.status import Status

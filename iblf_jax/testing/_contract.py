@@ -162,15 +162,15 @@ def _has_members(findings: Findings, member: Any, base: type) -> None:
     for name in required_members(base):
         if hasattr(member, name):
             continue
-        required = getattr(base, name, None)
-        if required is None:
+        method = getattr(base, name, None)
+        if method is None:
             findings.add(f"the attribute {name!r} is missing", f"See {base.__name__}")
             continue
         arguments = ""
-        if callable(required):
-            names = [word for word in inspect.signature(required).parameters if word != "self"]
+        if callable(method):
+            names = [word for word in inspect.signature(method).parameters if word != "self"]
             arguments = f"({', '.join(names)})"
-        text = (inspect.getdoc(required) or "").split("\n")[0]
+        text = (inspect.getdoc(method) or "").split("\n")[0]
         findings.add(f"{name}{arguments} is missing", text)
 
 

@@ -14,7 +14,7 @@ from jax.flatten_util import ravel_pytree
 from iblf_jax.control.actuators import Actuator, Delivered
 from iblf_jax.control.sensors import Measurement, Sensor
 from iblf_jax.core import checks
-from iblf_jax.core.optional import has_members
+from iblf_jax.core.attributes import has_members
 from iblf_jax.testing._contract import (
     Findings,
     check_function,

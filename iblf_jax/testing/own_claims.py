@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.certificates.claims import OWN_CLAIM_METHODS, stated_methods, states_disturbance_terms
-from iblf_jax.core.optional import attributes, has_members
+from iblf_jax.core.attributes import attributes, has_members
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.simulation.levels import estimate_shape, law_state, start_levels
 from iblf_jax.simulation.scenario import Scenario

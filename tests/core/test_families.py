@@ -7,14 +7,16 @@ import math
 import pickle
 import subprocess
 import sys
+from collections.abc import Mapping
 from pathlib import Path
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 import pytest
 
 import iblf_jax as ij
-from iblf_jax.core.families import adopt, required_members
+from iblf_jax.core.families import Part, adopt, required_members
 from iblf_jax.core.pytree import note_code
 
 OWN = """
@@ -92,6 +94,17 @@ def test_a_default_does_not_hide_a_member_of_another_base_class():
     assert with_both.decay_rate(3.0) == 3.0
     later = ij.component(type("Later", (plain, Claiming), {}))
     assert law_with(later()).barrier.decay_rate(3.0) == 3.0
+
+
+def test_the_default_of_a_family_replaces_that_of_all_components():
+    class Gravity(Part):
+        own_joints: ClassVar[Mapping[str, int]] = {"mass": 3}
+
+    own = own_class()
+    assert own.own_joints == {}
+    for base in (Gravity, ij.barriers.Barrier):
+        adopt(own, base)
+        assert own.own_joints == {"mass": 3}
 
 
 def test_a_leaf_may_have_the_name_of_a_statement_of_classes():

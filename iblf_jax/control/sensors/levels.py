@@ -20,7 +20,7 @@ from iblf_jax.control.sensors._base import (
 )
 from iblf_jax.control.sensors.unmeasured import Unmeasured
 from iblf_jax.core import checks
-from iblf_jax.core.optional import has_members
+from iblf_jax.core.attributes import has_members
 from iblf_jax.core.pytree import component
 
 

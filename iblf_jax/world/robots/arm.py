@@ -34,8 +34,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.core.attributes import attributes
 from iblf_jax.core.linalg import sums_from, sums_to, symmetric
-from iblf_jax.core.optional import attributes
 from iblf_jax.core.pytree import Leaf, component, leaf, static
 from iblf_jax.world.robots import spatial
 from iblf_jax.world.robots._base import broadcast_fields
