@@ -197,9 +197,9 @@ def not_public(key: str, definition: ast.ClassDef) -> list[str]:
     def lacks(name: str, places: list) -> bool:
         return not any(getattr(place, name, None) is getattr(module, name) for place in places)
 
-    own = {definition.name, *returned, *fields}
+    own = {definition.name, *returned}
     missing = {name for name in own if lacks(name, [family])} | {
-        name for name in given if lacks(name, [family, *anywhere])
+        name for name in fields | given if lacks(name, [family, *anywhere])
     }
     return sorted(missing)
 

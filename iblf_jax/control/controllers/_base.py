@@ -9,7 +9,7 @@ was active.
 from __future__ import annotations
 
 import abc
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from functools import partial
 from typing import Any, ClassVar, NamedTuple, Self
 
@@ -18,7 +18,7 @@ import jax.numpy as jnp
 
 from iblf_jax.control.barriers import Barrier
 from iblf_jax.control.decays import Decay, Exponential
-from iblf_jax.core.families import NO_NAMES, Part, adopt
+from iblf_jax.core.families import Part, adopt
 from iblf_jax.core.pytree import Leaf, layers
 from iblf_jax.world.bounds import Bounds, Tube, speed_limits_at, tube_at
 from iblf_jax.world.references import Reference
@@ -198,9 +198,9 @@ class Controller(Part):
         """The same law without a limit of its own, by which a sampled loop is linearised."""
         return self
 
-    def unit_symbols(self, model: Any) -> Mapping[str, Any]:
+    def unit_symbols(self, model: Any) -> dict[str, Any]:
         """The units of symbols in the units of its leaves."""
-        return NO_NAMES
+        return {}
 
     def advice(self) -> list[str]:
         """Warnings about the values of the fields."""
