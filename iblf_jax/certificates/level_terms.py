@@ -39,7 +39,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 from iblf_jax.certificates.auxiliary import covers_limit, inner_context, inner_state
-from iblf_jax.certificates.claims import adaptive_law, own_claim
+from iblf_jax.certificates.claims import adaptive_law, own_claim, states_disturbance_terms
 from iblf_jax.certificates.proof_terms import TORQUE_ROUNDING, OwnTerms
 from iblf_jax.control.controllers import BarrierBackstepping
 from iblf_jax.control.controllers._base import decay_of
@@ -428,11 +428,10 @@ def _own_terms(
     V, dV = jax.jvp(lyapunov, point, direction)
     decay = jnp.sum(law.decay(*point[:3], context, at.law_state))
     slopes = jax.grad(lyapunov, argnums=(0, 1, 2, 3))(*point)
-    stated = law.disturbance_terms(*point[:3], dd, context, at.law_state)
-    if stated is None:
-        terms = jnp.sum(slopes[1] * d_tilde) + jnp.sum(slopes[2] * dd)
+    if states_disturbance_terms(law):
+        terms = jnp.sum(law.disturbance_terms(*point[:3], dd, context, at.law_state))
     else:
-        terms = jnp.sum(stated)
+        terms = jnp.sum(slopes[1] * d_tilde) + jnp.sum(slopes[2] * dd)
     sizes = _rate_sizes(scenario, at, d, d_tilde, tangent.x)
     products = jax.tree.map(lambda a, b: jnp.sum(jnp.abs(a * b)), slopes, direction)
     size = sum(jax.tree.leaves(products)) + jnp.sum(jnp.abs(slopes[1]) * sizes)

@@ -41,7 +41,13 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.certificates.auxiliary import covers_limit, inner_state
-from iblf_jax.certificates.claims import adaptive_law, decay_phi, decay_rate, own_claim
+from iblf_jax.certificates.claims import (
+    adaptive_law,
+    decay_phi,
+    decay_rate,
+    own_claim,
+    states_disturbance_terms,
+)
 from iblf_jax.control.controllers import Backstepping, FullState
 from iblf_jax.control.controllers._base import decay_of
 from iblf_jax.control.decays._base import energy_gain, gain_at
@@ -468,16 +474,15 @@ def _own_terms(
     decay = jnp.sum(law.decay(t, q, dq, f_tilde, context, own_state))
     slopes = jax.grad(lyapunov, argnums=(0, 1, 2, 3, 4))(*point)
     M0 = scenario.model.mass_matrix(q)
-    stated = law.disturbance_terms(t, q, dq, f_tilde, df, context, own_state)
-    if stated is None:
+    if states_disturbance_terms(law):
+        terms = jnp.sum(law.disturbance_terms(t, q, dq, f_tilde, df, context, own_state))
+    else:
         terms = slopes[2] @ solve_spd(M0, f_tilde) + slopes[3] @ df
         if scenario.observer.completes:
             # The law received estimates: what that changes of the torque acts like f_tilde.
             f_hat = now["disturbance_estimate"]
             command, _ = law.command(t, q, dq, f_hat, context, state.controller)
             terms += slopes[2] @ solve_spd(M0, now["tau"] - command.tau)
-    else:
-        terms = jnp.sum(stated)
     size = _own_term_sizes(M0, slopes, tangent, now) + jnp.abs(decay) + jnp.abs(terms)
     limited = jnp.zeros((), bool)
     if law is not scenario.controller:

@@ -568,10 +568,8 @@ def _with_sent_input(command: Command, sent: SentCommand) -> Command:
 
 def _next_observer_state(sampling: Any, observer: Any, arguments: tuple) -> Any:
     """The observer's state one period later; `arguments` are those of `Observer.derivative`."""
-    if sampling.observer == "exact":
-        exact = observer.advance(*arguments, sampling.period)
-        if exact is not None:
-            return exact
+    if sampling.observer == "exact" and observer.advances:
+        return observer.advance(*arguments, sampling.period)
     return _euler(arguments[-1], observer.derivative(*arguments), sampling.period)
 
 

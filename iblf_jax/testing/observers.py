@@ -125,10 +125,10 @@ def _structure(findings: Findings, observer, t, case: Case, model) -> None:
         label = f"complete(t, {names}, model, state)"
         arguments = (t, *case.measured, model, state)
         call_has_shape(findings, label, observer.complete, arguments, shape)
-    label = f"advance(t, {names}, tau, model, state, period)"
-    arguments = (t, *case.measured, case.tau, model, state, jnp.asarray(1e-3, t.dtype))
-    after = shape_of(findings, label, observer.advance, *arguments)
-    if after is not None:
+    if observer.advances:
+        label = f"advance(t, {names}, tau, model, state, period)"
+        arguments = (t, *case.measured, case.tau, model, state, jnp.asarray(1e-3, t.dtype))
+        after = shape_of(findings, label, observer.advance, *arguments)
         same_structure(findings, label, after, state)
 
 

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from iblf_jax.control.barriers import Barrier
 from iblf_jax.control.decays import Decay, Exponential
 from iblf_jax.core.families import Part, adopt
-from iblf_jax.core.pytree import Leaf, layers
+from iblf_jax.core.pytree import Leaf, layers, wrapped_field
 from iblf_jax.world.bounds import Bounds, Tube, speed_limits_at, tube_at
 from iblf_jax.world.references import Reference
 from iblf_jax.world.regions import Along, Region, along
@@ -336,8 +336,10 @@ class Wrapping(Controller):
 
 def adopt_layers(law: Any) -> None:
     """Makes laws of the classes of a law and of those that it wraps."""
-    for layer in layers(law):
-        adopt(type(layer), Controller)
+    adopt(type(law), Controller)
+    field = wrapped_field(law)
+    if field:
+        adopt_layers(vars(law)[field])
 
 
 def state_of_levels(q: jax.Array, dq: jax.Array, higher: Any) -> jax.Array:

@@ -55,6 +55,11 @@ class Observer(Part):
         return None
 
     @property
+    def advances(self) -> bool:
+        """Whether it has `advance`."""
+        return type(self).advance is not Observer.advance
+
+    @property
     def completes(self) -> bool:
         """Whether it has `complete`."""
         return type(self).complete is not Observer.complete
@@ -95,8 +100,8 @@ class Observer(Part):
         state: State,
         period: jax.Array,
     ) -> State | None:
-        """The state a period [s] later for constant measurements and torque; None for a step of
-        Euler.
+        """The state a period [s] later for constant measurements and torque; an observer without
+        this method makes a step of Euler.
         """
         return None
 
