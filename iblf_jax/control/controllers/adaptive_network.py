@@ -43,11 +43,7 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.control.barriers import Barrier, Log
-from iblf_jax.control.controllers._base import (
-    Command,
-    Controller,
-    LawContext,
-)
+from iblf_jax.control.controllers._base import Command, Controller, LawContext
 from iblf_jax.control.controllers.adaptive_rbf import scaled_input, sobol_centres
 from iblf_jax.control.controllers.backstepping import (
     alpha_and_rate,
@@ -117,7 +113,6 @@ class AdaptiveNetwork(Controller):
     barrier: Barrier = Log()
     nodes: int = static(default=10)
     weight: Leaf = leaf("N m rad", sign="positive", default=None)
-    gains: ClassVar[tuple[str, ...]] = ("k1", "K2")
     unit_factors: ClassVar[tuple[str, ...]] = ("weight",)
     uses_observer: ClassVar[bool] = False
     takes_shift: ClassVar[bool] = True

@@ -44,11 +44,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.control.barriers import Barrier, Log
-from iblf_jax.control.controllers._base import (
-    Command,
-    Controller,
-    LawContext,
-)
+from iblf_jax.control.controllers._base import Command, Controller, LawContext
 from iblf_jax.control.controllers.backstepping import (
     alpha_and_rate,
     barrier_command,
@@ -108,7 +104,6 @@ class AdaptiveRBF(Controller):
     nodes: int = static(default=64)
     normalised: bool = static(default=False)
     weight: Leaf = leaf("N m rad", sign="positive", default=None)
-    gains: ClassVar[tuple[str, ...]] = ("k1", "K2")
     unit_factors: ClassVar[tuple[str, ...]] = ("weight",)
     uses_observer: ClassVar[bool] = False
     takes_shift: ClassVar[bool] = True

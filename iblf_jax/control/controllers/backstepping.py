@@ -38,13 +38,7 @@ import numpy as np
 
 from iblf_jax.control.barriers import Barrier, Integral
 from iblf_jax.control.barriers._base import guard_is_active
-from iblf_jax.control.controllers._base import (
-    Command,
-    Controller,
-    LawContext,
-    decay_of,
-    no_state,
-)
+from iblf_jax.control.controllers._base import Command, Controller, LawContext, decay_of, no_state
 from iblf_jax.control.decays import Decay
 from iblf_jax.control.decays._base import (
     energy_gain,
@@ -105,7 +99,6 @@ class Backstepping(Controller):
     reading: str = static(default="printed")
     weight: Leaf = leaf("N m rad", sign="positive", default=None)
     decays: tuple[Decay, ...] = ()
-    gains: ClassVar[tuple[str, ...]] = ("k1", "K2")
     unit_factors: ClassVar[tuple[str, ...]] = ("weight",)
     takes_shift: ClassVar[bool] = True
     leaf_units = weight_units

@@ -52,12 +52,7 @@ from iblf_jax.control.barriers._base import (
     guard_is_active,
     has_ratio,
 )
-from iblf_jax.control.controllers._base import (
-    Command,
-    Controller,
-    LawContext,
-    decay_of,
-)
+from iblf_jax.control.controllers._base import Command, Controller, LawContext, decay_of
 from iblf_jax.control.controllers._levels import Design, Level, exact_levels, surface_levels
 from iblf_jax.control.controllers.backstepping import (
     check_barrier,

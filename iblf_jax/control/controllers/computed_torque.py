@@ -11,12 +11,7 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.controllers._base import (
-    Command,
-    Controller,
-    LawContext,
-    no_state,
-)
+from iblf_jax.control.controllers._base import Command, Controller, LawContext, no_state
 from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.world.robots import inverse_dynamics
 

@@ -19,11 +19,7 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.control.barriers import Barrier, Integral
-from iblf_jax.control.controllers._base import (
-    Command,
-    Controller,
-    LawContext,
-)
+from iblf_jax.control.controllers._base import Command, Controller, LawContext
 from iblf_jax.control.controllers.backstepping import (
     barrier_command,
     check_barrier,
@@ -69,7 +65,6 @@ class DynamicSurface(Controller):
     barrier: Barrier = Integral()
     weight: Leaf = leaf("N m rad", sign="positive", default=None)
     decays: tuple[Decay, ...] = ()
-    gains: ClassVar[tuple[str, ...]] = ("k1", "K2")
     unit_factors: ClassVar[tuple[str, ...]] = ("weight",)
     takes_shift: ClassVar[bool] = True
     leaf_units = weight_units

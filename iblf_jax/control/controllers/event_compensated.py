@@ -37,12 +37,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.control.controllers._base import (
-    Command,
-    Controller,
-    State,
-    Wrapping,
-)
+from iblf_jax.control.controllers._base import Command, Controller, State, Wrapping
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.core.units import INPUT

@@ -63,13 +63,7 @@ from iblf_jax.control.barriers._base import (
     guard_is_active,
     has_ratio,
 )
-from iblf_jax.control.controllers._base import (
-    Command,
-    Controller,
-    LawContext,
-    decay_of,
-    no_state,
-)
+from iblf_jax.control.controllers._base import Command, Controller, LawContext, decay_of, no_state
 from iblf_jax.control.controllers._levels import Design, exact_levels
 from iblf_jax.control.controllers.backstepping import (
     alpha_and_rate,
@@ -138,7 +132,6 @@ class FullState(Controller):
     velocity_barrier: Barrier = Integral()
     weight: Leaf = leaf("1", sign="positive", default=None)
     decays: tuple[Decay, ...] = ()
-    gains: ClassVar[tuple[str, ...]] = ("k1", "K2")
     unit_factors: ClassVar[tuple[str, ...]] = ("weight",)
     needs_velocity_bounds: ClassVar[bool] = True
     includes_e2: ClassVar[bool] = True

@@ -26,11 +26,7 @@ from typing import Any, ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.controllers._base import (
-    Command,
-    Controller,
-    LawContext,
-)
+from iblf_jax.control.controllers._base import Command, Controller, LawContext
 from iblf_jax.control.controllers.computed_torque import ComputedTorque
 from iblf_jax.control.controllers.pd_gravity import PDGravity
 from iblf_jax.core import checks

@@ -35,13 +35,7 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.controllers._base import (
-    Command,
-    Controller,
-    LawContext,
-    State,
-    Wrapping,
-)
+from iblf_jax.control.controllers._base import Command, Controller, LawContext, State, Wrapping
 from iblf_jax.core import checks
 from iblf_jax.core.linalg import matmul, matvec, solve_spd
 from iblf_jax.core.pytree import Leaf, component, leaf, static

@@ -33,12 +33,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.control.controllers._base import (
-    Command,
-    LawContext,
-    LyapunovLaw,
-    no_state,
-)
+from iblf_jax.control.controllers._base import Command, LawContext, LyapunovLaw, no_state
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.world.bounds import Tube

@@ -15,12 +15,7 @@ from typing import Any, ClassVar
 
 import jax
 
-from iblf_jax.control.controllers._base import (
-    Command,
-    Controller,
-    State,
-    Wrapping,
-)
+from iblf_jax.control.controllers._base import Command, Controller, State, Wrapping
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import component, unwrapped
 from iblf_jax.world.plants import ElectricDrive

@@ -11,13 +11,7 @@ from typing import Any, ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.sensors._base import (
-    LevelReading,
-    LevelSensor,
-    Measurement,
-    Sensor,
-    State,
-)
+from iblf_jax.control.sensors._base import LevelReading, LevelSensor, Measurement, Sensor, State
 from iblf_jax.control.sensors.unmeasured import Unmeasured
 from iblf_jax.core import checks
 from iblf_jax.core.attributes import has_members
