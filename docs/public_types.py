@@ -1,6 +1,6 @@
-"""Pages of the protocols, records and type aliases that user-written classes need.
+"""Pages of the base classes, records and type aliases that user-written classes need.
 
-The page of a protocol lists its methods, and that of a record its fields. The text of a field is
+The page of a base class lists its members, and that of a record its fields. The text of a field is
 the string that follows it in the source, which `inspect` does not return.
 """
 
@@ -20,9 +20,9 @@ ALIASES = {"Leaf": pytree}
 """Type alias at the top of the package -> the module that documents it."""
 
 
-def is_protocol(thing: Any) -> bool:
-    """Whether something is a protocol, the contract of a family."""
-    return inspect.isclass(thing) and getattr(thing, "_is_protocol", False)
+def is_contract(thing: Any) -> bool:
+    """Whether something is the base class of a family, or a protocol."""
+    return inspect.isabstract(thing) or getattr(thing, "_is_protocol", False)
 
 
 def is_record(thing: Any) -> bool:
@@ -31,13 +31,13 @@ def is_record(thing: Any) -> bool:
 
 
 def types_of(module: ModuleType) -> dict[str, Any]:
-    """The public protocols and records of a family, protocols first."""
+    """The public base classes and records of a family, base classes first."""
     things = {
         name: thing for name, thing in vars(module).items() if _belongs_to(thing, name, module)
     }
-    protocols = {name: thing for name, thing in things.items() if is_protocol(thing)}
+    contracts = {name: thing for name, thing in things.items() if is_contract(thing)}
     records = {name: thing for name, thing in things.items() if is_record(thing)}
-    return protocols | records
+    return contracts | records
 
 
 def _belongs_to(thing: Any, name: str, module: ModuleType) -> bool:
@@ -86,7 +86,7 @@ def fields_of(record: type) -> dict[str, str]:
 def page(
     thing: Any, name: str, level: int, body: Callable[[str], str], defined: Callable[..., str]
 ) -> str:
-    """A protocol or a record in Markdown; `body` writes a docstring, `defined` a definition."""
+    """A base class or a record in Markdown; `body` writes a docstring, `defined` a definition."""
     family, _, short = name.rpartition(".")
     module = f"iblf_jax.{family}".rstrip(".")
     definition = defined("class", module, short)
@@ -108,8 +108,8 @@ def page(
     return "\n".join(lines)
 
 
-def _attributes(protocol: type) -> dict[str, str]:
-    """Annotated attributes of a protocol -> what they are."""
-    definition = ast.parse(textwrap.dedent(inspect.getsource(protocol))).body[0]
+def _attributes(contract: type) -> dict[str, str]:
+    """Annotated attributes of a base class -> what they are."""
+    definition = ast.parse(textwrap.dedent(inspect.getsource(contract))).body[0]
     assert isinstance(definition, ast.ClassDef)
     return texts_of_fields(definition.body)

@@ -112,13 +112,13 @@ FAMILIES = (
     "actuators",
     "metrics",
 )
-OWN_TYPES = "Protocols and types for user-written classes"
-"""Heading of the protocols and records of a family."""
+OWN_TYPES = "Base classes and types for user-written classes"
+"""Heading of the base classes and records of a family."""
 
 
 def page_of(thing: Any, name: str, level: int = 2, module: str = "iblf_jax") -> str:
     """One public object in Markdown; `name` is its name in a module."""
-    if public_types.is_protocol(thing) or public_types.is_record(thing):
+    if public_types.is_contract(thing) or public_types.is_record(thing):
         return public_types.page(thing, name, level, body, defined)
     documented_in = public_types.ALIASES.get(name)
     if documented_in is not None:

@@ -21,7 +21,7 @@ import jax
 import numpy as np
 
 from iblf_jax.core import checks, notices, tables
-from iblf_jax.core.optional import has_members
+from iblf_jax.core.attributes import has_members
 from iblf_jax.core.progress import announced
 from iblf_jax.core.pytree import wrapped_field
 from iblf_jax.core.units import as_text

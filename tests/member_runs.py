@@ -15,7 +15,6 @@ import warnings
 import jax
 
 import iblf_jax as ij
-from iblf_jax.control.actuators._base import input_delay
 
 RUN = {"duration": 0.02, "dt": 2e-3}
 
@@ -24,7 +23,7 @@ def fitting(scenario: ij.Scenario, method: str) -> str:
     """The method, or the nearest one that the scenario admits."""
     if scenario.process_noise is not None:
         return "euler_maruyama"
-    if method == "euler" and input_delay(scenario.actuator) is not None:
+    if method == "euler" and scenario.actuator.input_delay is not None:
         return "heun"
     return method
 

@@ -31,7 +31,9 @@ def evaluate_annotations(names: dict[str, Any]) -> None:
         if not defined_here or not isinstance(thing, type | types.FunctionType):
             continue
         methods = vars(thing).values() if isinstance(thing, type) else ()
-        functions = [method for method in methods if isinstance(method, types.FunctionType)]
+        functions = [x for x in methods if isinstance(x, types.FunctionType)]
+        # A class also has functions that the package gives it.
+        functions = [x for x in functions if x.__module__ == names["__name__"]]
         for annotated in (thing, *functions):
             inspect.get_annotations(annotated, globals=names, eval_str=True)
 

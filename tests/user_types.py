@@ -20,7 +20,7 @@ def of_a_run(scenario: ij.Scenario) -> None:
 
 
 @ij.component
-class Drive:
+class Drive(ij.actuators.Actuator):
     """An actuator of a user's, with the public types that its methods return."""
 
     gain: ij.Leaf = ij.leaf("1", sign="positive")
@@ -37,7 +37,7 @@ class Drive:
 
 
 @ij.component
-class Wrapping:
+class Wrapping(ij.controllers.Controller):
     """A law of a user's that wraps another, and states a claim of its own."""
 
     law: ij.controllers.Controller
@@ -62,7 +62,7 @@ class Wrapping:
 
 
 @ij.component
-class Barrier:
+class Barrier(ij.barriers.Barrier):
     """A barrier of a user's."""
 
     guard: float = ij.static(default=1e-3)
@@ -102,7 +102,7 @@ class Barrier:
 
 
 @ij.component
-class Observer:
+class Observer(ij.observers.Observer):
     """An observer of a user's."""
 
     gain: ij.Leaf = ij.leaf("1/s", sign="positive")
@@ -158,7 +158,7 @@ class Push:
 
 
 @ij.component
-class Sensor:
+class Sensor(ij.sensors.Sensor):
     """A sensor of a user's."""
 
     draws: ClassVar[int] = 0
@@ -196,6 +196,25 @@ class Plant:
         return 1.0 + 0.0 * x
 
 
+@ij.component
+class Largest(ij.metrics.Fold):
+    """A metric of a user's."""
+
+    units: ClassVar[dict[str, str]] = {"largest": "rad"}
+
+    def init(self, sample: ij.metrics.Sample) -> jax.Array:
+        """Zero."""
+        return 0.0 * sample.e1
+
+    def update(self, acc: jax.Array, sample: ij.metrics.Sample) -> jax.Array:
+        """The larger one."""
+        return jax.numpy.maximum(acc, sample.e1)
+
+    def finish(self, acc: jax.Array) -> dict[str, jax.Array]:
+        """The result by name."""
+        return {"largest": acc}
+
+
 def of_own_parts(scenario: ij.Scenario, sample: ij.metrics.Sample, tube: ij.bounds.Tube) -> None:
     """Parts of a user's own fit where the package's do."""
     actuator: ij.actuators.Actuator = Drive(gain=3.0)
@@ -206,6 +225,7 @@ def of_own_parts(scenario: ij.Scenario, sample: ij.metrics.Sample, tube: ij.boun
     sensor: ij.sensors.Sensor = Sensor()
     plant: ij.plants.Plant = Plant()
     ij.controllers.Backstepping(k1=2.0, K2=20.0, barrier=barrier)
+    ij.simulate(scenario, duration=1.0, metrics=(Largest(),))
     ij.with_parts(scenario, actuator=actuator, controller=law, observer=observer, sensor=sensor)
     ij.with_parts(scenario, disturbance=disturbance, plant=plant)
     assert_type(sample.e1, jax.Array)

@@ -31,22 +31,20 @@ from iblf_jax.certificates._level_certificate import (
 from iblf_jax.certificates.claims import own_claim
 from iblf_jax.certificates.level_terms import is_about_levels
 from iblf_jax.certificates.lines import FAILS, NOT_APPLICABLE, Line, Statement, not_applicable
-from iblf_jax.certificates.optional import optional_member
 from iblf_jax.certificates.reconstruction import is_valid, time_grid
 from iblf_jax.certificates.result import Certificate, LevelTraces, Traces
 from iblf_jax.certificates.run_summary import THEOREM, WEIGHTED, RunSummary, Segment, summarise
 from iblf_jax.control import actuators, sensors
-from iblf_jax.control.actuators._base import input_delay
 from iblf_jax.control.controllers import EventCompensated
 from iblf_jax.control.controllers.event_compensated import excess
 from iblf_jax.core import checks, notices
-from iblf_jax.core.optional import has_members
 from iblf_jax.core.progress import announced
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.status import Status, has_flag
 from iblf_jax.engine.simulate import SimulationWarning, simulate
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical, with_history, with_parts
+from iblf_jax.studies.study import Study
 from iblf_jax.world import plants
 
 MAX_RECORDED = 20_000
@@ -133,7 +131,7 @@ def certify(
     Source: Zhang & Yan 2024, Theorem 2 and its proof, (3.16)-(3.31); (S.3) as at the head of
       `iblf_jax.certificates.level_terms`, (D.2) at that of `iblf_jax.certificates.settling`.
     """
-    if isinstance(scenario, Rollout) or _is_study(scenario):
+    if isinstance(scenario, Rollout | Study):
         remedy = "Pass certify(scenario, run) or certify(scenario, study)."
         raise checks.fail("scenario", type(scenario).__name__, "a Scenario", remedy)
     scenario = _with_history_of(canonical(scenario), run, dt)
@@ -157,32 +155,25 @@ def certify(
 
 def _with_history_of(scenario: Scenario, run: Any, dt: float) -> Scenario:
     """The scenario with as many past commands as the run has, where its input has a delay."""
-    if run is not None:
-        dt = optional_member(run, "dt")
-    if dt is None or input_delay(scenario.actuator) is None:
+    if scenario.actuator.input_delay is None:
         return scenario
-    return with_history(scenario, float(dt))
+    step = run.dt if isinstance(run, Rollout | Study) else dt
+    return with_history(scenario, float(step))
 
 
 # --- the runs ------------------------------------------------------------------------------------
 
 
 def _runs_of_study(
-    scenario: Scenario, study: Any, worst: int | None
+    scenario: Scenario, study: Study, worst: int | None
 ) -> Iterator[tuple[int, Rollout]]:
     """The runs of a study to check; ValueError for a study of another scenario."""
-    if not _is_study(study):
+    if not isinstance(study, Study):
         remedy = "Pass what ij.simulate or ij.monte_carlo returned."
         raise checks.fail("run", study, "a Rollout, a study or None", remedy)
-    nominal = optional_member(study, "scenario")
-    if nominal is not None:
-        _check_same(scenario, canonical(nominal), numbers=True)
+    _check_same(scenario, canonical(study.scenario), numbers=True)
     for index in _nearest_to_bounds(study, worst):
         yield index, _replayed(study, index)
-
-
-def _is_study(candidate: Any) -> bool:
-    return has_members(candidate, "replay", "metrics", "__len__")
 
 
 def _on_host(run: Rollout) -> Rollout:
@@ -207,12 +198,12 @@ def _check_same(scenario: Scenario, of_run: Scenario, *, numbers: bool) -> None:
         raise checks.fail("run", got, "a run of `scenario`", remedy)
 
 
-def _nearest_to_bounds(study: Any, worst: int | None) -> list[int]:
+def _nearest_to_bounds(study: Study, worst: int | None) -> list[int]:
     """The runs of a study that came nearest to their bounds, the nearest first, among those that
     were made.
     """
     count = len(study)
-    made = np.broadcast_to(optional_member(study, "made"), (count,))
+    made = study.made
     if worst is None or worst >= np.sum(made):
         return np.flatnonzero(made).tolist()
     try:
@@ -229,14 +220,12 @@ def _nearest_to_bounds(study: Any, worst: int | None) -> list[int]:
     return order[made[order]][:worst].tolist()
 
 
-def _replayed(study: Any, index: int) -> Rollout:
+def _replayed(study: Study, index: int) -> Rollout:
     """One run of a study on the host, with a bounded number of recorded samples."""
-    duration, dt = optional_member(study, "duration"), optional_member(study, "dt")
     options = {}
-    if duration is not None and dt is not None:
-        steps = round(duration / dt)
-        if steps > MAX_RECORDED:
-            options["record_every"] = 1 + steps // MAX_RECORDED
+    steps = round(study.duration / study.dt)
+    if steps > MAX_RECORDED:
+        options["record_every"] = 1 + steps // MAX_RECORDED
     return _on_host(study.replay(index, **options))
 
 
@@ -255,7 +244,7 @@ def _checked_claims(run: Rollout) -> Certificate:
         return _certificate_by_comparison(run, "noisy", NOISY)
     if run.scenario.sampling is not None:
         return _certificate_by_comparison(run, "sampled", SAMPLED)
-    if input_delay(run.scenario.actuator) is not None:
+    if run.scenario.actuator.input_delay is not None:
         return _certificate_by_comparison(run, "delayed", DELAYED)
     if is_about_levels(run.scenario):
         return level_certificate(run)
@@ -474,7 +463,7 @@ def _trigger_lines(run: Rollout) -> tuple[Line, ...]:
         line = not_applicable(COMPENSATED, AT_CHECKS, counts=False)
         return (dataclasses.replace(line, value=float(excess(law))),)
     inner = unwrapped(law)
-    if is_about_levels(scenario) or law is not inner or optional_member(inner, "includes_e2"):
+    if is_about_levels(scenario) or law is not inner or inner.includes_e2:
         return ()
     if not isinstance(scenario.actuator, actuators.Ideal) or sampling.queue > 0:
         return ()  # the torque of the run is not the command that the trigger holds

@@ -15,7 +15,6 @@ from iblf_jax.certificates.level_summary import (
     level_summary,
 )
 from iblf_jax.certificates.lines import Line
-from iblf_jax.certificates.optional import optional_member
 from iblf_jax.certificates.result import Certificate, LevelLabel, LevelTraces
 from iblf_jax.certificates.run_summary import Segment, in_two_passes
 from iblf_jax.core.pytree import unwrapped
@@ -30,18 +29,16 @@ CLAIM = "the claim (S.3)"
 def heading_of(scenario: Scenario) -> str:
     """Law, barriers, reading and observer, in words."""
     law = unwrapped(scenario.controller)
-    barrier, reading = optional_member(law, "barrier"), optional_member(law, "reading")
-    barriers = optional_member(law, "barriers")
     adaptive = adaptive_law(scenario)
     parts = [type(law).__name__]
     if adaptive is not None:
         parts.insert(0, f"{type(adaptive).__name__} of {len(adaptive.parameters)}")
-    if barrier is not None:
-        parts.append(f"barrier {type(barrier).__name__}")
-    if barriers:
-        parts.append("barriers " + " ".join(type(x).__name__ for x in barriers))
-    if reading:
-        parts.append(f"reading {reading}")
+    if law.barrier is not None:
+        parts.append(f"barrier {type(law.barrier).__name__}")
+    if law.barriers:
+        parts.append("barriers " + " ".join(type(x).__name__ for x in law.barriers))
+    if law.reading:
+        parts.append(f"reading {law.reading}")
     return ", ".join([*parts, f"observer {type(scenario.observer).__name__}"])
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 from iblf_jax.control.controllers import LawContext, Saturated
-from iblf_jax.control.controllers._base import law_member, layers_with_states
+from iblf_jax.control.controllers._base import layers_with_states
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.simulation.scenario import Scenario
 
@@ -19,7 +19,7 @@ def covers_limit(scenario: Scenario) -> bool:
     outer: Any = scenario.controller
     if not isinstance(outer, Saturated) or not outer.has_auxiliary:
         return False
-    return outer.law is unwrapped(outer) and bool(law_member(outer.law, "takes_shift"))
+    return outer.law is unwrapped(outer) and outer.law.takes_shift
 
 
 def inner_state(scenario: Scenario, state: Any) -> Any:

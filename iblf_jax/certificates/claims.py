@@ -47,16 +47,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.certificates.optional import optional_member
 from iblf_jax.control.actuators import Ideal
 from iblf_jax.control.controllers import (
     AdaptiveParameters,
     Backstepping,
+    Controller,
     FullState,
     LyapunovLaw,
     Saturated,
 )
-from iblf_jax.control.controllers._base import law_member
 from iblf_jax.control.observers import Momentum, Printed
 from iblf_jax.core import checks, programs
 from iblf_jax.core.pytree import layers, unwrapped
@@ -122,7 +121,7 @@ def claims_of(scenario: Scenario) -> Claims:
     """
     law: Any = unwrapped(scenario.controller)
     no_theorem = why_no_theorem(scenario)
-    weight = optional_member(law, "weight")
+    weight = law.weight
     is_corrected = isinstance(law, Backstepping) and law.reading == "corrected"
     why_no_weights = "the claim with weights is about the corrected law with a momentum observer"
     if is_corrected and isinstance(scenario.observer, Momentum) and not no_theorem:
@@ -169,7 +168,7 @@ def why_excluded(scenario: Scenario) -> str:
     """What excludes instants from the claims about the law inside its wrappers, in words."""
     changing = []
     for law in layers(scenario.controller)[:-1]:
-        if law_member(law, "has_auxiliary"):
+        if law.has_auxiliary:
             changing.append(f"the auxiliary state of {type(law).__name__}")
         elif not isinstance(law, Saturated | AdaptiveParameters):
             changing.append(type(law).__name__)
@@ -206,7 +205,7 @@ def decay_phi(law: FullState, gain: Any = None) -> jax.Array | None:
 
 def _decay_of(barrier: Any, gain: jax.Array) -> jax.Array | None:
     """Decay rate that a barrier states for a gain, (n,) [1/s], or None."""
-    stated = optional_member(barrier, "decay_rate")
+    stated = barrier.decay_rate
     return None if stated is None else stated(gain)
 
 
@@ -342,17 +341,32 @@ def own_claim(scenario: Scenario) -> LyapunovLaw | None:
       ValueError: a law that states half of a claim.
     """
     law: Any = scenario.controller
-    while isinstance(law, Saturated) and optional_member(law, "lyapunov") is None:
+    while isinstance(law, Saturated) and not stated_methods(law):
         law = law.law
-    missing = [name for name in OWN_CLAIM_METHODS if optional_member(law, name) is None]
-    if len(missing) == len(OWN_CLAIM_METHODS):
+    stated = stated_methods(law)
+    if not stated:
         return None
+    missing = [name for name in OWN_CLAIM_METHODS if name not in stated]
     if missing:
-        stated = next(name for name in OWN_CLAIM_METHODS if name not in missing)
-        what = f"{type(law).__name__} with {stated} and without {missing[0]}"
+        what = f"{type(law).__name__} with {stated[0]} and without {missing[0]}"
         remedy = "See iblf_jax.controllers.LyapunovLaw."
         raise checks.fail("controller", what, "both methods, or neither", remedy)
     return law
+
+
+def stated_methods(law: Controller) -> list[str]:
+    """The methods among `lyapunov` and `decay` that a law has."""
+    kind = type(law)
+    are_own = (
+        kind.lyapunov is not Controller.lyapunov,
+        kind.decay is not Controller.decay,
+    )
+    return [name for name, is_own in zip(OWN_CLAIM_METHODS, are_own, strict=True) if is_own]
+
+
+def states_disturbance_terms(law: Controller) -> bool:
+    """Whether a law states the T of its own claim."""
+    return type(law).disturbance_terms is not Controller.disturbance_terms
 
 
 def _why_no_own_claim(scenario: Scenario) -> str:
@@ -360,7 +374,7 @@ def _why_no_own_claim(scenario: Scenario) -> str:
     if own_claim(scenario) is not None:
         return ""
     inner, outer = unwrapped(scenario.controller), scenario.controller
-    if optional_member(inner, "lyapunov") is not None:
+    if stated_methods(inner):
         wrapper = type(outer).__name__
         return f"; the claim that it states of itself does not cover the {wrapper} that wraps it"
     return ", and states none of its own (controllers.LyapunovLaw)"

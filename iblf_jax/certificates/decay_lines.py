@@ -19,7 +19,6 @@ from iblf_jax.certificates.lines import (
     join_notes,
     not_applicable,
 )
-from iblf_jax.certificates.optional import optional_member
 from iblf_jax.certificates.reconstruction import padded_index
 from iblf_jax.certificates.run_summary import (
     THEOREM,
@@ -217,7 +216,7 @@ def _why_no_bound(segment: Segment, name: str, bounds: dict[str, np.ndarray]) ->
 def xi_bound(scenario: Scenario, t: jax.Array, V: jax.Array) -> jax.Array | None:
     """The barrier's own bound on |xi_i| where w_i V1_i <= V, (T, n), or None if it states none."""
     law: Any = unwrapped(scenario.controller)
-    stated = optional_member(law.barrier, "xi_bound")
+    stated = law.barrier.xi_bound
     if stated is None:
         return None
     return jax.vmap(lambda t, V: stated(V / law.weight, scenario.context.tube(t)))(t, V)
@@ -241,7 +240,7 @@ def _xi2_bound(
     none.
     """
     law: Any = unwrapped(scenario.controller)
-    stated = optional_member(law.velocity_barrier, "xi_bound")
+    stated = law.velocity_barrier.xi_bound
     if stated is None:
         return None
 

@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from iblf_jax.certificates.claims import states_disturbance_terms
 from iblf_jax.certificates.decay_lines import check_steps
 from iblf_jax.certificates.level_terms import LEVEL_TERMS, is_about_levels
 from iblf_jax.certificates.lines import (
@@ -15,13 +16,11 @@ from iblf_jax.certificates.lines import (
     Statement,
     not_applicable,
 )
-from iblf_jax.certificates.optional import optional_member
 from iblf_jax.certificates.proof_terms import GENERAL_TERMS
 from iblf_jax.certificates.run_summary import (
     Segment,
 )
 from iblf_jax.control.actuators import Ideal
-from iblf_jax.control.observers._base import observer_member
 from iblf_jax.core import checks
 
 TORQUE_OF_ESTIMATES = " + dV/dq' . M0^-1 (tau(x_hat) - tau(x))"
@@ -50,13 +49,13 @@ def _why_not_with_estimates(scenario: Any, law: Any) -> str:
     The claim is about a measured state.  For a law of robots without a state of its own and with
     the general T, the error of the estimates acts through the torque alone, which T then contains.
     """
-    if observer_member(scenario.observer, "complete") is None:
+    if not scenario.observer.completes:
         return ""
     kind = type(scenario.observer).__name__
     about = f"the law's own claim is about a measured state, and {kind} estimates levels"
     if is_about_levels(scenario):
         return about
-    if optional_member(law, "disturbance_terms") is not None:
+    if states_disturbance_terms(law):
         return f"{about}; the T that the law states does not contain their error"
     start = jax.eval_shape(law.init, scenario.initial.q, scenario.initial.dq, scenario.context)
     if jax.tree.leaves(start):
@@ -75,10 +74,10 @@ def own_segment_lines(segment: Segment) -> list[Line]:
     if law is None:
         return []
     own = proof.own
-    states_terms = optional_member(law, "disturbance_terms") is not None
+    states_terms = states_disturbance_terms(law)
     general = LEVEL_TERMS if is_about_levels(summary.run.scenario) else GENERAL_TERMS
     right_side = "what the law states" if states_terms else general
-    if observer_member(summary.run.scenario.observer, "complete") is not None:
+    if summary.run.scenario.observer.completes:
         right_side += TORQUE_OF_ESTIMATES
     decay = "W >= 0: the decay that the law states"
     inequality = f"V' <= -W + T,  T: {right_side}"

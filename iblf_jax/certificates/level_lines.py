@@ -21,7 +21,6 @@ from iblf_jax.certificates.lines import (
     not_applicable,
     verdict_of,
 )
-from iblf_jax.certificates.optional import optional_member
 from iblf_jax.certificates.run_summary import Segment
 from iblf_jax.certificates.theorem_lines import (
     REFERENCE_INSIDE,
@@ -30,7 +29,6 @@ from iblf_jax.certificates.theorem_lines import (
     with_status,
 )
 from iblf_jax.control.observers import NoObserver
-from iblf_jax.control.observers._base import observer_member
 from iblf_jax.core import checks
 from iblf_jax.core.status import Status
 from iblf_jax.core.units import Unit, of_component, per_second
@@ -207,7 +205,7 @@ def _estimate(segment: Segment) -> Line:
     observer = summary.run.scenario.observer
     if isinstance(observer, NoObserver):
         return not_applicable(ESTIMATE, "there is no observer: d_hat = 0 and d_tilde = d")
-    if observer_member(observer, "error_gain") is None:
+    if observer.error_gain is None:
         kind = type(observer).__name__
         return not_applicable(ESTIMATE, f"{NO_ESTIMATE} ({kind})")
     if summary.why_invalid:
@@ -322,7 +320,7 @@ def error_bounds(segment: Segment, V: np.ndarray) -> np.ndarray:
             continue
         k_l, k_u = claim.k_l[:, i], claim.k_u[:, i]
         tube = Tube(zero, zero, -k_l, k_u, zero, zero)
-        stated = optional_member(barrier, "xi_bound")(level, tube)
+        stated = barrier.xi_bound(level, tube)
         if stated is None:
             stated = np.full_like(zero, np.nan)
         rows.append(np.asarray(stated))

@@ -19,13 +19,11 @@ import numpy as np
 
 from iblf_jax.certificates.claims import adaptive_law, own_claim, why_excluded
 from iblf_jax.certificates.lines import join_notes
-from iblf_jax.certificates.optional import optional_member
 from iblf_jax.certificates.proof_terms import DECAY_ROUNDING
 from iblf_jax.certificates.reconstruction import Steps, TimeGrid, check_status, is_valid
 from iblf_jax.certificates.run_summary import Decay
 from iblf_jax.control.actuators import Ideal
 from iblf_jax.control.controllers import BarrierBackstepping
-from iblf_jax.control.observers._base import observer_member
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.status import UNTRUSTED, describe
@@ -133,11 +131,11 @@ def level_claims_of(scenario: Scenario) -> LevelClaims:
     rates, is_exact = np.zeros((0, scenario.n)), False
     if not why_not:
         stated = [
-            np.broadcast_to(optional_member(barrier, "decay_rate")(k), scenario.n)
+            np.broadcast_to(barrier.decay_rate(k), scenario.n)
             for barrier, k in zip(law.barriers, law.k, strict=True)
         ]
         rates = np.stack(stated)
-        is_exact = all(optional_member(barrier, "exact_decay") for barrier in law.barriers)
+        is_exact = all(barrier.exact_decay for barrier in law.barriers)
     return LevelClaims(law, why_not, is_exact, rates, own_claim(scenario))
 
 
@@ -150,10 +148,10 @@ def why_no_level_claim(scenario: Scenario) -> str:
     if adaptive_law(scenario) is not None:
         return "(S.3) is about a constant model, and AdaptiveParameters changes it"
     for i, (barrier, k) in enumerate(zip(law.barriers, law.k, strict=True)):
-        if optional_member(barrier, "decay_rate")(k) is None:
+        if barrier.decay_rate(k) is None:
             kind = type(barrier).__name__
             return f"the barrier {kind} of level {i + 1} states no decay rate of its V"
-    if observer_member(scenario.observer, "complete") is not None:
+    if scenario.observer.completes:
         kind = type(scenario.observer).__name__
         return f"(S.3) is about a measured state, and the law receives levels that {kind} estimates"
     if not isinstance(scenario.actuator, Ideal):

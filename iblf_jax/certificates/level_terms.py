@@ -11,12 +11,12 @@ for any observer, because the law replaces x' by the flow of the model with the 
 the estimate.  dV/dx contains w_i s_i in level i, and dV_i/dalpha_{i-1} times the derivatives of
 alpha_{i-1} in the levels below it; dV_i/dalpha_{i-1} is taken at fixed x_i and t, so that it moves
 the error and the tube.  An observer with d_tilde' = d' - kappa d_tilde has d_hat' = kappa d_tilde
-(`observer_member`, "error_gain"), which is checked by itself.  Without an observer d_hat = 0 and
+(`Observer.error_gain`), which is checked by itself.  Without an observer d_hat = 0 and
 d_tilde = d.  A torque observer of the robot inside the plant gives f_hat, which is held, while
 d_hat = M0^-1 f_hat in the second level is not: T has dV/df_hat . f_hat' then, and
 f_hat' = kf f_tilde.
 
-For barriers that decay exactly (`barrier_member`, "exact_decay"), (S.3) is an equality.
+For barriers that decay exactly (`Barrier.exact_decay`), (S.3) is an equality.
 
 With filters, beta_i takes the place of alpha_i in the errors and its rate is known exactly, so that
 T = sum w_i s_i . d_tilde_i + sum w_i s_i . G_i (beta_i - alpha_i).  The last sum is the effect of
@@ -39,13 +39,11 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 from iblf_jax.certificates.auxiliary import covers_limit, inner_context, inner_state
-from iblf_jax.certificates.claims import adaptive_law, own_claim
-from iblf_jax.certificates.optional import optional_member
+from iblf_jax.certificates.claims import adaptive_law, own_claim, states_disturbance_terms
 from iblf_jax.certificates.proof_terms import TORQUE_ROUNDING, OwnTerms
 from iblf_jax.control.controllers import BarrierBackstepping
-from iblf_jax.control.controllers._base import decay_of, law_member
+from iblf_jax.control.controllers._base import decay_of
 from iblf_jax.control.decays._base import gain_at
-from iblf_jax.control.observers._base import observer_member
 from iblf_jax.core.linalg import solve_spd
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, plant_input
@@ -128,7 +126,7 @@ def is_about_levels(scenario: Scenario) -> bool:
     """Whether the law of a scenario receives the levels of the plant, so that (S.3), and not
     Theorem 2, is the claim to check.
     """
-    return bool(law_member(unwrapped(scenario.controller), "receives_x"))
+    return bool(unwrapped(scenario.controller).receives_x)
 
 
 def level_terms_at(scenario: Scenario, t: jax.Array, state: LoopState) -> LevelTerms:
@@ -282,12 +280,12 @@ def _claim_terms(
         w, x = law.weights[i], at.x[i]
         # The claim holds for the gain of the instant, which a decay makes a function of t and V_i.
         gain = gain_at(decay_of(law, i), at.t, law.k[i], barrier, tube, x)
-        stated = optional_member(barrier, "decay_rate")(gain)
+        stated = barrier.decay_rate(gain)
         if stated is not None:
             decay += jnp.sum(w * stated * barrier.value(tube, x))
         by_slopes += jnp.sum(law.c[i] * level.slope**2 / w)
         xi = _relative_error(scenario, i, tube, x)
-        gap = _gap(xi, optional_member(barrier, "guard"))
+        gap = _gap(xi, barrier.guard)
         gaps.append(gap)
         size += jnp.sum(jnp.abs(level.slope) / gap * (jnp.abs(tube.dq_d) + gain * jnp.abs(x)))
         near = jnp.abs(x) + jnp.abs(tube.q_d)
@@ -354,7 +352,7 @@ def _gap(xi: jax.Array, guard: float) -> jax.Array:
 
 def _ratio_at_centre(barrier: Any, tube: Tube) -> jax.Array:
     """e/s at e = 0, (n,); that of k^2/2 for a barrier without one."""
-    stated = optional_member(barrier, "error_over_slope")(tube, tube.q_d)
+    stated = barrier.error_over_slope(tube, tube.q_d)
     if stated is None:
         return 0.5 * jnp.minimum(tube.k_l, tube.k_u) ** 2
     return stated  # type: ignore[no-any-return]
@@ -381,7 +379,7 @@ def _estimate_error(
 ) -> tuple[jax.Array, jax.Array]:
     """The error of d_hat' = kappa d_tilde and the size of its terms; 0 without a stated kappa."""
     zero = jnp.zeros_like(at.estimate)
-    kappa = observer_member(scenario.observer, "error_gain")
+    kappa = scenario.observer.error_gain
     if kappa is None:
         return zero, zero
     x = at.x
@@ -406,7 +404,7 @@ def _own_terms(
     """
     law: Any = own_claim(scenario)
     context = scenario.context._replace(plant=scenario.plant)
-    uses_observer = optional_member(law, "uses_observer")
+    uses_observer = law.uses_observer
 
     def disturbances(t, state):
         state_rate, sample = evaluate(scenario, t, state)
@@ -430,11 +428,10 @@ def _own_terms(
     V, dV = jax.jvp(lyapunov, point, direction)
     decay = jnp.sum(law.decay(*point[:3], context, at.law_state))
     slopes = jax.grad(lyapunov, argnums=(0, 1, 2, 3))(*point)
-    stated = optional_member(law, "disturbance_terms")
-    if stated is None:
-        terms = jnp.sum(slopes[1] * d_tilde) + jnp.sum(slopes[2] * dd)
+    if states_disturbance_terms(law):
+        terms = jnp.sum(law.disturbance_terms(*point[:3], dd, context, at.law_state))
     else:
-        terms = jnp.sum(stated(*point[:3], dd, context, at.law_state))
+        terms = jnp.sum(slopes[1] * d_tilde) + jnp.sum(slopes[2] * dd)
     sizes = _rate_sizes(scenario, at, d, d_tilde, tangent.x)
     products = jax.tree.map(lambda a, b: jnp.sum(jnp.abs(a * b)), slopes, direction)
     size = sum(jax.tree.leaves(products)) + jnp.sum(jnp.abs(slopes[1]) * sizes)

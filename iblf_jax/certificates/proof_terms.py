@@ -41,13 +41,17 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.certificates.auxiliary import covers_limit, inner_state
-from iblf_jax.certificates.claims import adaptive_law, decay_phi, decay_rate, own_claim
-from iblf_jax.certificates.optional import optional_member
+from iblf_jax.certificates.claims import (
+    adaptive_law,
+    decay_phi,
+    decay_rate,
+    own_claim,
+    states_disturbance_terms,
+)
 from iblf_jax.control.controllers import Backstepping, FullState
 from iblf_jax.control.controllers._base import decay_of
-from iblf_jax.control.decays._base import decay_member, energy_gain, gain_at
+from iblf_jax.control.decays._base import energy_gain, gain_at
 from iblf_jax.control.observers import Printed
-from iblf_jax.control.observers._base import observer_member
 from iblf_jax.core.linalg import matvec, solve_spd
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.time import as_at
@@ -330,7 +334,7 @@ def _decay_of_backstepping(scenario: Scenario, t: jax.Array, state: LoopState, M
     decay = jnp.sum(law.weight * stated * law.barrier.value(tube, state.q)) + e2 @ (law.K2 * e2)
     W = 0.5 * e2 @ (M0 @ e2)
     second = decay_of(law, 1)
-    if decay_member(second, "constant"):
+    if second.constant:
         return decay
     return decay + 2.0 * energy_gain(second, t, W, e2) * W
 
@@ -365,12 +369,6 @@ def _full_terms(
 # --- sizes of the terms, for rounding ------------------------------------------------------------
 
 
-def _leaf(part: Any, name: str, default: jax.Array) -> jax.Array:
-    """A leaf that only some laws and observers have."""
-    value = optional_member(part, name)
-    return default if value is None else value
-
-
 def _gap(xi: jax.Array, guard: float) -> jax.Array:
     """Distance to the bound relative to the width of the tube, in [guard, 1]; 1 for a barrier
     without a guard. Relative errors grow by 1/gap near the bound.
@@ -385,10 +383,10 @@ def _term_sizes(
 ) -> tuple[jax.Array, jax.Array]:
     """`dV_size` and `sqrt_V_size` of `ProofTerms`."""
     law, zero = unwrapped(scenario.controller), jnp.zeros_like(state.q)
-    K2 = _leaf(law, "K2", zero)
-    kf = _leaf(scenario.observer, "kf", zero)
-    barrier = optional_member(law, "barrier")
-    gap = _gap(now["xi"], optional_member(barrier, "guard"))
+    K2 = zero if law.K2 is None else law.K2
+    kf = zero if scenario.observer.kf is None else scenario.observer.kf
+    guard = -1.0 if law.barrier is None else law.barrier.guard
+    gap = _gap(now["xi"], guard)
     speeds = jnp.abs(state.dq) + jnp.abs(now["alpha"]) + jnp.abs(now["dq_d"])
     accelerations = jnp.abs(now["ddq"]) + jnp.abs(rates["alpha"])
     torque = (
@@ -416,7 +414,7 @@ def _term_sizes(
         dV_size += _phi_term_sizes(law, scenario, t, state, M0, torque, accelerations)
     tube = scenario.context.tube(t)
     width = jnp.minimum(tube.k_l, tube.k_u)
-    weight = _leaf(law, "weight", jnp.ones_like(width))
+    weight = jnp.ones_like(width) if law.weight is None else law.weight
     V_size = (
         jnp.sum(weight * (jnp.abs(state.q) / (width * gap)) ** 2)
         + speeds @ (jnp.abs(M0) @ speeds)
@@ -463,7 +461,7 @@ def _own_terms(
     own_rate = inner_state(scenario, state_rate.controller)
     df = rates["disturbance"]
     f_tilde, df_tilde = now["disturbance"], df
-    if optional_member(law, "uses_observer"):
+    if law.uses_observer:
         f_tilde = f_tilde - now["disturbance_estimate"]
         df_tilde = df_tilde - rates["disturbance_estimate"]
 
@@ -476,16 +474,15 @@ def _own_terms(
     decay = jnp.sum(law.decay(t, q, dq, f_tilde, context, own_state))
     slopes = jax.grad(lyapunov, argnums=(0, 1, 2, 3, 4))(*point)
     M0 = scenario.model.mass_matrix(q)
-    stated = optional_member(law, "disturbance_terms")
-    if stated is None:
+    if states_disturbance_terms(law):
+        terms = jnp.sum(law.disturbance_terms(t, q, dq, f_tilde, df, context, own_state))
+    else:
         terms = slopes[2] @ solve_spd(M0, f_tilde) + slopes[3] @ df
-        if observer_member(scenario.observer, "complete") is not None:
+        if scenario.observer.completes:
             # The law received estimates: what that changes of the torque acts like f_tilde.
             f_hat = now["disturbance_estimate"]
             command, _ = law.command(t, q, dq, f_hat, context, state.controller)
             terms += slopes[2] @ solve_spd(M0, now["tau"] - command.tau)
-    else:
-        terms = jnp.sum(stated(t, q, dq, f_tilde, df, context, own_state))
     size = _own_term_sizes(M0, slopes, tangent, now) + jnp.abs(decay) + jnp.abs(terms)
     limited = jnp.zeros((), bool)
     if law is not scenario.controller:

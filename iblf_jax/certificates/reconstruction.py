@@ -27,9 +27,9 @@ import numpy as np
 from iblf_jax.certificates.level_terms import is_about_levels, level_terms_and_sample
 from iblf_jax.certificates.proof_terms import ProofTerms, mass_over_gain, terms_and_sample
 from iblf_jax.core import checks
-from iblf_jax.core.optional import attributes
+from iblf_jax.core.attributes import attributes
 from iblf_jax.core.status import UNTRUSTED, Status, describe, has_flag
-from iblf_jax.engine import step_states
+from iblf_jax.engine import Step, step_states
 from iblf_jax.simulation import discontinuities
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state
 from iblf_jax.simulation.scenario import Scenario
@@ -202,7 +202,7 @@ class Position(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class ObserveStep:
+class ObserveStep(Step):
     """A step of the engine that keeps its position and records the proof terms there."""
 
     terms: Callable = terms_and_sample
@@ -216,7 +216,7 @@ class ObserveStep:
 
 
 @dataclasses.dataclass(frozen=True)
-class AdvanceStep:
+class AdvanceStep(Step):
     """A step of the engine that makes the run's own step, of any size, and records the state, V2
     and |f_tilde|^2/2 before it.
     """

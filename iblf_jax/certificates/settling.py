@@ -34,12 +34,11 @@ import numpy as np
 
 from iblf_jax.certificates.decay_lines import check_steps
 from iblf_jax.certificates.lines import Line, Statement, not_applicable
-from iblf_jax.certificates.optional import optional_member
 from iblf_jax.certificates.run_summary import ENERGY_ROUNDING, Segment
 from iblf_jax.control.actuators import Ideal
 from iblf_jax.control.controllers import Backstepping, BarrierBackstepping, FullState
 from iblf_jax.control.controllers._base import decay_of
-from iblf_jax.control.decays._base import decay_member, energy_gain
+from iblf_jax.control.decays._base import energy_gain
 from iblf_jax.core import checks, programs
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.simulation.scenario import Scenario
@@ -86,7 +85,7 @@ def has_settling_claim(scenario: Scenario) -> bool:
         return False
     if any(part.rate(part.gain) is None for part in parts_of(law)):
         return False
-    return any(not decay_member(decay, "constant") for decay in law.decays)
+    return any(not decay.constant for decay in law.decays)
 
 
 def parts_of(law: Any) -> list[Part]:
@@ -94,14 +93,14 @@ def parts_of(law: Any) -> list[Part]:
     if isinstance(law, BarrierBackstepping):
         rows = zip(law.barriers, law.k, law.weights, strict=True)
         return [
-            Part(decay_of(law, i), k, w, optional_member(barrier, "decay_rate"))
+            Part(decay_of(law, i), k, w, barrier.decay_rate)
             for i, (barrier, k, w) in enumerate(rows)
         ]
-    rate = optional_member(law.barrier, "decay_rate")
+    rate = law.barrier.decay_rate
     first = Part(decay_of(law, 0), law.k1, law.weight, rate)
     if isinstance(law, Backstepping):
         return [first]
-    rate = optional_member(law.velocity_barrier, "decay_rate")
+    rate = law.velocity_barrier.decay_rate
     return [first, Part(decay_of(law, 1), law.K2, jnp.ones_like(law.K2), rate)]
 
 
@@ -300,11 +299,11 @@ def _band(law: Any) -> float:
     """The least w_j band_j of the decays that state a band; infinite if none does."""
     found = [np.inf]
     for part in parts_of(law):
-        stated = decay_member(part.decay, "band")()
+        stated = part.decay.band()
         if stated is not None:
             found.append(float(np.min(np.asarray(part.weight * stated))))
     if isinstance(law, Backstepping):
-        stated = decay_member(decay_of(law, 1), "band")()
+        stated = decay_of(law, 1).band()
         if stated is not None:
             found.append(float(np.min(np.asarray(stated))))
     return min(found)
@@ -312,7 +311,7 @@ def _band(law: Any) -> float:
 
 def _deadline(law: Any) -> float:
     """The latest time of the decays that state one [s]; infinite if none does."""
-    stated = [decay_member(decay, "deadline")() for decay in law.decays]
+    stated = [decay.deadline() for decay in law.decays]
     times = [float(np.max(np.asarray(time))) for time in stated if time is not None]
     return max(times, default=np.inf)
 

@@ -28,7 +28,6 @@ from iblf_jax.certificates.lines import (
     not_applicable,
     verdict_of,
 )
-from iblf_jax.certificates.optional import optional_member
 from iblf_jax.certificates.run_summary import THEOREM, RunSummary, Segment
 from iblf_jax.control.observers import Momentum
 from iblf_jax.core.status import Status
@@ -217,7 +216,7 @@ def _why_law_is_exact(summary: RunSummary) -> str:
     """Why the proof drops no term of the law; "" if it drops one."""
     if summary.claims.bounds_velocities:
         return "the claim is exact: C0 q' is cancelled, and e2 weighed without M0"
-    if optional_member(summary.claims.law, "reading") == "corrected":
+    if summary.claims.law.reading == "corrected":
         return "the claim is exact: the law uses C0 alpha"
     return ""
 

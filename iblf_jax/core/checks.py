@@ -12,7 +12,6 @@ import dataclasses
 import difflib
 import errno
 import functools
-import inspect
 import math
 import numbers
 import os
@@ -26,8 +25,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.core.attributes import has_members, missing_members
 from iblf_jax.core.devices import default_devices, platform
-from iblf_jax.core.optional import has_members, missing_members
+from iblf_jax.core.families import adopt, required_members
 
 F = TypeVar("F", bound=Callable)
 
@@ -414,23 +414,28 @@ def one_of(name: str, value: Any, allowed: Any) -> None:
         raise fail(name, value, "one of " + ", ".join(repr(x) for x in allowed))
 
 
+PUBLIC_MODULES = {
+    "iblf_jax.simulation.metrics": "iblf_jax.metrics",
+    "iblf_jax.tuning.quantities": "iblf_jax.objectives",
+}
+"""Module with the base class of a family -> where users find it."""
+
+
 def conforms(
-    name: str, value: Any, protocol: type, remedy: str = "", optional: tuple[str, ...] = ()
+    name: str, value: Any, base: type, remedy: str = "", optional: tuple[str, ...] = ()
 ) -> None:
-    """Raises unless `value` is an object that JAX can flatten and that has the members of
-    `protocol`, those in `optional` excepted.
+    """Raises unless `value` is an object that JAX can flatten and that has what the family `base`
+    requires; its class is then adopted by the family.
     """
-    declared = {*vars(protocol), *inspect.get_annotations(protocol)} - {*optional}
-    members = sorted(x for x in declared if not x.startswith("_"))
-    public = protocol.__module__.removesuffix("._base").replace(
-        "iblf_jax.simulation.metrics", "iblf_jax.metrics"
-    )
-    expected = f"a component that fits {public}.{protocol.__name__}"
+    module = base.__module__
+    public = PUBLIC_MODULES.get(module, module.removesuffix("._base"))
+    expected = f"a component that fits {public}.{base.__name__}"
     if isinstance(value, type):
         raise fail(name, value, expected, "It is a class: make an instance, with brackets.")
     if _is_plain(value):
         raise fail(name, value, expected, remedy)
-    offers(name, value, members, expected, remedy)
+    required = [x for x in required_members(base) if x not in optional]
+    offers(name, value, required, expected, remedy)
     fields = vars(value) if has_members(value, "__dict__") else {}
     for field, part in fields.items():
         flat_enough(f"{name}.{field}", part)
@@ -441,6 +446,7 @@ def conforms(
     if any(leaf is value for leaf in leaves):
         remedy = "JAX does not know its class: decorate it with iblf_jax.component."
         raise fail(name, value, expected, remedy)
+    adopt(type(value), base)
 
 
 def _is_plain(value: Any) -> bool:

@@ -18,8 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks, modules
+from iblf_jax.core.families import statements_of
 from iblf_jax.core.modules import NUMBERS, RowName
-from iblf_jax.core.pytree import component_member, field_values, wrapped_field
+from iblf_jax.core.pytree import field_values, wrapped_field
 
 BARE = r"[^\[\]]*[^\W\d_][^\[\]]*"
 """The name of a row that needs no quotes."""
@@ -106,7 +107,7 @@ def steps_of(part: Any, tokens: list[str | int]) -> tuple[list[str | int], list[
         raise KeyError(token)
     if has_field(part, token):
         return [token], tokens[1:]
-    rows = component_member(type(part), "rows")
+    rows = statements_of(part).named_rows
     if token in rows:
         names, fields = rows[token]
         row, field = tokens[1:3]
@@ -114,7 +115,7 @@ def steps_of(part: Any, tokens: list[str | int]) -> tuple[list[str | int], list[
             raise KeyError(field)
         index = row if isinstance(row, int) else vars(part)[names].index(row)
         return [field, index], tokens[3:]
-    stacked = component_member(type(part), "stacked")
+    stacked = statements_of(part).stacked
     if token in stacked:
         row = tokens[1]
         if not isinstance(row, int):

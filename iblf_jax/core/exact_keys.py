@@ -42,6 +42,8 @@ MARSHAL_VERSION = 2
 NOT_BEHAVIOUR = {
     *("__module__", "__qualname__", "__doc__", "__dict__", "__weakref__", "__annotations__"),
     *("__firstlineno__", "__static_attributes__"),
+    # of abstract base classes
+    *("_abc_impl", "__abstractmethods__"),
     # of dataclasses
     *("__dataclass_fields__", "__dataclass_params__", "__match_args__", "__init__", "__repr__"),
     *("__setattr__", "__delattr__", "__replace__"),

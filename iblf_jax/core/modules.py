@@ -23,8 +23,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.core.attributes import has_members
 from iblf_jax.core.exact_keys import exact_key
-from iblf_jax.core.optional import has_members
 
 NUMBERS = (jax.Array, np.ndarray, np.generic, float, int)
 """Types of leaves."""

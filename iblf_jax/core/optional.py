@@ -1,5 +1,4 @@
-"""Access to members by name: optional members of a protocol with their defaults, and groups of
-attributes.
+"""Access to the optional members of a protocol, with their defaults.
 
 Classes that users write may leave out some attributes and methods of a protocol.  Each family
 declares these once, with their defaults, as an `OptionalMembers` beside its protocol; the rest of
@@ -8,12 +7,11 @@ the package reads them through it and never by `getattr` with a default of its o
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Any
 
 
 class OptionalMembers:
-    """Reads the optional members of a family: `law_member(law, "uses_observer")`.
+    """Reads the optional members of a family: `law.uses_observer`.
 
     Args:
       defaults: name of a member -> its value for a class that does not have it.
@@ -39,18 +37,3 @@ class OptionalMembers:
         """
         found = self(part, name)
         return part if found is None else found
-
-
-def attributes(part: Any, names: Iterable[str]) -> dict[str, Any]:
-    """Name -> value of these attributes of an object."""
-    return {name: getattr(part, name) for name in names}
-
-
-def missing_members(part: Any, names: Iterable[str]) -> list[str]:
-    """The names of which an object has no attribute and no method."""
-    return [name for name in names if not hasattr(part, name)]
-
-
-def has_members(part: Any, *names: str) -> bool:
-    """Whether an object has all of these attributes and methods."""
-    return not missing_members(part, names)

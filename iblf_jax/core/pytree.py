@@ -20,36 +20,22 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import inspect
 import operator
 from collections.abc import Callable
-from types import MappingProxyType
 from typing import Any, TypeAlias, TypeVar, dataclass_transform
 
 import jax
 
 from iblf_jax.core import checks, modules
 from iblf_jax.core.exact_keys import behaviour_of, key_of_fields
-from iblf_jax.core.optional import OptionalMembers, has_members
+from iblf_jax.core.families import Default, Part, adopt, statements_of
 
 T = TypeVar("T")
 
 Leaf: TypeAlias = Any
 """Type of a field declared with `leaf`: a number, a list or an array when a person writes it, a
 `jax.Array` from then on."""
-
-component_member = OptionalMembers(
-    wraps=None,
-    rows=MappingProxyType({}),
-    stacked=MappingProxyType({}),
-    leaf_units=dict,
-    own_joints=MappingProxyType({}),
-    symbols_of_part=lambda field, index, symbols: symbols,
-)
-"""Reads what a component may declare: the field that holds a wrapped component, rows with names,
-names for several leaves as the rows of one array, a function of the units of leaves that depend on
-other fields, the number of joints of parts (field -> number) whose number differs from that of the
-scenario, and a function of the units of the symbols in its parts, `symbols_of_part(field, index,
-symbols)`."""
 
 
 def leaf(
@@ -81,10 +67,16 @@ def component(cls: type[T]) -> type[T]:
     """Class decorator that makes a frozen dataclass a component (see the head of this module).
 
     A class may define `check(self)`, called once after construction, to raise ValueError when
-    fields do not fit together.
+    fields do not fit together; `Part` lists what else it may state.
+
+    Raises:
+      ValueError: fields that Python refuses, or a class that inherits from the base class of a
+        family and lacks a method that the family requires.
     """
     if not isinstance(cls, type):
         raise checks.fail("component", cls, "a class", "Write @iblf_jax.component above it.")
+    adopt(cls, Part)
+    _keep_required(cls)
     has_own_init = "__init__" in vars(cls)
     try:
         cls = dataclasses.dataclass(frozen=True, eq=False)(cls)
@@ -93,6 +85,19 @@ def component(cls: type[T]) -> type[T]:
             "component", cls, "a class of annotated fields, those with defaults last", f"{error}."
         ) from error
     fields = dataclasses.fields(cls)  # type: ignore[arg-type]
+    if inspect.isabstract(cls):
+        # A field takes the place of a property that a base class requires.
+        cls.__abstractmethods__ -= {field.name for field in fields}  # type: ignore[attr-defined]
+        missing = sorted(cls.__abstractmethods__)  # type: ignore[attr-defined]
+        if missing:
+            lacks = f"It lacks {', '.join(missing)}."
+            raise checks.fail("component", cls, "a complete class", lacks)
+    for field in fields:
+        name = field.name
+        if isinstance(inspect.getattr_static(cls, name, None), property):
+            # It would hide the values of the field.
+            base = next(x for x in cls.__mro__ if name in vars(x))
+            setattr(cls, name, Default(base, name))
     dataclass_init = cls.__init__
 
     @functools.wraps(dataclass_init)
@@ -110,13 +115,23 @@ def component(cls: type[T]) -> type[T]:
                 checks.structural(cls.__name__, field.name, value)
             else:
                 object.__setattr__(self, field.name, _as_leaf_or_module(cls, field, value))
-        if has_members(self, "check"):
-            self.check()
+        self.check()
         _note_modules(self)
 
     cls.__init__ = checked_init  # type: ignore[method-assign]
 
     return register_component(cls)
+
+
+def _keep_required(cls: type) -> None:
+    """Marks the fields without a value as such where a base class, which is no dataclass, has a
+    default of the same name.
+    """
+    inherited = getattr(cls, "__dataclass_fields__", {})
+    for name, kind in inspect.get_annotations(cls).items():
+        is_field = "ClassVar" not in str(kind)
+        if is_field and name not in vars(cls) and name not in inherited and hasattr(cls, name):
+            setattr(cls, name, dataclasses.field())
 
 
 def _as_leaf_or_module(cls: type, field: dataclasses.Field, value: Any) -> Any:
@@ -249,7 +264,7 @@ def layers(part: Any) -> list[Any]:
 
 def wrapped_field(part: Any) -> str | None:
     """The name of the field that holds the wrapped component; None if there is none."""
-    return component_member(type(part), "wraps")
+    return statements_of(part).wraps
 
 
 def unwrapped(part: Any) -> Any:

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.core import checks
-from iblf_jax.core.optional import has_members
+from iblf_jax.core.attributes import has_members
 
 T = TypeVar("T")
 

@@ -17,7 +17,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.control.sensors import Ideal, Levels, Measurement
-from iblf_jax.control.sensors._base import sensor_member
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.engine import LOWERING_LIMITS
@@ -216,7 +215,7 @@ def velocity_filters(scenario: Scenario) -> list[VelocityFilter]:
     parts = [(0, scenario.sensor)]
     if isinstance(scenario.sensor, Levels):
         parts = [(span.levels.start, span.part) for span in scenario.sensor.spans()]
-    filters = [VelocityFilter(row + 1, sensor_member(part, "velocity")) for row, part in parts]
+    filters = [VelocityFilter(row + 1, part.velocity) for row, part in parts]
     return [x for x in filters if x.velocity is not None and x.row < order]
 
 
@@ -227,8 +226,8 @@ def _check_sensor(scenario: Scenario) -> None:
         spans = enumerate(scenario.sensor.spans())
         parts = {f"scenario.sensor.parts[{i}]": span.part for i, span in spans}
     for name, part in parts.items():
-        has_level = sensor_member(part, "levels") == 1
-        if has_level or isinstance(part, Ideal) or sensor_member(part, "velocity") is not None:
+        has_level = part.levels == 1
+        if has_level or isinstance(part, Ideal) or part.velocity is not None:
             continue
         expected = "one with a field `velocity`, sensors.Levels or sensors.Ideal()"
         remedy = "The velocity filter computes q' from q."

@@ -21,7 +21,7 @@ import numpy as np
 from iblf_jax.control.actuators import Ideal
 from iblf_jax.control.actuators.delay import WHOLE_TOLERANCE
 from iblf_jax.core import checks, notices
-from iblf_jax.core.optional import attributes
+from iblf_jax.core.attributes import attributes
 from iblf_jax.core.progress import announced
 from iblf_jax.core.status import Status
 from iblf_jax.core.time import as_at

@@ -18,7 +18,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.control.actuators import Ideal
-from iblf_jax.control.actuators._base import input_delay
 from iblf_jax.core import checks, notices, taylor
 from iblf_jax.core.progress import announced
 from iblf_jax.core.pytree import astype
@@ -212,7 +211,7 @@ def _without_parts_of_the_plant(scenario: Scenario) -> Scenario:
     The program of a law ends with its command; the noise acts on the plant, and the delay belongs
     to the computer that runs the law.
     """
-    if input_delay(scenario.actuator) is not None:
+    if scenario.actuator.input_delay is not None:
         scenario = dataclasses.replace(scenario, actuator=Ideal())
     return dataclasses.replace(scenario, process_noise=None)
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.core.optional import attributes
+from iblf_jax.core.attributes import attributes
 from iblf_jax.deployment.control_law import as_floats, of_floats, program_of
 from iblf_jax.deployment.signal_units import one_unit, rate_units
 from iblf_jax.engine.carry import Inputs, StepOptions, start

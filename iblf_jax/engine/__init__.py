@@ -14,6 +14,7 @@ import from here; `simulate`, `explain`, `recommended_period` and the step sizes
 their own.
 """
 
+from iblf_jax.engine.carry import Step as Step
 from iblf_jax.engine.compile import BackendWarning as BackendWarning
 from iblf_jax.engine.derivatives import Outer as Outer
 from iblf_jax.engine.derivatives import Tangents as Tangents

@@ -33,6 +33,7 @@ from iblf_jax.engine.batch import Batch, carry_shapes, finalize, initialize
 from iblf_jax.engine.carry import (
     Carry,
     Inputs,
+    Step,
     StepOptions,
     keep_if,
     start_without_accuracy,
@@ -80,7 +81,7 @@ class Form(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class RecordingStep:
+class RecordingStep(Step):
     """A step that records the carry before it, as one vector of floats."""
 
     step: TimeStep
@@ -102,7 +103,7 @@ class Adjoint(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class AdjointStep:
+class AdjointStep(Step):
     """The adjoint of a step of one run.  The first one is that of the last instant.
 
     A run that diverges keeps its last valid state.  The derivatives of a step that it does not make

@@ -5,12 +5,12 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.core.optional import OptionalMembers
 from iblf_jax.engine.metric_folds import begun
 from iblf_jax.simulation import error_estimate, error_growth, stability
 from iblf_jax.simulation.closed_loop import (
@@ -70,8 +70,12 @@ class StepOptions(NamedTuple):
     """Whether the step becomes a scalar program, in which equal numbers are computed once."""
 
 
-step_member = OptionalMembers(is_derivative=False)
-"""Optional members of a step: whether it computes derivatives."""
+class Step:
+    """A step of a run (head of `engine.time_step`), or of its derivatives."""
+
+    is_derivative: ClassVar[bool] = False
+    """Whether it computes derivatives."""
+    __call__: Callable[..., tuple[Any, Any]]
 
 
 def keep_if(condition, new, old):

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.engine.batch import Batch, Leaves, StepLoop, run_step
-from iblf_jax.engine.carry import Carry, Inputs, StepOptions, start_without_accuracy
+from iblf_jax.engine.carry import Carry, Inputs, Step, StepOptions, start_without_accuracy
 from iblf_jax.engine.derivatives import (
     Directions,
     Tangents,
@@ -85,7 +85,7 @@ def numbers_of(inputs: Inputs, record: Callable) -> int:
 
 
 @dataclasses.dataclass(frozen=True)
-class TangentStep:
+class TangentStep(Step):
     """A step and its derivative along the direction of each entry of `places`."""
 
     step: TimeStep

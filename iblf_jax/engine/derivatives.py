@@ -47,17 +47,16 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from iblf_jax.core.optional import attributes
+from iblf_jax.core.attributes import attributes
 from iblf_jax.engine import thresholds
 from iblf_jax.engine.batch import Batch, StepLoop, finalize, initialize
-from iblf_jax.engine.carry import Carry, Inputs, StepOptions
+from iblf_jax.engine.carry import Carry, Inputs, Step, StepOptions
 from iblf_jax.engine.metric_folds import finished, split_floats
 from iblf_jax.engine.outcome import Outcome
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.time_step import Advanced, advance
 from iblf_jax.simulation import error_estimate
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
-from iblf_jax.simulation.metrics import fold_member
 from iblf_jax.simulation.paths import get, with_parameters
 from iblf_jax.simulation.signals import Sample
 
@@ -269,15 +268,14 @@ def preaccumulated(scenario, directions: Directions, eps: jax.Array) -> Callable
 
 def count_curvatures(folds: Any) -> int:
     """How many curvature matrices the folds have."""
-    return sum(fold_member(fold, "curvatures") for fold in folds)
+    return sum(fold.curvatures for fold in folds)
 
 
 def outers_of(folds, accumulators, sample) -> tuple[Outer, ...]:
     """What a sample adds to the curvature matrices of the folds that have them."""
     found: tuple[Outer, ...] = ()
     for fold, acc in zip(folds, accumulators, strict=True):
-        if fold_member(fold, "curvatures"):
-            found += tuple(fold.curvature(acc, sample))
+        found += tuple(fold.curvature(acc, sample))
     return found
 
 
@@ -295,7 +293,7 @@ def outers_of_step(folds, found: Advanced) -> list[Outer]:
 
 
 @dataclasses.dataclass(frozen=True)
-class DerivativeStep:
+class DerivativeStep(Step):
     """One step of a run and of its tangents."""
 
     method: str

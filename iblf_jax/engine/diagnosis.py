@@ -12,9 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.control.actuators._base import input_delay
 from iblf_jax.control.barriers import Quadratic
-from iblf_jax.control.controllers._base import law_member
 from iblf_jax.core import checks, notices
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.status import FAILED, LOST, Status, describe
@@ -69,7 +67,7 @@ def report(result: Rollout, steps: int, throw: bool) -> None:
     failed = status & FAILED
     reported = failed | status & REPORTED
     law = unwrapped(result.scenario.controller)
-    knows_bounds = law_member(law, "needs_velocity_bounds") or law_member(law, "receives_x")
+    knows_bounds = law.needs_velocity_bounds or law.receives_x
     if knows_bounds or _fast_reference(result):
         reported |= status & Status.ALPHA_INFEASIBLE
     if not reported:
@@ -166,12 +164,12 @@ def _level_remedy(scenario: Scenario, level: int) -> str:
     """How the bounds of a level above the first can be kept, in words."""
     law = unwrapped(scenario.controller)
     field = f"state_bounds[{level - 2}]"
-    if not law_member(law, "receives_x"):
+    if not law.receives_x:
         return (
             f"{type(law).__name__} knows no bounds of that level; controllers.BarrierBackstepping"
             " keeps them."
         )
-    barriers = law_member(law, "barriers")
+    barriers = law.barriers
     if level <= len(barriers) and isinstance(barriers[level - 1], Quadratic):
         return (
             "The law has barriers.Quadratic() on that level, which keeps no bounds: give it"
@@ -505,7 +503,7 @@ def _smaller_step(result: Rollout, steps: int) -> str:
     """
     if not checks.is_concrete(result.scenario):
         return "a smaller one"
-    if input_delay(result.scenario.actuator) is not None:
+    if result.scenario.actuator.input_delay is not None:
         # Every number of steps in a delay is a program of its own.
         return "a smaller one, a whole part of actuator.delay"
     duration = steps * float(result.dt)

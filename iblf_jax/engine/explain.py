@@ -10,7 +10,6 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.control.actuators._base import input_delay
 from iblf_jax.core import checks, notices
 from iblf_jax.core.devices import threads
 from iblf_jax.core.presentation import Result
@@ -97,7 +96,7 @@ def explain(
       UnsupportedError: the step does not lower; the message says why.
     """
     scenario = canonical(scenario)
-    delay, step = input_delay(scenario.actuator), EXPLAINED_STEP
+    delay, step = scenario.actuator.input_delay, EXPLAINED_STEP
     if delay is not None:
         step = min(step, float(delay.delay))
     scenario = with_history(scenario, step)

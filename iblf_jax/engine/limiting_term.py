@@ -23,7 +23,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.control.controllers._base import law_member
 from iblf_jax.core import programs
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.engine.step_size import largest_eigenvalue, start_and_along
@@ -112,7 +111,7 @@ def limiting_term(run: Any) -> Limit | None:
 def terms_of(scenario: Scenario) -> Iterator[Term]:
     """The terms of a scenario's loop that are leaves."""
     law = unwrapped(scenario.controller)
-    names = (*law_member(law, "gains"), *law_member(law, "unit_factors"), "c")
+    names = (*law.gains, *law.unit_factors, "c")
     of_law = {f"controller.{name}" for name in names}
     for parameter in parameters(scenario, named=False):
         part, _, rest = parameter.path.partition(".")

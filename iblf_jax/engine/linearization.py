@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from iblf_jax.engine.carry import Inputs, StepOptions, keep_if
+from iblf_jax.engine.carry import Inputs, Step, StepOptions, keep_if
 from iblf_jax.simulation import error_estimate, stability
 from iblf_jax.simulation.closed_loop import (
     LoopState,
@@ -56,7 +56,7 @@ class Linearization(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class LinearizationStep:
+class LinearizationStep(Step):
     """The closed loop's derivative along one direction after the other.
 
     The directions are at first the unit vectors of the numbers that `accuracy` watches.  Where

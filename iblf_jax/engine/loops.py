@@ -18,7 +18,7 @@ from iblf_jax.core import checks
 from iblf_jax.core.caches import CACHE
 from iblf_jax.engine import thresholds
 from iblf_jax.engine.batch import Batch, Leaves, StepLoop
-from iblf_jax.engine.carry import StepOptions, keep_if, step_member
+from iblf_jax.engine.carry import Step, StepOptions, keep_if
 from iblf_jax.engine.linearization import LinearizationStep
 from iblf_jax.engine.registry import Executor
 from iblf_jax.kernels import (
@@ -125,7 +125,7 @@ def _on_leaves(step: Any, treedef, is_per_run: tuple[bool, ...], carry_treedef) 
     return on_leaves
 
 
-def program_of(step: Any, batch: Batch, carry: Any, series: Shapes = EMPTY) -> CompiledStep:
+def program_of(step: Step, batch: Batch, carry: Any, series: Shapes = EMPTY) -> CompiledStep:
     """The scalar program of a step, for a carry with a leading batch axis (arrays or their shapes);
     `series` has the shapes of what each step of a run reads from a series.
 
@@ -142,7 +142,7 @@ def program_of(step: Any, batch: Batch, carry: Any, series: Shapes = EMPTY) -> C
         Shapes.of(leaves.per_run, 1),
         Shapes.of(flat, 1),
         limits=thresholds.LOWERING_LIMITS,
-        is_derivative=step_member(step, "is_derivative"),
+        is_derivative=step.is_derivative,
         known=batch.shared_constants,
         series=series,
     )

@@ -19,7 +19,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from iblf_jax.control.actuators._base import input_delay
 from iblf_jax.core import checks, notices, programs
 from iblf_jax.core.status import Status, has_flag
 from iblf_jax.engine.request import RunRequest
@@ -258,7 +257,7 @@ def find_dt(scenario: Scenario, *, duration: float, method: str) -> float:
     duration = checks.positive_number("duration", duration, "s")
     if scenario.sampling is not None:
         return _find_part(scenario, float(scenario.sampling.period), duration, method)
-    delay = input_delay(scenario.actuator)
+    delay = scenario.actuator.input_delay
     if delay is not None:
         return _find_part(scenario, float(delay.delay), duration, method, MAX_STEPS_IN_DELAY)
     mode = fastest_along(scenario, np.linspace(0.0, duration, MODE_INSTANTS))

@@ -16,9 +16,8 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from iblf_jax.control.controllers._base import law_member
 from iblf_jax.core import checks
-from iblf_jax.core.optional import attributes
+from iblf_jax.core.attributes import attributes
 from iblf_jax.core.pytree import layers, wrapped_field
 from iblf_jax.kernels import Known
 from iblf_jax.simulation.scenario import Scenario
@@ -177,7 +176,7 @@ def _unit_factors(scenario: Scenario) -> dict[tuple[str, ...], Any]:
     path: tuple[str, ...] = ("controller",)
     found: dict[tuple[str, ...], Any] = {}
     for law in layers(scenario.controller):
-        names = _field_names(law_member(type(law), "unit_factors"))
+        names = _field_names(type(law).unit_factors)
         for name, factor in attributes(law, names).items():
             if checks.is_concrete(factor):
                 found[*path, name] = factor

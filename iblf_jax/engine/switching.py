@@ -40,7 +40,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.controllers._base import law_member, switching_functions
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.simulation.closed_loop import LoopState
 from iblf_jax.simulation.integrators import StepResult, stage_states, tableau
@@ -140,14 +139,15 @@ def surfaces(scenario: Scenario, t: jax.Array, state: LoopState) -> jax.Array | 
     """The switching functions of the scenario's law at a state, (m,), or None if its command does
     not jump.
     """
-    law, context = scenario.controller, scenario.context
+    context = scenario.context
+    law: Any = scenario.controller
     arguments = law_state(scenario, state.q, state.dq, state.higher)
-    if law_member(unwrapped(law), "receives_x"):
+    if unwrapped(law).receives_x:
         levels = (state.q, state.dq, state.higher)
         observer = scenario.observer
         d_hat = observer_estimate(scenario, observer, t, *levels, state.observer)
         arguments = (*arguments, d_hat)
-    return switching_functions(law, t, *arguments, context, state.controller)
+    return law.switching(t, *arguments, context, state.controller)
 
 
 def with_hybrid_derivative(

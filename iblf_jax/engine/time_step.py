@@ -24,9 +24,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.core.optional import attributes
+from iblf_jax.core.attributes import attributes
 from iblf_jax.core.status import Status, flag
-from iblf_jax.engine.carry import Carry, Inputs, Nearest, StepOptions, keep_if
+from iblf_jax.engine.carry import Carry, Inputs, Nearest, Step, StepOptions, keep_if
 from iblf_jax.engine.metric_folds import begun_at, updated, weighed
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.status_flags import has_no_input, is_valid, sample_status
@@ -59,7 +59,7 @@ from iblf_jax.world import plants
 
 
 @dataclasses.dataclass(frozen=True)
-class TimeStep:
+class TimeStep(Step):
     """One step of a run."""
 
     method: str

@@ -78,7 +78,7 @@ FAMILIES: dict[Any, Family] = {
     decays.Decay: family("decays", decays.MEMBERS),
     observers.Observer: family("observers", observers.MEMBERS),
     sensors.Sensor: family("sensors", sensors.MEMBERS),
-    sensors.Part: Family("sensors", _PARTS_OF_SENSORS),
+    sensors.LevelReading: Family("sensors", _PARTS_OF_SENSORS),
     sensors.Velocity: Family("sensors", {"VELOCITIES": sensors.VELOCITIES}),
     process_noise.ProcessNoise: family("process_noise", process_noise.MEMBERS),
     actuators.Actuator: family("actuators", actuators.MEMBERS),

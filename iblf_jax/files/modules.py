@@ -35,7 +35,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks, modules
-from iblf_jax.core.optional import has_members
+from iblf_jax.core.attributes import has_members
 from iblf_jax.files.values import Words, as_table, dotted, encode_numbers, known_keys, numbers
 from iblf_jax.simulation.paths import arrays_of_module, written
 

@@ -52,7 +52,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.core.optional import attributes
+from iblf_jax.core.attributes import attributes
 from iblf_jax.core.pytree import field_values
 from iblf_jax.core.whole_files import written_whole
 from iblf_jax.engine import RunRequest

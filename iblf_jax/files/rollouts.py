@@ -32,7 +32,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.core.optional import attributes
+from iblf_jax.core.attributes import attributes
 from iblf_jax.core.pytree import astype
 from iblf_jax.core.status import Status, describe
 from iblf_jax.files import digest

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.core.optional import has_members
+from iblf_jax.core.attributes import has_members
 from iblf_jax.identification.bag import (
     BagOptions,
     is_bag,

@@ -23,7 +23,7 @@ from iblf_jax.control.controllers.adaptive_parameters import (
 )
 from iblf_jax.control.sensors import Ideal as IdealSensor
 from iblf_jax.core import checks
-from iblf_jax.core.optional import attributes
+from iblf_jax.core.attributes import attributes
 from iblf_jax.core.status import FAILED, Status, describe
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.units import status_words

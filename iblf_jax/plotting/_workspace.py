@@ -17,7 +17,7 @@ from matplotlib.gridspec import SubplotSpec
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from iblf_jax.core import checks
-from iblf_jax.core.optional import has_members
+from iblf_jax.core.attributes import has_members
 from iblf_jax.plotting import _style
 from iblf_jax.plotting._curves import Curve, curves_of, escaped
 from iblf_jax.plotting._figures import Runs

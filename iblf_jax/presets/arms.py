@@ -39,9 +39,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.control.barriers import Barrier
-from iblf_jax.control.barriers._base import CLAIMS
 from iblf_jax.control.controllers import LAWS, Controller, PDGravity, law_by_name, within_effort
-from iblf_jax.control.controllers._base import law_member
 from iblf_jax.control.controllers.systems import observer_of
 from iblf_jax.control.observers import Momentum, Printed
 from iblf_jax.core import checks
@@ -184,7 +182,7 @@ def inertial_weight(
     """
     checks.conforms("robot", robot, Robot)
     checks.conforms("reference", reference, Reference)
-    checks.conforms("barrier", barrier, Barrier, optional=CLAIMS)
+    checks.conforms("barrier", barrier, Barrier)
     if not isinstance(bounds, Bounds):
         raise checks.fail(
             "bounds",
@@ -297,7 +295,7 @@ def _arm_law(
     if law == "pd":  # The default gains of "pd" are for one size of joint.
         return PDGravity(Kp=3.0 * K2, Kd=K2)
     controller: Any = law_by_name(law, k1=2.0, K2=K2, o=0.1, reading=reading, p=1)
-    if "weight" in law_member(type(controller), "unit_factors"):
+    if "weight" in type(controller).unit_factors:
         weight = inertial_weight(model, reference, bounds, controller.barrier)
         controller = dataclasses.replace(controller, weight=weight)
     return controller

@@ -40,7 +40,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.barriers._base import value_unit
 from iblf_jax.core.linalg import inner, matvec
 from iblf_jax.proofs.forms import enclosed
 from iblf_jax.proofs.matrices import inverse
@@ -142,7 +141,7 @@ def side_of(parts: ArmParts, t: jax.Array, xi: jax.Array) -> Side:
 
 def degree(barrier: Any) -> int:
     """d: V1 is homogeneous of this degree in lengths."""
-    return 2 if value_unit(barrier) == "rad^2" else 0
+    return 2 if barrier.value_unit == "rad^2" else 0
 
 
 def scaled_alpha(parts: ArmParts, t: jax.Array, xi: jax.Array) -> jax.Array:

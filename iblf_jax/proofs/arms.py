@@ -18,7 +18,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.control import controllers, observers
-from iblf_jax.control.barriers._base import barrier_member
 from iblf_jax.core import checks
 from iblf_jax.core.linalg import matvec
 from iblf_jax.core.pytree import astype
@@ -365,10 +364,10 @@ def _check_law(law: Any) -> None:
     barrier = law.barrier
     zero, one = jnp.zeros(1), jnp.ones(1)
     tube = Tube(zero, zero, -one, one, zero, zero)
-    known = barrier_member(barrier, "error_at")(zero, tube, zero > 0)
+    known = barrier.error_at(zero, tube, zero > 0)
     claims = (
-        barrier_member(barrier, "decay_rate")(one),
-        barrier_member(barrier, "xi_bound")(one, tube),
+        barrier.decay_rate(one),
+        barrier.xi_bound(one, tube),
     )
     if known is None or any(claim is None for claim in claims):
         reason = "The level set needs the error at which V1 has a value, in closed form."
@@ -409,7 +408,7 @@ def _parts_of(scenario: Scenario) -> ArmParts:
         jnp.broadcast_to(observer.kf, (scenario.n,)),
         scenario.reference,
         scenario.bounds,
-        jnp.asarray(scenario.controller.barrier.guard),  # type: ignore[attr-defined]
+        jnp.asarray(scenario.controller.barrier.guard),  # type: ignore[union-attr]
     )
 
 

@@ -54,7 +54,6 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.control.barriers import Quadratic
-from iblf_jax.control.barriers._base import barrier_member
 from iblf_jax.core import taylor
 from iblf_jax.proofs.arm_motion import along
 from iblf_jax.world import plants
@@ -279,7 +278,7 @@ class LevelEquations:
         law = self.parts.law
         barrier = law.barriers[i]
         claimed = barrier.decay_rate(law.k[i]) * energy
-        if barrier_member(barrier, "exact_decay"):
+        if barrier.exact_decay:
             return claimed
         return jnp.maximum(self.exact_decay(i, y), claimed)
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from iblf_jax.control import controllers, observers
 from iblf_jax.control.barriers import Quadratic
-from iblf_jax.control.barriers._base import barrier_member, has_ratio
+from iblf_jax.control.barriers._base import has_ratio
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import astype
 from iblf_jax.core.time import as_at, jump_times_of
@@ -539,14 +539,14 @@ def _check_law(scenario: Scenario) -> None:
     tube = Tube(0.0 * one, 0.0 * one, -one, one, 0.0 * one, 0.0 * one)
     for i, barrier in enumerate(law.barriers):
         name, kind = f"controller.barriers[{i}]", type(barrier).__name__
-        if barrier_member(barrier, "decay_rate")(one) is None:
+        if barrier.decay_rate(one) is None:
             raise unsupported(name, kind, "a barrier with decay_rate", "V' contains its decay.")
         if i > 0 and not has_ratio(barrier):
             reason = "The law needs e/s above the first level."
             raise unsupported(name, kind, "a barrier with error_over_slope", reason)
         if isinstance(barrier, Quadratic):
             continue
-        if barrier_member(barrier, "error_at")(one, tube, one > 0) is None:
+        if barrier.error_at(one, tube, one > 0) is None:
             reason = "The level set needs the error at which V_i has a value, in closed form."
             raise unsupported(name, kind, "a barrier with error_at", reason)
 
@@ -559,7 +559,7 @@ def _check_observer(scenario: Scenario) -> None:
         reason = "V contains d_tilde of observers with d_tilde' = d' - kappa d_tilde only."
         expected = "observers.LevelObserver or NoObserver"
         raise unsupported("observer", type(observer).__name__, expected, reason)
-    order = scenario.plant.order
+    order = plants.order_of(scenario.plant)
     gain, eta0 = (np.asarray(_rows(x, order)) for x in (observer.gain, observer.eta0))
     if np.any(eta0[gain == 0.0]):
         reason = "A level without a gain keeps this estimate, which is taken as 0."

@@ -13,7 +13,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.control.barriers._base import barrier_member
 from iblf_jax.core import checks, tables
 from iblf_jax.core.presentation import Result, present
 from iblf_jax.core.pytree import astype
@@ -369,7 +368,7 @@ def tube_of_level(scenario: Scenario, level: float, duration: float) -> Guarante
     def ends(t):
         tube = scenario.context.tube(t)
         values = jnp.broadcast_to(level / weight, tube.q_d.shape)
-        error_at = barrier_member(barrier, "error_at")
+        error_at = barrier.error_at
         below = error_at(values, tube, jnp.zeros(values.shape, bool))
         above = error_at(values, tube, jnp.ones(values.shape, bool))
         xi = jnp.maximum(-below / tube.k_l, above / tube.k_u)

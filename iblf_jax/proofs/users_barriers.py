@@ -18,7 +18,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import primitives
 
-from iblf_jax.control.barriers._base import barrier_member, ratio_jumps
 from iblf_jax.core import checks
 from iblf_jax.kernels import jaxprs
 from iblf_jax.proofs.arm_motion import degree
@@ -124,13 +123,13 @@ def _methods(barrier: Any, o: Any, n: int) -> Iterator[tuple[str, Callable, list
     yield "virtual_velocity", virtual_velocity, [*at_error, gain, gain], 1
 
     def error_over_slope(*x: Any) -> Any:
-        return barrier_member(barrier, "error_over_slope")(_tube(*x[:4]), x[4])
+        return barrier.error_over_slope(_tube(*x[:4]), x[4])
 
     yield "error_over_slope", error_over_slope, at_error, 2 - d
     for above in (True, False):
 
         def error_at(*x: Any, above: bool = above) -> Any:
-            return barrier_member(barrier, "error_at")(x[4], _tube(*x[:4]), jnp.full(n, above))
+            return barrier.error_at(x[4], _tube(*x[:4]), jnp.full(n, above))
 
         yield "error_at", error_at, [*of_tube, _Quantity(d)], 1
 
@@ -297,10 +296,10 @@ def _check_samples(name: str, barrier: Any, o: Any, n: int) -> None:
         V = barrier.value(tube, e)
         slope = jax.jvp(lambda q: barrier.value(tube, q), (e,), (one,))[1]
         found = {"slope": (barrier.slope(tube, e), slope)}
-        back = barrier_member(barrier, "error_at")(V, tube, e > 0)
+        back = barrier.error_at(V, tube, e > 0)
         if back is not None:
             found["error_at"] = (back, e)
-        ratio = barrier_member(barrier, "error_over_slope")(tube, e)
+        ratio = barrier.error_over_slope(tube, e)
         if ratio is not None:
             found["error_over_slope"] = (ratio * slope, e)
         return found
@@ -314,8 +313,8 @@ def _check_samples(name: str, barrier: Any, o: Any, n: int) -> None:
             lambda q: barrier.virtual_velocity(tube, q, one, gain_o), (e,), (one,)
         )
         found = (barrier.value(tube, e), barrier.slope(tube, e), alpha, rate)
-        ratio = barrier_member(barrier, "error_over_slope")(tube, e)
-        return found if ratio is None or ratio_jumps(barrier) else (*found, ratio)
+        ratio = barrier.error_over_slope(tube, e)
+        return found if ratio is None or barrier.ratio_jumps else (*found, ratio)
 
     samples = _samples(n)
     for method, pair in jax.vmap(pairs)(*samples).items():

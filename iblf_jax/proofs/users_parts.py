@@ -15,7 +15,7 @@ import numpy as np
 
 from iblf_jax.control import barriers
 from iblf_jax.core import checks
-from iblf_jax.core.optional import has_members
+from iblf_jax.core.attributes import has_members
 from iblf_jax.core.time import as_at
 from iblf_jax.proofs.examination import Examined, Operations, operations, refuse_unknown
 from iblf_jax.world import bounds, plants, references, robots

@@ -25,13 +25,9 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.control.actuators import Ideal
-from iblf_jax.control.actuators import _base as actuators
 from iblf_jax.control.controllers import Command
-from iblf_jax.control.controllers import _base as controllers
-from iblf_jax.control.controllers._base import law_member, state_of_levels
-from iblf_jax.control.observers._base import observer_member
+from iblf_jax.control.controllers._base import state_of_levels
 from iblf_jax.control.sensors import Measurement
-from iblf_jax.control.sensors._base import unrounded
 from iblf_jax.core.linalg import inner
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.time import as_at
@@ -429,7 +425,7 @@ def _robot_uncertain_signals(
     f_hat = estimate_as_torque(model, q, signals.f_hat)
     e2, f_tilde = dq - signals.alpha, f - f_hat
     V = jnp.sum(signals.V1)
-    if law_member(unwrapped(scenario.controller), "includes_e2"):
+    if unwrapped(scenario.controller).includes_e2:
         V = V + 0.5 * inner(f_tilde, f_tilde)
     else:
         V = V + 0.5 * (inner(e2, momentum(model, q, e2)) + inner(f_tilde, f_tilde))
@@ -517,10 +513,7 @@ def discrete_observer(scenario: Scenario) -> Any:
     sampling, observer = scenario.sampling, scenario.observer
     if sampling is None or sampling.observer != "poles":
         return observer
-    at_period = observer_member(observer, "at_period")
-    if at_period is None:
-        return observer
-    return at_period(sampling.period)
+    return observer.at_period(sampling.period)
 
 
 def law_update(
@@ -575,9 +568,8 @@ def _with_sent_input(command: Command, sent: SentCommand) -> Command:
 
 def _next_observer_state(sampling: Any, observer: Any, arguments: tuple) -> Any:
     """The observer's state one period later; `arguments` are those of `Observer.derivative`."""
-    advance = observer_member(observer, "advance")
-    if sampling.observer == "exact" and advance is not None:
-        return advance(*arguments, sampling.period)
+    if sampling.observer == "exact" and observer.advances:
+        return observer.advance(*arguments, sampling.period)
     return _euler(arguments[-1], observer.derivative(*arguments), sampling.period)
 
 
@@ -694,7 +686,7 @@ def perturbed_rate(
         arguments to `evaluate` elsewhere shares the traced function.
     """
     if not isinstance(perturbed, PerturbedState):
-        actuator = actuators.smooth(scenario.actuator)
+        actuator = scenario.actuator.smooth
         if actuator is not scenario.actuator:
             scenario = dataclasses.replace(scenario, actuator=actuator)
         arguments = [scenario, t, perturbed]
@@ -704,9 +696,9 @@ def perturbed_rate(
     sampling: Any = scenario.sampling
     scenario = dataclasses.replace(
         scenario,
-        sensor=unrounded(scenario.sensor),
-        controller=controllers.unlimited(scenario.controller),
-        actuator=actuators.smooth(actuators.unlimited(scenario.actuator)),
+        sensor=scenario.sensor.unrounded,
+        controller=scenario.controller.unlimited,
+        actuator=scenario.actuator.unlimited.smooth,
         sampling=dataclasses.replace(sampling, trigger=None),
     )
     controller, observer, sensor = perturbed.memory

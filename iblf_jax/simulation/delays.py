@@ -24,7 +24,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.actuators._base import input_delay
 from iblf_jax.control.actuators.delay import WHOLE_TOLERANCE
 from iblf_jax.simulation.integrators import TABLEAUS, tableau
 from iblf_jax.simulation.sampling import command_at
@@ -41,7 +40,7 @@ def initial_commands(scenario: Scenario, balance: jax.Array) -> Any:
       scenario: the scenario.
       balance: the input that balances gravity, (n,) [N m].
     """
-    delay = input_delay(scenario.actuator)
+    delay = scenario.actuator.input_delay
     if delay is None:
         return ()
     return jnp.broadcast_to(balance, (delay.history or 1, STAGES, balance.size))
@@ -129,7 +128,7 @@ def arriving(
       number: number of the step, () of floating-point type.
       commands: of the steps before it, newest first, (history, STAGES, n) [N m].
     """
-    actuator = input_delay(scenario.actuator)
+    actuator = scenario.actuator.input_delay
     if actuator is None:
         return ()
     delay = actuator.delay

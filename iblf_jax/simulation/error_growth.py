@@ -62,9 +62,7 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
-from iblf_jax.control.actuators import _base as actuators
 from iblf_jax.control.controllers._base import state_of_levels
-from iblf_jax.control.sensors._base import sensor_member, unrounded
 from iblf_jax.core import checks
 from iblf_jax.core.linalg import matmul_in_order
 from iblf_jax.core.time import as_at
@@ -112,7 +110,7 @@ def is_interrupted(scenario: Scenario) -> bool:
     """Whether a part of the loop does not pass on every small difference: it rounds, has a dead
     zone or play, or holds commands until an event.
     """
-    sampling, smooth = scenario.sampling, actuators.smooth(scenario.actuator)
+    sampling, smooth = scenario.sampling, scenario.actuator.smooth
     if sampling is None:
         return smooth is not scenario.actuator and not rounds_continuously(scenario)
     if sampling.trigger is not None or smooth is not scenario.actuator:
@@ -125,21 +123,21 @@ def rounds_continuously(scenario: Scenario) -> bool:
     an interrupted actuator.
     """
     actuator = scenario.actuator
-    if scenario.sampling is not None or actuators.smooth(actuator) is actuator:
+    if scenario.sampling is not None or actuator.smooth is actuator:
         return False
-    if actuators.input_delay(actuator) is not None:
+    if actuator.input_delay is not None:
         return True
     return _rounds_torque(scenario)
 
 
 def _rounds_readings(scenario: Scenario) -> bool:
     """Whether the sensor rounds."""
-    return unrounded(scenario.sensor) is not scenario.sensor
+    return scenario.sensor.unrounded is not scenario.sensor
 
 
 def _rounds_torque(scenario: Scenario) -> bool:
     """Whether the actuator rounds."""
-    return actuators.actuator_member(scenario.actuator, "resolution") is not None
+    return scenario.actuator.resolution is not None
 
 
 def _variables(scenario: Scenario, state: LoopState) -> Any:
@@ -363,7 +361,7 @@ def _reaches_code(
     step = _resolution(scenario, state.x)
     rounded, exact = (
         _reading(sensor, scenario, state, normal)
-        for sensor in (scenario.sensor, unrounded(scenario.sensor))
+        for sensor in (scenario.sensor, scenario.sensor.unrounded)
     )
     distance = 0.5 * step - jnp.abs(rounded - exact)
     blur = ARITHMETIC * jnp.finfo(step.dtype).eps * jnp.abs(rounded)
@@ -452,7 +450,7 @@ def _resolution(scenario: Scenario, x: jax.Array) -> jax.Array:
     """The step of the readings of each level of a state x, (r, n); 0 for one that is not
     rounded.
     """
-    step = jnp.asarray(sensor_member(scenario.sensor, "resolution"), x.dtype)
+    step = jnp.asarray(scenario.sensor.resolution, x.dtype)
     if step.ndim < 2:
         first = jnp.broadcast_to(step, x[:1].shape)
         return jnp.concatenate([first, jnp.zeros_like(x[1:])])
@@ -576,10 +574,10 @@ def _torque_width(scenario: Scenario, growth: ErrorGrowth) -> jax.Array:
     """
     sampling: Any = scenario.sampling
     width = jnp.zeros((scenario.n,), growth.largest.dtype)
-    deviation = actuators.actuator_member(scenario.actuator, "deviation")
+    deviation = scenario.actuator.deviation
     if deviation is not None:
         width = width + deviation
-    elif actuators.smooth(scenario.actuator) is not scenario.actuator:
+    elif scenario.actuator.smooth is not scenario.actuator:
         width = width + jnp.inf
     if sampling.trigger is not None:
         trigger = sampling.trigger

@@ -12,10 +12,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.controllers._base import law_member, state_of_levels
+from iblf_jax.control.controllers._base import state_of_levels
 from iblf_jax.control.observers import NoObserver
-from iblf_jax.control.observers._base import observer_member
-from iblf_jax.control.sensors._base import Measurement, sensor_member
+from iblf_jax.control.sensors._base import Measurement
 from iblf_jax.core import taylor
 from iblf_jax.core.linalg import solve_spd
 from iblf_jax.core.pytree import unwrapped
@@ -115,14 +114,14 @@ def model_state(scenario: Any, q: jax.Array, dq: jax.Array, higher: Any) -> jax.
 
 def law_state(scenario: Any, q: jax.Array, dq: jax.Array, higher: Any) -> tuple[jax.Array, ...]:
     """The state as the law receives it: (q, q'), or (x,)."""
-    if law_member(unwrapped(scenario.controller), "receives_x"):
+    if unwrapped(scenario.controller).receives_x:
         return (model_state(scenario, q, dq, higher),)
     return q, dq
 
 
 def sensor_state(scenario: Any, q: jax.Array, dq: jax.Array, higher: Any) -> tuple[jax.Array, ...]:
     """The state as the sensor receives it: (q, q'), or (x,)."""
-    if sensor_member(scenario.sensor, "receives_x"):
+    if scenario.sensor.receives_x:
         return (state_of_levels(q, dq, higher),)
     return q, dq
 
@@ -132,7 +131,7 @@ def sensor_state(scenario: Any, q: jax.Array, dq: jax.Array, higher: Any) -> tup
 
 def observer_initial(scenario: Any, observer: Any, q: jax.Array, dq: jax.Array, higher: Any) -> Any:
     """The state of an observer at the start."""
-    if observer_member(observer, "receives_x"):
+    if observer.receives_x:
         plant = plants.as_plant(scenario.model)
         return observer.init(model_state(scenario, q, dq, higher), plant)
     return observer.init(q, dq, _observed_robot(scenario))
@@ -142,10 +141,10 @@ def observer_estimate(
     scenario: Any, observer: Any, t: jax.Array, q: jax.Array, dq: jax.Array, higher: Any, state: Any
 ) -> jax.Array:
     """The estimate that the law receives: the torque f_hat, (n,) [N m], or d_hat, (r, n)."""
-    if observer_member(observer, "receives_x"):
+    if observer.receives_x:
         x, plant = model_state(scenario, q, dq, higher), plants.as_plant(scenario.model)
         d_hat: jax.Array = observer.estimate(t, x, plant, state)
-        if law_member(unwrapped(scenario.controller), "receives_x"):
+        if unwrapped(scenario.controller).receives_x:
             return d_hat
         return estimate_as_torque(scenario.model, q, d_hat)
     if plants.is_chain(scenario.model) and isinstance(observer, NoObserver):
@@ -174,7 +173,7 @@ def observer_arguments(
     state: Any,
 ) -> tuple:
     """The arguments of `Observer.derivative` and `advance`, given the input u of the model."""
-    if observer_member(observer, "receives_x"):
+    if observer.receives_x:
         x = model_state(scenario, q, dq, higher)
         return t, x, u, plants.as_plant(scenario.model), state
     if plants.is_chain(scenario.model) and not isinstance(observer, NoObserver):
@@ -189,11 +188,11 @@ def completed(
     """The levels that the law receives: those of a measurement, with the estimates of an observer
     in the place of the levels that it does not read.
     """
-    complete = observer_member(observer, "complete")
-    if complete is None:
+    if not observer.completes:
         return measured
     q, dq, higher = measured
-    x = complete(t, model_state(scenario, q, dq, higher), plants.as_plant(scenario.model), state)
+    x = model_state(scenario, q, dq, higher)
+    x = observer.complete(t, x, plants.as_plant(scenario.model), state)
     if len(x) == 2:
         # The plant may have more levels than the model; they remain those of the sensor.
         return Measurement(x[0], x[1], higher)
@@ -231,15 +230,12 @@ def estimated_levels(
       true: the levels of the plant.
       state: of the observer.
     """
-    if observer_member(observer, "complete") is None:
+    if not observer.completes:
         return ()
     x_hat = model_state(scenario, *known)
     error = x_hat - model_state(scenario, *true)
-    excess: Any = ()
-    own = observer_member(observer, "limit_excess")
-    if own is not None:
-        x = model_state(scenario, *reading)
-        excess = own(t, x, plants.as_plant(scenario.model), state)
+    x = model_state(scenario, *reading)
+    excess = observer.limit_excess(t, x, plants.as_plant(scenario.model), state)
     return EstimatedLevels(x_hat, error, excess)
 
 

@@ -18,8 +18,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from iblf_jax.control.observers._base import observer_member
-from iblf_jax.control.sensors._base import sensor_member, unrounded
 from iblf_jax.core.units import of_component, per_second
 from iblf_jax.simulation.levels import model_state, sensor_state, start_levels
 from iblf_jax.world import plants
@@ -61,10 +59,10 @@ def standard_deviations(scenario: Any) -> np.ndarray:
 def _linear_sensor(scenario: Any) -> LinearSensor:
     """The matrices of the sensor at the start, for inputs of the standard deviation 1."""
     sensor, period = scenario.sensor, scenario.sampling.period
-    smooth: Any = unrounded(sensor)
+    smooth: Any = sensor.unrounded
     levels = start_levels(scenario)
     given = sensor_state(scenario, *levels)
-    steps = jnp.broadcast_to(jnp.asarray(sensor_member(sensor, "resolution")), given[0].shape)
+    steps = jnp.broadcast_to(jnp.asarray(sensor.resolution), given[0].shape)
     start, rebuild = ravel_pytree(smooth.init(*given, period))
     dtype = given[0].dtype  # which the vector of a sensor without memory may lack
 
@@ -92,7 +90,7 @@ def noise_advice(scenario: Any) -> list[str]:
     """A warning about an observer that amplifies the noise of the sensor, with the numbers of each
     level; none for an observer without `noise_gain`, or a sensor without noise.
     """
-    gain = observer_member(scenario.observer, "noise_gain")
+    gain = scenario.observer.noise_gain
     if gain is None:
         return []
     noise = standard_deviations(scenario)

@@ -18,17 +18,15 @@ A fold is a component: its thresholds are leaves. Its `units` name the results o
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from types import MappingProxyType
-from typing import Any, ClassVar, NamedTuple, Protocol
+import abc
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.controllers._base import law_member
-from iblf_jax.control.observers._base import observer_member
 from iblf_jax.core import checks
-from iblf_jax.core.optional import OptionalMembers
+from iblf_jax.core.families import Part
 from iblf_jax.core.pytree import Leaf, component, layers, leaf, note_code
 from iblf_jax.core.status import Status
 from iblf_jax.core.units import (
@@ -57,34 +55,37 @@ from iblf_jax.simulation.units import unit_text
 from iblf_jax.world import plants
 
 
-class Fold(Protocol):
-    """The protocol of a metric.
+class Fold(Part):
+    """The contract of a metric."""
 
-    A fold that reads an optional signal, which not every scenario has (`SIGNAL_SOURCES`), names it
-    in a class attribute `needs`.
-    """
-
-    units: ClassVar[dict[str, str]]
+    units: ClassVar[Mapping[str, str]]
     """Name -> SI unit of everything that `finish` returns."""
+    needs: ClassVar[str | None] = None
+    """The optional signal, one of `SIGNAL_SOURCES`, that the metric reads and not every scenario
+    has."""
 
+    @property
+    def curvatures(self) -> int:
+        """The number of `Outer` that `curvature` returns (`engine.derivatives`)."""
+        return 0
+
+    @abc.abstractmethod
     def init(self, sample: Sample) -> Any:
         """The accumulator before the first sample; `sample` is that first sample, for shapes and
         types.
         """
-        ...
 
+    @abc.abstractmethod
     def update(self, acc: Any, sample: Sample) -> Any:
         """The accumulator after one more sample; same structure, shapes and types."""
-        ...
 
+    @abc.abstractmethod
     def finish(self, acc: Any) -> dict[str, jax.Array]:
         """The named results."""
-        ...
 
-
-fold_member = OptionalMembers(needs=None, units=MappingProxyType({}), curvatures=0)
-"""Reads the members that a metric may lack; `curvatures` is the number of `Outer` that its
-`curvature` returns (`engine.derivatives`)."""
+    def curvature(self, acc: Any, sample: Sample) -> tuple[Any, ...]:
+        """What one more sample adds to the matrices of second derivatives of the results."""
+        return ()
 
 
 def _root_mean_square(integral: jax.Array, time: jax.Array) -> jax.Array:
@@ -102,7 +103,7 @@ class _TrackingSums(NamedTuple):
 
 
 @component
-class Tracking:
+class Tracking(Fold):
     """Integrals and peak of the position error e1, joint by joint.
 
     ISE = int e1^2, IAE = int |e1|, ITAE = int t |e1|, rmse = sqrt(ISE / duration), peak_error = max
@@ -153,7 +154,7 @@ class _SettlingState(NamedTuple):
 
 
 @component
-class Settling:
+class Settling(Fold):
     """Settling time and overshoot of e1.
 
     settling_time: the first sample time from which on |e1| < tolerance; infinite if the run ends
@@ -215,7 +216,7 @@ def _with_margins(acc: _MarginState, t: jax.Array, *margins: jax.Array) -> _Marg
 
 
 @component
-class Margin:
+class Margin(Fold):
     """Smallest distance of the joints to their bounds, and the first violation.
 
     margin = min(q - lower, upper - q), continuous through zero; xi_margin = 1 - max |xi|;
@@ -252,7 +253,7 @@ class Margin:
 
 
 @component
-class FirstExit:
+class FirstExit(Fold):
     """Time at which each joint first reaches or leaves its bounds: first_exit_time.
 
     It is infinite for a joint that keeps its bounds.  Bounds are compared at the instants of the
@@ -283,7 +284,7 @@ class _ValueSums(NamedTuple):
 
 
 @component
-class LyapunovValue:
+class LyapunovValue(Fold):
     """The law's Lyapunov function: mean_V = int V / duration, and final_V at the end of the run.
 
     Under process noise no bound on V is claimed: means over the runs of a study estimate E[V].
@@ -310,7 +311,7 @@ class LyapunovValue:
 
 
 @component
-class VelocityMargin:
+class VelocityMargin(Fold):
     """Smallest distance of the velocities, and of the virtual velocity alpha, to the velocity
     bounds, and the first violation.
 
@@ -351,7 +352,7 @@ class VelocityMargin:
 
 
 @component
-class LevelMargin:
+class LevelMargin(Fold):
     """Smallest distance of the levels from the third on, and of the virtual controls that they
     follow, to the bounds of these levels, and the first violation.
 
@@ -406,7 +407,7 @@ def _level_margins(sample: Sample) -> list[jax.Array]:
 
 
 @component
-class RegionMargin:
+class RegionMargin(Fold):
     """Smallest distance of the robot's points to the boundaries of their regions, and the first
     violation.
 
@@ -443,7 +444,7 @@ class RegionMargin:
 
 
 @component
-class Slack:
+class Slack(Fold):
     """Largest violation of a safety filter's own conditions on the joints: largest_slack.
 
     Only for laws with a filter (`controllers.SafetyFilter`), whose runs carry it by default.
@@ -466,7 +467,7 @@ class Slack:
 
 
 @component
-class RegionSlack:
+class RegionSlack(Fold):
     """Largest violation of a safety filter's own conditions on the regions: largest_region_slack.
 
     Only for laws with a filter in scenarios with regions, whose runs carry it by default.
@@ -498,7 +499,7 @@ class _TorqueSums(NamedTuple):
 
 
 @component
-class Torque:
+class Torque(Fold):
     """Size and variation of the torque, or of another plant's input.
 
     effort = int |tau|^2 over all joints; and joint by joint torque_rms, peak_torque,
@@ -547,7 +548,7 @@ class _SquareSums(NamedTuple):
 
 
 @component
-class AboveGravity:
+class AboveGravity(Fold):
     """Torque beyond gravity compensation: effort_above_gravity = sqrt(mean |tau - G0(q)|^2) over
     all joints.
 
@@ -573,7 +574,7 @@ class AboveGravity:
 
 
 @component
-class Estimation:
+class Estimation(Fold):
     """Error of the observer: estimate_rmse = sqrt(mean f_tilde^2), f_tilde = f - f_hat, or the
     same of d_1 ... d_r of a model in strict-feedback form.
     """
@@ -605,7 +606,7 @@ class _LevelErrorState(NamedTuple):
 
 
 @component
-class LevelEstimation:
+class LevelEstimation(Fold):
     """Error of the levels that the law receives from an observer, and the time of their limits.
 
     peak_level_error = max |x_hat - x| of each level, at the instants at which the law runs, with
@@ -651,7 +652,7 @@ def _positive_share(first: jax.Array, last: jax.Array) -> jax.Array:
 
 
 @component
-class Auxiliary:
+class Auxiliary(Fold):
     """Largest size of the auxiliary state of a limited torque: largest_auxiliary = max |lambda|.
 
     Only for laws that have one (`controllers.Saturated` with `auxiliary`), whose runs carry it by
@@ -685,7 +686,7 @@ class _EventTimes(NamedTuple):
 
 
 @component
-class Events:
+class Events(Fold):
     """Number of the commands that an event trigger sent, and the intervals between them.
 
     shortest_interval and mean_interval are those between consecutive events, infinite on a run with
@@ -752,15 +753,15 @@ def has_signal(scenario: Scenario, signal: str) -> bool:
         levels = range(3, plants.order_of(scenario.plant) + 1)
         return any(context.level_bounds(level) is not None for level in levels)
     if signal == "x_hat":
-        return observer_member(scenario.observer, "complete") is not None
+        return scenario.observer.completes
     has_regions = len(scenario.regions) > 0
     if signal == "region_margin":
         return has_regions
     if signal == "auxiliary":
-        return any(law_member(law, "has_auxiliary") for law in layers(scenario.controller))
+        return any(law.has_auxiliary for law in layers(scenario.controller))
     if signal == "events":
         return scenario.sampling is not None and scenario.sampling.trigger is not None
-    has_filter = any(law_member(law, "filters") for law in layers(scenario.controller))
+    has_filter = any(law.filters for law in layers(scenario.controller))
     return has_filter and (signal == "slack" or has_regions)
 
 
@@ -768,7 +769,7 @@ def check_needs(field: str, fold: Any, scenario: Scenario) -> None:
     """Raises ValueError for a fold, or a quantity of a tuning, that reads a signal which runs of
     the scenario do not have.
     """
-    needs = fold_member(fold, "needs")
+    needs = fold.needs
     if needs is None:
         return
     checks.one_of(f"{field}.needs", needs, SIGNAL_SOURCES)
@@ -832,8 +833,7 @@ def metric_units(folds: Sequence[Fold], scenario: Scenario) -> tuple[tuple[str, 
     """Name and unit of every result of a run of a scenario with these folds, its accuracy results
     included.
     """
-    of_folds = [fold_member(fold, "units") for fold in folds]
-    pairs = [pair for units in of_folds for pair in units.items()]
+    pairs = [pair for fold in folds for pair in fold.units.items()]
     if plants.plant_member(scenario.plant, "switching") is not None:
         pairs += plants.SWITCHING_UNITS.items()
     return tuple((name, unit_text(scenario, unit)) for name, unit in (*pairs, *ACCURACY_UNITS))

@@ -15,7 +15,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.control.actuators._base import input_delay
 from iblf_jax.core import checks
 from iblf_jax.simulation.discontinuities import Piece
 from iblf_jax.simulation.integrators import STOCHASTIC, TABLEAUS, tableau
@@ -158,7 +157,7 @@ def check_method(scenario: Scenario, method: str) -> None:
     """
     stages = tableau(method).c
     _check_kind_of_method(scenario, method)
-    if len(stages) == 1 and input_delay(scenario.actuator) is not None:
+    if len(stages) == 1 and scenario.actuator.input_delay is not None:
         raise _no_command_between_steps(scenario, method)
 
 

@@ -5,10 +5,10 @@ Sweeps, perturbations, tuning and scenario files address leaves by these paths.
 
 - Names follow the fields of the components; `[i]` selects a part of a `Sum` or one entry of an
   array.
-- A component whose rows have names (class attribute `rows`, such as `robots.Arm`) can be addressed
-  by them: "plant.link[forearm].mass", "plant.joint[elbow].damping"; numbers from 0 work as well. A
-  name without a letter, or with a bracket, a line break or the like, is written as a JSON string:
-  'plant.link["a]b"].mass'.
+- A component whose rows have names (class attribute `named_rows`, such as `robots.Arm`) can be
+  addressed by them: "plant.link[forearm].mass", "plant.joint[elbow].damping"; numbers from 0 work
+  as well. A name without a letter, or with a bracket, a line break or the like, is written as a
+  JSON string: 'plant.link["a]b"].mass'.
 - `robot.` stands for `plant.` and `model.` together and changes both robots alike.
 - Several leaves may be addressed as the rows of one array (class attribute `stacked`):
   "initial.x[2]" is the third level of the start of a plant, "initial.x[0]" its initial.q.
@@ -40,8 +40,9 @@ from iblf_jax.core.component_paths import (
     resolve,
     rows_of,
 )
+from iblf_jax.core.families import statements_of
 from iblf_jax.core.modules import NUMBERS, RowName
-from iblf_jax.core.pytree import component_member, field_values, wrapped_field
+from iblf_jax.core.pytree import field_values, wrapped_field
 from iblf_jax.core.units import Unit, as_text, of_entry, resolved
 from iblf_jax.simulation.scenario import HOW_TO_MAKE, Scenario, canonical
 from iblf_jax.simulation.units import symbols_of
@@ -202,7 +203,7 @@ def _symbols_below(
     part: Any, field: dataclasses.Field, symbols: Symbols, index: int = 0
 ) -> Symbols:
     """The unit of each symbol in the part that a field holds, or in one of its parts."""
-    symbols = component_member(part, "symbols_of_part")(field.name, index, symbols)
+    symbols = statements_of(part).symbols_of_part(field.name, index, symbols)
     change = field.metadata.get("part_units")
     return symbols if change is None else change(symbols, index)  # type: ignore[no-any-return]
 
@@ -222,7 +223,7 @@ def _walk_wrapped(
 
 def _unit(part: Any, field: dataclasses.Field, symbols: Symbols) -> Unit:
     """The unit of a leaf of a component, as the component or the field states it."""
-    stated = component_member(part, "leaf_units")()
+    stated = statements_of(part).leaf_units()
     return resolved(stated.get(field.name, field.metadata.get("unit", "")), symbols)
 
 
@@ -230,7 +231,7 @@ def _named_rows(part: Any, path: str) -> Iterator[Parameter]:
     """The rows of leaves that have names."""
     units = {field.name: field.metadata.get("unit", "") for field in dataclasses.fields(part)}
     values = field_values(part)
-    for kind, (names, fields) in component_member(type(part), "rows").items():
+    for kind, (names, fields) in statements_of(part).named_rows.items():
         for i, name in enumerate(values[names]):
             for field in fields:
                 value = values[field]
@@ -246,7 +247,7 @@ def _stacked_rows(part: Any, path: str, symbols: Symbols) -> Iterator[Parameter]
     """
     fields = {field.name: field for field in dataclasses.fields(part)}
     values = field_values(part)
-    for kind, names in component_member(type(part), "stacked").items():
+    for kind, names in statements_of(part).stacked.items():
         for i, (name, *index) in enumerate(rows_of(part, names)):
             at = tuple(index)
             unit = of_entry(_unit(part, fields[name], symbols), at, jnp.ndim(values[name]))

@@ -20,23 +20,20 @@ import numpy as np
 
 from iblf_jax.control.actuators import Actuator
 from iblf_jax.control.actuators import Ideal as IdealActuator
-from iblf_jax.control.actuators._base import actuator_member, input_delay
 from iblf_jax.control.controllers import Controller, LawContext
-from iblf_jax.control.controllers._base import law_member, state_of_levels
+from iblf_jax.control.controllers._base import adopt_layers, state_of_levels
 from iblf_jax.control.observers import NoObserver, Observer
-from iblf_jax.control.observers._base import observer_member
 from iblf_jax.control.sensors import Ideal as IdealSensor
 from iblf_jax.control.sensors import Sensor
-from iblf_jax.control.sensors._base import sensor_member
 from iblf_jax.core import checks, modules, notices, programs
 from iblf_jax.core.disk_cache import keep_programs
+from iblf_jax.core.families import statements_of
 from iblf_jax.core.modules import NUMBERS
 from iblf_jax.core.presentation import present
 from iblf_jax.core.pytree import (
     Leaf,
     astype,
     component,
-    component_member,
     field_values,
     is_leaf_field,
     layers,
@@ -233,6 +230,7 @@ class Scenario:
         parts = field_values(self)
         for name, (protocol, remedy) in PROTOCOLS.items():
             checks.conforms(f"Scenario.{name}", parts[name], protocol, remedy, OPTIONAL_MEMBERS)
+        adopt_layers(self.controller)
         self._check_classes()
         self._fit_state_bounds()
         self._check_combination()
@@ -247,11 +245,10 @@ class Scenario:
     def _complete_law(self) -> None:
         """Gives the law what it derives from its model and the start, such as weights."""
         law = unwrapped(self.controller)
-        completed = law_member(law, "completed")
-        if completed is None:
+        if type(law).completed is Controller.completed:
             return
         with jax.ensure_compile_time_eval():
-            new = completed(self.context, model_state(self, *start_levels(self)))
+            new = law.completed(self.context, model_state(self, *start_levels(self)))
         if new is not law:
             object.__setattr__(self, "controller", rewrapped(self.controller, new))
 
@@ -296,7 +293,7 @@ class Scenario:
             expected = f"{plants.counted_components(self.plant, self.plant.n)}, as the plant has"
             raise checks.fail("Scenario.model", got, expected)
         law = unwrapped(self.controller)
-        if self.context.level_bounds(2) is None and law_member(law, "needs_velocity_bounds"):
+        if self.context.level_bounds(2) is None and law.needs_velocity_bounds:
             expected = f"the bounds that {type(law).__name__} keeps"
             remedy = "Such as velocity_bounds=Bounds(lower=Constant(-1.0), upper=Constant(1.0))."
             raise checks.fail("Scenario.velocity_bounds", None, expected, remedy)
@@ -304,7 +301,7 @@ class Scenario:
             got, expected = type(self.sensor).__name__, "an Ideal sensor where no law is sampled"
             remedy = "Add sampling=ij.Sampling(period=...): a sensor is read once a period."
             raise checks.fail("Scenario.sensor", got, expected, remedy)
-        if self.sampling is not None and input_delay(self.actuator) is not None:
+        if self.sampling is not None and self.actuator.input_delay is not None:
             expected = "no Delay where the law is sampled"
             remedy = "Give ij.Sampling(period=..., delay=...) instead."
             raise checks.fail("Scenario.actuator", self.actuator, expected, remedy)
@@ -427,7 +424,7 @@ def check_levels(scenario: Scenario) -> None:
         raise checks.fail("Scenario.model", f"a plant of order {known}", expected)
     law = unwrapped(scenario.controller)
     kind = type(law).__name__
-    if plants.is_chain(model) and not law_member(law, "receives_x"):
+    if plants.is_chain(model) and not law.receives_x:
         expected = f"a robot as the model of the law {kind}"
         robot = plants.robot_of(model)
         remedy = "Take controllers.BarrierBackstepping"
@@ -452,8 +449,8 @@ def _check_observer(scenario: Scenario) -> None:
     observer, model = scenario.observer, scenario.model
     if isinstance(observer, NoObserver):
         return
-    if observer_member(observer, "receives_x"):
-        observer_member(observer, "check_model")(plants.as_plant(model))
+    if observer.receives_x:
+        observer.check_model(plants.as_plant(model))
         return
     if plants.is_chain(model) and plants.plant_member(model, "joint_torque") is None:
         expected = "an observer of plants in strict-feedback form, such as LevelObserver"
@@ -467,13 +464,13 @@ def _check_input(scenario: Scenario) -> None:
     """
     outermost, *wrapped = layers(scenario.controller)
     for law in wrapped:
-        if law_member(law, "input_unit") is not None:
+        if law.input_unit is not None:
             kind = type(law).__name__
             expected = f"{kind} as the outermost law"
             remedy = f"Such as {kind}(law={type(outermost).__name__}(...), ...)."
             raise checks.fail("Scenario.controller", type(outermost).__name__, expected, remedy)
     needed = plants.units_of(scenario.plant)[-1]
-    given = law_member(outermost, "input_unit") or plants.units_of(scenario.model)[-1]
+    given = outermost.input_unit or plants.units_of(scenario.model)[-1]
     if given == needed or UNKNOWN_UNIT in (given, needed):
         return
     kind = type(scenario.plant).__name__
@@ -492,17 +489,17 @@ UNKNOWN_UNIT = "1"
 def _check_measured_levels(scenario: Scenario) -> None:
     """Raises ValueError for levels that are neither measured nor estimated."""
     order = plants.order_of(scenario.plant)
-    covered = sensor_member(scenario.sensor, "order")
+    covered = scenario.sensor.order
     if covered not in (None, order):
         expected = f"sensors of {order} levels, as the plant has"
         remedy = "None is for a level that is not measured."
         raise checks.fail("Scenario.sensor", f"sensors of {covered} levels", expected, remedy)
     every = tuple(range(1, plants.order_of(scenario.model) + 1))
-    measured = sensor_member(scenario.sensor, "measured") or every
+    measured = scenario.sensor.measured or every
     observer = scenario.observer
     needed = every
-    if observer_member(observer, "complete") is not None:
-        needed = observer_member(observer, "measured") or every
+    if observer.completes:
+        needed = observer.measured or every
     missing = [str(level) for level in needed if level not in measured]
     if not missing:
         return
@@ -603,7 +600,7 @@ def fit_joints(part: Any, n: int, path: str) -> Any:
         return part
     new: dict[str, Any] = {}
     values = field_values(part)
-    own_joints = component_member(part, "own_joints")
+    own_joints = statements_of(part).own_joints
     for field in dataclasses.fields(part):
         old = values[field.name]
         name = f"{path}.{field.name}"
@@ -696,7 +693,7 @@ def canonical(scenario: Scenario) -> Scenario:
         return scenario
     _check_start(scenario)
     for law in layers(scenario.controller):
-        law_member(law, "check_start")(scenario.context)
+        law.check_start(scenario.context)
     for text in advice_of(scenario):
         notices.warn(text)
     return scenario
@@ -715,12 +712,12 @@ def _with_sufficient_queue(scenario: Scenario) -> Scenario:
 
 def advice_of(scenario: Scenario) -> list[str]:
     """The warnings of the parts about their parameter values."""
-    advice = law_member(scenario.controller, "advice")()
-    if all(law_member(part, "uses_observer") for part in layers(scenario.controller)):
-        advice = advice + observer_member(scenario.observer, "advice")()
+    advice = scenario.controller.advice()
+    if all(part.uses_observer for part in layers(scenario.controller)):
+        advice = advice + scenario.observer.advice()
     advice = advice + motors_advice(scenario)
     if scenario.sampling is not None:
-        advice = advice + sensor_member(scenario.sensor, "advice")(scenario.sampling.period)
+        advice = advice + scenario.sensor.advice(scenario.sampling.period)
         advice = advice + noise_advice(scenario)
     return advice
 
@@ -805,10 +802,7 @@ def fitted_to_step(scenario: Scenario, dt: float) -> Scenario:
 
 def with_history(scenario: Scenario, dt: float) -> Scenario:
     """`fitted_to_step` without the check of the sampling period."""
-    fitted = actuator_member(scenario.actuator, "with_history")
-    if fitted is None:
-        return scenario
-    actuator = fitted(dt)
+    actuator = scenario.actuator.with_history(dt)
     if actuator is scenario.actuator:
         return scenario
     return dataclasses.replace(scenario, actuator=actuator)

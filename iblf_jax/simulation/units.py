@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from iblf_jax.control.controllers._base import law_member
 from iblf_jax.core.pytree import layers
 from iblf_jax.core.status import WORDS, WORDS_OF_LEVELS, Status
 from iblf_jax.core.units import ROBOT, Unit, as_text, of_component, resolved
@@ -22,7 +21,7 @@ def symbols_of(scenario: Any) -> Mapping[str, Unit]:
         return ROBOT
     found = dict(plants.unit_symbols(scenario.plant, scenario.model))
     for law in layers(scenario.controller):
-        found |= law_member(law, "unit_symbols")(scenario.model)
+        found |= law.unit_symbols(scenario.model)
     return found
 
 

@@ -19,7 +19,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.control.actuators._base import input_delay
 from iblf_jax.core import checks, programs
 from iblf_jax.core.pytree import component
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state
@@ -176,7 +175,7 @@ def vector_field(scenario: Scenario) -> VectorField:
             "a law that runs at every instant",
             "Its torque jumps: use ij.simulate.",
         )
-    if input_delay(field.scenario.actuator) is not None:
+    if field.scenario.actuator.input_delay is not None:
         raise checks.fail(
             "scenario.actuator",
             "a Delay",

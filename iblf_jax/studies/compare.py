@@ -29,11 +29,11 @@ from iblf_jax.control.controllers import (
     Saturated,
     law_by_name,
 )
-from iblf_jax.control.controllers._base import law_member
+from iblf_jax.control.controllers._base import adopt_layers
 from iblf_jax.control.controllers.systems import observer_of
 from iblf_jax.control.observers import NoObserver
 from iblf_jax.core import checks, notices, programs
-from iblf_jax.core.optional import attributes
+from iblf_jax.core.attributes import attributes
 from iblf_jax.core.progress import announced
 from iblf_jax.core.pytree import field_values, layers, unwrapped
 from iblf_jax.core.status import Status
@@ -154,28 +154,31 @@ def _named_laws(laws: Laws) -> dict[str, str | Controller]:
             "a list of names and laws, or a dict of them",
             f"Names are {', '.join(NAMES)}.",
         )
+    pairs: list[tuple[str | None, Any]] = [(None, law) for law in laws]
     if isinstance(laws, Mapping):
         pairs = [(str(name), law) for name, law in laws.items()]
-    else:
-        pairs = [(law if isinstance(law, str) else _title(law), law) for law in laws]
     named: dict[str, str | Controller] = {}
     for name, law in pairs:
         if isinstance(law, str):
             checks.one_of("laws", law, NAMES)
+            title = law
         else:
-            checks.conforms(f"laws[{name!r}]", law, Controller, f"Or a name: {', '.join(NAMES)}.")
-        shown = name
+            label = type(law).__name__ if name is None else name
+            checks.conforms(f"laws[{label!r}]", law, Controller, f"Or a name: {', '.join(NAMES)}.")
+            adopt_layers(law)
+            title = _title(law)
+        first = shown = title if name is None else name
         count = 1
         while shown in named:
             count += 1
-            shown = f"{name} {count}"
+            shown = f"{first} {count}"
         named[shown] = law
     return named
 
 
 def _title(law: Controller) -> str:
     inner = unwrapped(law)
-    barrier = law_member(inner, "barrier")
+    barrier = inner.barrier
     text = type(inner).__name__
     if barrier is not None:
         text += f"({type(barrier).__name__})"
@@ -191,16 +194,16 @@ def _with_law(scenario: Scenario, law: str | Controller) -> Scenario:
         values = field_values(own)
         given = {name: values.get(name) for name in ("k1", "K2", "o", "reading")}
         kept = {name: value for name, value in given.items() if value is not None}
-        p = getattr(law_member(own, "barrier"), "p", 1)
+        p = getattr(own.barrier, "p", 1)
         controller = _limited_as(scenario.controller, law_by_name(law, p=p, **kept))
         observer = observer_of(law, scenario.observer)
     else:
         controller = law
         observer = scenario.observer
-        if not all(law_member(part, "uses_observer") for part in layers(law)):
+        if not all(part.uses_observer for part in layers(law)):
             observer = NoObserver()
     model = _model_for(controller, scenario)
-    receives_x = law_member(unwrapped(controller), "receives_x")
+    receives_x = unwrapped(controller).receives_x
     if isinstance(law, str) and plants.is_chain(model) and not receives_x:
         raise _no_robot(law, model)
     return dataclasses.replace(scenario, controller=controller, observer=observer, model=model)
@@ -216,7 +219,7 @@ def _no_robot(name: str, model: Any) -> ValueError:
 def _model_for(law: Controller, scenario: Scenario) -> Any:
     """The scenario's model; for a law of robots its rigid limit, or the robot inside it."""
     model = scenario.model
-    if law_member(unwrapped(law), "receives_x") or not plants.is_chain(model):
+    if unwrapped(law).receives_x or not plants.is_chain(model):
         return model
     rigid = plants.plant_member(model, "rigid")
     if rigid is not None:
@@ -257,7 +260,7 @@ def gain_names(law: Controller) -> tuple[str, ...]:
     """
     inner = unwrapped(law)
     values = field_values(inner)
-    return tuple(name for name in law_member(inner, "gains") if values.get(name) is not None)
+    return tuple(name for name in inner.gains if values.get(name) is not None)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from iblf_jax.control.barriers import Integral
-from iblf_jax.control.controllers._base import law_member
 from iblf_jax.core import tables
 from iblf_jax.core.presentation import Result, present
 from iblf_jax.core.pytree import unwrapped
@@ -219,10 +218,7 @@ class Comparison(Result):
         for name, gains in self.gains.items():
             groups.setdefault(gains, []).append(name)
         in_words = "; ".join(f"{gains} ({', '.join(names)})" for gains, names in groups.items())
-        barriers = [
-            law_member(unwrapped(run.scenario.controller), "barrier")
-            for run in self.rollouts.values()
-        ]
+        barriers = [unwrapped(run.scenario.controller).barrier for run in self.rollouts.values()]
         notes = {"gains": [f"Held equal: the scenario. Gains: {in_words}."]}
         if len(groups) > 1:
             notes["gains"].append(OWN_GAINS)

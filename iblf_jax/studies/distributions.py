@@ -23,47 +23,55 @@ numbers do not recompile a study.
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Protocol, runtime_checkable
+import abc
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.core.optional import OptionalMembers
+from iblf_jax.core.attributes import has_members
+from iblf_jax.core.families import Part, adopt, required_members
 from iblf_jax.core.pytree import component, leaf, static
 
 KINDS = ("factor", "offset", "value")
 """How a draw acts on the nominal value."""
 
 
-@runtime_checkable
-class Distribution(Protocol):
-    """A distribution: a component with these two methods.
+class Distribution(Part):
+    """The contract of a distribution."""
 
-    A distribution of leaves that vary together has two more attributes: `group`, the name of the
-    draws that they share, and `draws`, the number of uniform numbers that `quantile` takes.
+    is_discrete: ClassVar[bool] = False
+    """Whether its draws are not continuous in u."""
 
-    A distribution may have a method `of_normal(z)` = F^-1(Phi(z)) that is accurate in both tails,
-    where Phi(z) rounds to 1; one whose draws are not continuous in u sets `is_discrete = True`.
-    """
+    @property
+    def group(self) -> str:
+        """The name of the draws that leaves which vary together share; "" for other leaves."""
+        return ""
 
+    @property
+    def draws(self) -> int:
+        """The number of uniform numbers that `quantile` takes for a group."""
+        return 0
+
+    @abc.abstractmethod
     def quantile(self, u: jax.Array) -> jax.Array:
         """F^-1(u), elementwise, for u in (0, 1)."""
-        ...
 
+    def of_normal(self, z: jax.Array) -> jax.Array:
+        """F^-1(Phi(z)).  Where Phi(z) rounds to 1, a distribution may compute it by other means."""
+        limits = jnp.finfo(z.dtype)
+        u = jax.scipy.special.ndtr(z)
+        return self.quantile(jnp.clip(u, limits.tiny, 1 - limits.eps / 2))
+
+    @abc.abstractmethod
     def support(self) -> tuple[np.ndarray, np.ndarray]:
         """The smallest and the largest draw; infinite where the distribution is unbounded."""
-        ...
-
-
-distribution_member = OptionalMembers(group="", draws=0, of_normal=None, is_discrete=False)
-"""The optional members of a `Distribution`: those of leaves that vary together, and those that
-probabilities of rare failures read."""
 
 
 @component
-class Uniform:
+class Uniform(Distribution):
     """Evenly between `low` and `high`.
 
     Args:
@@ -88,7 +96,7 @@ class Uniform:
 
 
 @component
-class Normal:
+class Normal(Distribution):
     """Gaussian, with mean `mean` and standard deviation `std`.
 
     Args:
@@ -114,7 +122,7 @@ class Normal:
 
 
 @component
-class LogUniform:
+class LogUniform(Distribution):
     """Evenly between `low` and `high` on a logarithmic scale.
 
     Args:
@@ -139,7 +147,7 @@ class LogUniform:
 
 
 @component
-class Choice:
+class Choice(Distribution):
     """One of a list of numbers, with weights.
 
     Args:
@@ -177,7 +185,7 @@ class Choice:
 
 
 @component
-class JointNormal:
+class JointNormal(Distribution):
     """Gaussian, of leaves that vary together.
 
     Args:
@@ -244,6 +252,18 @@ class Interval:
         return np.asarray(self.low), np.asarray(self.high)
 
 
+def is_distribution(value: Any) -> bool:
+    """Whether a value is an interval, or has what a distribution requires; its class is then
+    adopted by the family.
+    """
+    if isinstance(value, Distribution | Interval):
+        return True
+    fits = not isinstance(value, type) and has_members(value, *required_members(Distribution))
+    if fits:
+        adopt(type(value), Distribution)
+    return fits
+
+
 def is_interval(perturbation: Any) -> bool:
     """Whether a perturbation states a set of values and no distribution."""
     return isinstance(perturbation, Perturbation) and isinstance(
@@ -252,7 +272,7 @@ def is_interval(perturbation: Any) -> bool:
 
 
 @component
-class JointSamples:
+class JointSamples(Distribution):
     """One of a list of samples, of leaves that vary together.
 
     Args:
@@ -336,7 +356,7 @@ class Perturbation:
 
     def check(self) -> None:
         """Raises ValueError for something that is not a distribution."""
-        if not isinstance(self.distribution, Distribution | Interval):
+        if not is_distribution(self.distribution):
             raise _no_distribution(self.kind, self.distribution)
         checks.one_of("Perturbation.kind", self.kind, KINDS)
         object.__setattr__(self, "shared", checks.boolean("Perturbation.shared", self.shared))
@@ -344,7 +364,7 @@ class Perturbation:
     @property
     def group(self) -> str:
         """Name of the draws that the leaf shares with others; "" if it shares none."""
-        return distribution_member(self.distribution, "group")
+        return "" if isinstance(self.distribution, Interval) else self.distribution.group
 
     def apply(self, nominal: jax.Array, u: jax.Array) -> jax.Array:
         """The perturbed leaf, from its nominal value and the uniform number(s) of this draw; the
@@ -535,7 +555,7 @@ def choice(values: Any, weights: Any = None) -> Choice:
 
 def _perturbation(kind: str, distribution: Any, shared: Any) -> Perturbation:
     """A perturbation; ValueError for an invalid distribution."""
-    if not isinstance(distribution, Distribution | Interval):
+    if not is_distribution(distribution):
         raise _no_distribution(kind, distribution)
     return Perturbation(distribution, kind, shared)
 

@@ -30,7 +30,6 @@ from iblf_jax.studies.distributions import (
     Distribution,
     JointSamples,
     Perturbation,
-    distribution_member,
     is_interval,
 )
 
@@ -179,7 +178,7 @@ def _check_groups(what: str, perturbations: Mapping[str, Perturbation]) -> None:
 
 def _can_share_draws(a: Distribution, b: Distribution) -> bool:
     """Whether the draws of a group serve both: d numbers, or one of a list of samples."""
-    if distribution_member(a, "draws") != distribution_member(b, "draws"):
+    if a.draws != b.draws:
         return False
     if not isinstance(a, JointSamples) or not isinstance(b, JointSamples):
         return True
@@ -272,8 +271,9 @@ def draw_shapes(
     for target in targets:
         perturbation = perturbations[target.path]
         shape = target.shape
+        distribution: Any = perturbation.distribution
         if perturbation.group:
-            shape = (distribution_member(perturbation.distribution, "draws"),)
+            shape = (distribution.draws,)
         elif perturbation.shared:
             shape = ()
         shapes[perturbation.group or target.source] = shape

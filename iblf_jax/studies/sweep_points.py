@@ -19,7 +19,7 @@ from iblf_jax.core import checks
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies.designs import MAX_RUNS, designed_numbers
-from iblf_jax.studies.distributions import Distribution, Interval, Perturbation, value
+from iblf_jax.studies.distributions import Perturbation, is_distribution, value
 from iblf_jax.studies.draws import (
     CaseInputs,
     Target,
@@ -102,7 +102,7 @@ def _axis_values(scenario: Scenario, path: str, values: Any) -> np.ndarray:
     leaves.
     """
     name = f"grid[{path!r}]"
-    if isinstance(values, Perturbation | Distribution | Interval):
+    if isinstance(values, Perturbation) or is_distribution(values):
         raise checks.fail(
             name,
             values,
@@ -146,7 +146,7 @@ def _design(
 def _perturbation(path: str, given: Any) -> Perturbation:
     if isinstance(given, Perturbation):
         return given
-    if not isinstance(given, Distribution | Interval):
+    if not is_distribution(given):
         raise checks.fail(
             f"grid[{path!r}]",
             given,

@@ -37,6 +37,7 @@ import jax
 
 from iblf_jax.core import devices, thread_options
 from iblf_jax.core.caches import CACHE
+from iblf_jax.core.families import adopt_again
 from iblf_jax.core.pytree import is_component_class, register_component
 from iblf_jax.engine import uses_host_compiler
 from iblf_jax.studies.blocks import BlockResults, named_arrays, run_spans_here
@@ -184,6 +185,7 @@ def _unpacked(payload: bytes) -> WorkerTask:
     task, components = pickle.loads(content)
     for cls in components:
         register_component(cls)
+        adopt_again(cls)
     return task
 
 

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.core.families import adopt, required_members
 
 STEP = 1e-6
 """Relative step of the central differences, whose error is about 1e-9 in float64."""
@@ -90,16 +91,13 @@ class Findings:
 
 
 @contextmanager
-def examine(
-    member: Any, family: str, protocol: type, optional: tuple[str, ...] = ()
-) -> Iterator[Findings]:
+def examine(member: Any, family: str, base: type) -> Iterator[Findings]:
     """The context of a checker: computes in float64, and raises the findings at the end.
 
     Args:
       member: the component.
       family: name of the family, for messages.
-      protocol: contract of the family.
-      optional: members of the protocol that the component may lack.
+      base: base class of the family, which adopts the component's class.
 
     Raises:
       ContractError: at once if the object is not a component or lacks a required member.
@@ -107,8 +105,9 @@ def examine(
     findings = Findings(member, family)
     with jax.enable_x64(True), suppress(StoppedCheckError):
         _is_component(findings, member)
-        _has_members(findings, member, protocol, optional)
+        _has_members(findings, member, base)
         findings.stop_if_any()
+        adopt(type(member), base)
         yield findings
     findings.stop_if_any()
 
@@ -159,24 +158,20 @@ def first_line(error: Exception) -> str:
     return f"{type(error).__name__}: {text.rstrip('.')}"
 
 
-def _has_members(
-    findings: Findings, member: Any, protocol: type, optional: tuple[str, ...]
-) -> None:
-    for name, value in vars(protocol).items():
-        if name.startswith("_") or name in optional or hasattr(member, name):
+def _has_members(findings: Findings, member: Any, base: type) -> None:
+    for name in required_members(base):
+        if hasattr(member, name):
             continue
-        text = (inspect.getdoc(value) or "").split("\n")[0]
+        method = getattr(base, name, None)
+        if method is None:
+            findings.add(f"the attribute {name!r} is missing", f"See {base.__name__}")
+            continue
         arguments = ""
-        if callable(value):
-            names = [word for word in inspect.signature(value).parameters if word != "self"]
+        if callable(method):
+            names = [word for word in inspect.signature(method).parameters if word != "self"]
             arguments = f"({', '.join(names)})"
+        text = (inspect.getdoc(method) or "").split("\n")[0]
         findings.add(f"{name}{arguments} is missing", text)
-    for name in inspect.get_annotations(protocol):
-        findings.require(
-            hasattr(member, name),
-            f"the attribute {name!r} is missing",
-            f"See the docstring of {protocol.__name__}",
-        )
 
 
 def shape_of(findings: Findings, label: str, call: Callable, *args: Any) -> Any:

@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.control.barriers import Barrier
-from iblf_jax.control.barriers._base import CLAIMS, barrier_member
 from iblf_jax.testing._contract import (
     Findings,
     call_has_shape,
@@ -69,7 +68,7 @@ def check_barrier(barrier: Any, *, n: int | None = None) -> None:
       ContractError: lists what does not hold, with the remedy.
       ValueError: `n` is not a number of joints, or not that of the leaves.
     """
-    with examine_joints(barrier, Barrier, n, "barrier", CLAIMS) as (findings, barrier, joints):
+    with examine_joints(barrier, Barrier, n, "barrier") as (findings, barrier, joints):
         _class_members(findings, barrier)
         context = in_dtype(scenario_of(joints), "float64").context
         k1 = jnp.asarray(np.resize([2.0, 3.0], joints))
@@ -247,7 +246,7 @@ def _claims(
     """Tests the claims of the barrier about V1, if it states any."""
     xi, V1, decay = (np.asarray(numbers[name]) for name in ("xi", "value", "decay"))
     inside = np.abs(xi) < min(1 - 2 * barrier.guard, 1.0)
-    rate = barrier_member(barrier, "decay_rate")(k1)
+    rate = barrier.decay_rate(k1)
     if rate is not None:
         has_shape(findings, "decay_rate(k1)", rate, k1.shape)
         excess = float(np.max((decay + np.asarray(rate) * V1)[inside]))
@@ -256,7 +255,7 @@ def _claims(
             f"V1' + decay_rate V1 reaches {excess:.3g} along q' = alpha",
             "Claim a smaller rate, or None",
         )
-    error_over_slope = barrier_member(barrier, "error_over_slope")
+    error_over_slope = barrier.error_over_slope
     if error_over_slope(tube, tube.q_d) is not None:
         q = tube.q_d + xi * np.where(xi > 0, tube.k_u, tube.k_l)
         found = np.asarray(jax.jit(jax.vmap(lambda q: error_over_slope(tube, q)))(q))
@@ -271,7 +270,7 @@ def _claims(
         findings.require(
             np.all(np.isfinite(found)), "error_over_slope is not finite somewhere", remedy
         )
-    xi_bound = barrier_member(barrier, "xi_bound")
+    xi_bound = barrier.xi_bound
     if xi_bound(jnp.asarray(V1[0]), tube) is not None:
         claimed = np.asarray(jax.jit(jax.vmap(lambda V: xi_bound(V, tube)))(V1))
         kept = (np.abs(xi) <= claimed * (1 + 1e-9) + 1e-12)[inside]

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.control.decays import Decay
-from iblf_jax.control.decays._base import decay_member
 from iblf_jax.testing._contract import Findings, call_has_shape, check_function, has_shape
 from iblf_jax.testing.joints import examine_joints
 
@@ -45,8 +44,7 @@ def check_decay(decay: Any, *, n: int | None = None) -> None:
             "The gain of a joint is a function of the V of that joint",
         )
         _gains_at_every_value(findings, decay, k)
-        for name in ("band", "deadline"):
-            stated = decay_member(decay, name)()
+        for name, stated in (("band", decay.band()), ("deadline", decay.deadline())):
             if stated is not None:
                 has_shape(findings, f"{name}()", stated, (joints,))
                 findings.require(np.all(np.asarray(stated) > 0), f"{name}() is not positive")

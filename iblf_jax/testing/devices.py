@@ -12,11 +12,9 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from iblf_jax.control.actuators import Actuator, Delivered
-from iblf_jax.control.actuators._base import smooth
 from iblf_jax.control.sensors import Measurement, Sensor
-from iblf_jax.control.sensors._base import sensor_member, unrounded
 from iblf_jax.core import checks
-from iblf_jax.core.optional import has_members
+from iblf_jax.core.attributes import has_members
 from iblf_jax.testing._contract import (
     Findings,
     check_function,
@@ -61,7 +59,7 @@ def check_sensor(sensor: Any, *, n: int | None = None) -> None:
         in_both_types(findings, _measures, fitted, given, normal, period)
 
         def outputs(sensor, given, normal, period):
-            sensor = unrounded(sensor)
+            sensor = sensor.unrounded
             measured, state = sensor.measure(*given, normal, period, sensor.init(*given, period))
             found = leaves_by_name("further levels", measured.higher)
             return found | {"q": measured.q, "dq": measured.dq} | leaves_by_name("state", state)
@@ -71,9 +69,9 @@ def check_sensor(sensor: Any, *, n: int | None = None) -> None:
 
 def _state_for(sensor: Any, rng: np.random.Generator, joints: int) -> tuple[jax.Array, ...]:
     """A random state as the sensor receives it: (q, q'), or (x,)."""
-    if not sensor_member(sensor, "receives_x"):
+    if not sensor.receives_x:
         return tuple(jnp.asarray(rng.uniform(-1, 1, (2, joints))))
-    order = sensor_member(sensor, "order") or DEFAULT_LEVELS
+    order = sensor.order or DEFAULT_LEVELS
     return (jnp.asarray(rng.uniform(-1, 1, (order, joints))),)
 
 
@@ -124,7 +122,7 @@ def check_actuator(
         in_both_types(findings, _delivers, fitted, command, dq)
 
         def outputs(actuator, command, dq):
-            actuator = smooth(actuator)
+            actuator = actuator.smooth
             delivered = actuator.deliver(command, dq, actuator.init(0.9 * command))
             return {"tau": delivered.tau} | leaves_by_name("rate", delivered.rate)
 
@@ -132,7 +130,7 @@ def check_actuator(
         tested = [command]
         if torques is None:
             tested = [size * command / jnp.max(jnp.abs(command)) for size in SMALL_TORQUES]
-        _starts_at_its_torque(findings, smooth(fitted), tested)
+        _starts_at_its_torque(findings, fitted.smooth, tested)
 
 
 def _range_of(torques: Any) -> tuple[np.ndarray, np.ndarray]:

@@ -79,25 +79,23 @@ def _undeclared(member: Any) -> list[Any]:
 @contextmanager
 def examine_joints(
     member: Any,
-    protocol: type,
+    base: type,
     n: int | None,
     name: str,
-    optional: tuple[str, ...] = (),
 ) -> Iterator[tuple[Findings, Any, int]]:
     """The context of a checker whose component has one number per joint, as `examine`.
 
     Args:
       member: the component.
-      protocol: contract of the family.
+      base: base class of the family.
       n: number of joints; that of the leaves if None.
       name: what messages call the component.
-      optional: members of the protocol that the component may lack.
 
     Yields:
       The findings, the component in float64 for n joints, and n.
     """
     check_number(n)
-    with examine(member, protocol.__name__, protocol, optional) as findings:
+    with examine(member, base.__name__, base) as findings:
         n = number_of_joints(findings, member, n)
         yield findings, fitted_to(in_dtype(member, "float64"), n, name), n
 

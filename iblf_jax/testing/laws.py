@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.control.controllers import Command, Controller, WithDrive
-from iblf_jax.control.controllers._base import law_member
+from iblf_jax.control.controllers._base import adopt_layers
 from iblf_jax.core import notices
 from iblf_jax.core.pytree import field_values, unwrapped
 from iblf_jax.core.status import VIOLATED, Status
@@ -71,9 +71,10 @@ def check_law(
     """
     check_scenario(scenario, n)
     with examine(law, "Controller", Controller) as findings:
+        adopt_layers(law)
         base = in_dtype(scenario_for(findings, law, scenario, n), "float64")
         speeds = base.velocity_bounds
-        if speeds is None and law_member(unwrapped(law), "needs_velocity_bounds"):
+        if speeds is None and unwrapped(law).needs_velocity_bounds:
             speeds = Bounds(lower=Constant(-SPEED), upper=Constant(SPEED))
         plant = law.drive if isinstance(law, WithDrive) else base.plant
         try:
@@ -81,7 +82,7 @@ def check_law(
                 base, controller=law, velocity_bounds=speeds, plant=plant, model=base.model
             )
             base = in_dtype(base, "float64")
-            law_member(unwrapped(law), "check_start")(base.context)
+            unwrapped(law).check_start(base.context)
         except ValueError as error:
             findings.stop(f"a Scenario does not accept it ({error})")
         in_both_types(findings, _structure, base)
@@ -118,8 +119,8 @@ def _declarations(
     command.
     """
     inner = unwrapped(law)
-    gains = law_member(inner, "gains")
-    if gains is not law_member.defaults["gains"]:
+    gains = inner.gains
+    if gains is not Controller.gains:
         names = tuple(field_values(inner))
         unknown = [name for name in gains if name not in names]
         findings.require(
@@ -127,7 +128,7 @@ def _declarations(
             f"gains = {gains!r} has names that are no field: {', '.join(map(repr, unknown))}",
             f"Its fields are {', '.join(names)}",
         )
-    if law_member(law, "uses_observer"):
+    if law.uses_observer:
         return
     t, measured, f_hat, context = arguments
     with_estimate = outputs(law, t, measured, f_hat, context)
@@ -146,7 +147,7 @@ def _structure(findings: Findings, scenario: Scenario) -> None:
     q = scenario.initial.q
     t = jnp.zeros((), q.dtype)
     measured = law_state(scenario, *start_levels(scenario))
-    names = "x" if law_member(unwrapped(law), "receives_x") else "q, dq"
+    names = "x" if unwrapped(law).receives_x else "q, dq"
     state = shape_of(findings, f"init({names}, context)", law.init, *measured, context)
     label = f"command(t, {names}, f_hat, context, state)"
     f_hat = jnp.zeros(estimate_shape(scenario), q.dtype)

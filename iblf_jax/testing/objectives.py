@@ -37,7 +37,8 @@ from iblf_jax.tuning.quantities import (
     Quantities,
     Quantity,
     TimeIntegral,
-    quantity_member,
+    has_curvature,
+    has_hessian,
 )
 
 DIRECTIONS = 3
@@ -129,7 +130,7 @@ def _quantity(findings: Findings, quantity: Any, duration: float, n: int) -> Non
         np.allclose(largest, exact),
         f"the largest of its pieces, {largest}, is not its exact value, {np.asarray(exact)}",
     )
-    if quantity_member(quantity, "hessian") is not None:
+    if has_hessian(quantity):
         _second_order(findings, quantity, numbers, flags)
 
 
@@ -147,16 +148,15 @@ def _structure(findings: Findings, quantity: Any, first: Any) -> None:
         f"the pieces of finish(acc) have shape {shape}",
         "They must be (m,): value[None] if it is one",
     )
-    curvature = quantity_member(quantity, "curvature")
-    if curvature is None:
+    if not has_curvature(quantity):
         return
     findings.require(
-        quantity_member(quantity, "hessian") is not None,
+        has_hessian(quantity),
         "it has `curvature` without `hessian`",
         "Second-order methods need both",
     )
     label = "curvature(acc, sample)"
-    outer = shape_of(findings, label, curvature, acc, first)
+    outer = shape_of(findings, label, quantity.curvature, acc, first)
     remedy = "It must be an iblf_jax.engine.derivatives.Outer"
     findings.result_is(isinstance(outer, Outer), label, outer, remedy)
     size, weight = abstract_shape(outer.vector), abstract_shape(outer.weight)
@@ -212,7 +212,7 @@ def _gauss_newton(
 
     def accumulate(acc, sample):
         outer = Outer(jnp.zeros_like(sample.e1), jnp.zeros_like(sample.e1))
-        if quantity_member(quantity, "curvature") is not None:
+        if has_curvature(quantity):
             outer = quantity.curvature(acc, sample)
         weight = jnp.broadcast_to(outer.weight, outer.vector.shape)
         return quantity.update(acc, sample), (outer.vector, weight)

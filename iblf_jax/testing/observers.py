@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.control.observers import Observer
-from iblf_jax.control.observers._base import observer_member
 from iblf_jax.core import checks
 from iblf_jax.testing._contract import (
     Findings,
@@ -54,11 +53,11 @@ def check_observer(observer: Any, *, model: Any = None, n: int | None = None) ->
         leaves.
     """
     check_number(n)
-    receives_x = observer_member(observer, "receives_x")
-    if model is not None:
-        check_model(model, receives_x)
     with examine(observer, "Observer", Observer) as findings:
-        if model is None:
+        receives_x = observer.receives_x
+        if model is not None:
+            check_model(model, receives_x)
+        else:
             joints = number_of_joints(findings, observer, n)
             model = plant_of(levels_of(observer), joints) if receives_x else arm_of(joints)
         check_joints_of(n, model, "model")
@@ -102,16 +101,16 @@ class Case(NamedTuple):
 def _case(observer: Any, model: Any, n: int) -> Case:
     """Random arguments for an observer of robots, or of plants in strict-feedback form."""
     rng = np.random.default_rng(3)
-    if not observer_member(observer, "receives_x"):
+    if not observer.receives_x:
         q, dq, tau = jnp.asarray(rng.uniform(-1, 1, (3, n)))
         return Case((q, 0.5 * dq), (q, dq), tau)
-    observer_member(observer, "check_model")(model)
+    observer.check_model(model)
     x, tau = jnp.asarray(rng.uniform(-1, 1, (model.order, n))), jnp.asarray(rng.uniform(-1, 1, n))
     return Case((x.at[1].multiply(0.5),), (x,), tau)
 
 
 def _structure(findings: Findings, observer, t, case: Case, model) -> None:
-    receives_x = observer_member(observer, "receives_x")
+    receives_x = observer.receives_x
     names = "x" if receives_x else "q, dq"
     state = shape_of(findings, f"init({names}, model)", observer.init, *case.start, model)
     label = f"estimate(t, {names}, model, state)"
@@ -122,11 +121,11 @@ def _structure(findings: Findings, observer, t, case: Case, model) -> None:
     arguments = (t, *case.measured, case.tau, model, state)
     rate = shape_of(findings, label, observer.derivative, *arguments)
     same_structure(findings, label, rate, state)
-    if observer_member(observer, "complete") is not None:
+    if observer.completes:
         label = f"complete(t, {names}, model, state)"
         arguments = (t, *case.measured, model, state)
         call_has_shape(findings, label, observer.complete, arguments, shape)
-    if observer_member(observer, "advance") is not None:
+    if observer.advances:
         label = f"advance(t, {names}, tau, model, state, period)"
         arguments = (t, *case.measured, case.tau, model, state, jnp.asarray(1e-3, t.dtype))
         after = shape_of(findings, label, observer.advance, *arguments)

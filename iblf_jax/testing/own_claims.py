@@ -8,9 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.certificates.claims import OWN_CLAIM_METHODS
-from iblf_jax.control.controllers._base import law_member
-from iblf_jax.core.optional import attributes, has_members
+from iblf_jax.certificates.claims import OWN_CLAIM_METHODS, stated_methods, states_disturbance_terms
+from iblf_jax.core.attributes import attributes, has_members
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.simulation.levels import estimate_shape, law_state, start_levels
 from iblf_jax.simulation.scenario import Scenario
@@ -28,7 +27,7 @@ def check_claims(findings: Findings, scenario: Scenario) -> None:
     The inequalities are tested with an exact estimate, f_tilde = 0.
     """
     law: Any = scenario.controller
-    stated = [name for name in OWN_CLAIM_METHODS if has_members(law, name)]
+    stated = stated_methods(law)
     if not stated:
         return
     remedy = "A law states both, or neither: iblf_jax.controllers.LyapunovLaw"
@@ -84,16 +83,17 @@ def _shapes(findings: Findings, scenario: Scenario) -> None:
     own = law.init(*measured, context)
     arguments: tuple[Any, ...] = (t, *measured, zero, context, own)
     names = "q, dq, f_tilde"
-    if law_member(unwrapped(law), "receives_x"):
+    if unwrapped(law).receives_x:
         names = "x, d_tilde"
     for name, method in attributes(law, OWN_CLAIM_METHODS).items():
         label = f"{name}(t, {names}, context, state)"
         _is_summable(findings, label, shape_of(findings, label, method, *arguments), q)
-    disturbance_terms = law_member(law, "disturbance_terms")
-    if disturbance_terms is not None:
+    if states_disturbance_terms(law):
         label = f"disturbance_terms(t, {names}, rate, context, state)"
         arguments = (t, *measured, zero, zero, context, own)
-        _is_summable(findings, label, shape_of(findings, label, disturbance_terms, *arguments), q)
+        _is_summable(
+            findings, label, shape_of(findings, label, law.disturbance_terms, *arguments), q
+        )
 
 
 def _is_summable(findings: Findings, label: str, got: Any, like: jax.Array) -> None:

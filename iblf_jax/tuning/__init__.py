@@ -20,7 +20,7 @@ and validates the result on fresh runs.
 | `problem` | `TuningProblem`: all of the above in one object |
 | `rollouts`, `runs` | batches of runs without and with derivatives |
 | `evaluation` | value and derivatives of the problem |
-| `solvers` | the Protocol `Solver`; `SQP`, `LBFGS`, `Adam`, `Optax`, and those of other libraries |
+| `solvers` | the contract `Solver`; `SQP`, `LBFGS`, `Adam`, `Optax`, and those of other libraries |
 | `starts`, `search`, `checkpoints` | where a search begins, its steps, its stored state |
 | `optimality` | multipliers and residuals at the returned gains |
 | `result`, `report` | what `tune` returns, and its validation on fresh runs |

@@ -19,7 +19,7 @@ import numpy as np
 import optax
 
 from iblf_jax.core import checks
-from iblf_jax.core.optional import has_members
+from iblf_jax.core.attributes import has_members
 from iblf_jax.core.program_digest import CallsPythonError, program_digest
 from iblf_jax.core.pytree import field_values
 from iblf_jax.core.whole_files import written_whole

@@ -51,7 +51,6 @@ from iblf_jax.tuning.quantities import (
     MetricResult,
     Peak,
     TimeIntegral,
-    quantity_member,
 )
 from iblf_jax.tuning.quantities import Quantity as Quantity
 from iblf_jax.world import plants
@@ -87,7 +86,8 @@ class Term:
     name: str = static(default="term")
 
     def check(self) -> None:
-        """Raises ValueError for an unknown shape."""
+        """Raises ValueError for an unknown shape, or something that is not a quantity."""
+        checks.conforms("Term.quantity", self.quantity, Quantity)
         checks.one_of("Term.shape", self.shape, ("plain", "above"))
 
     def value(self, x: jax.Array) -> jax.Array:
@@ -129,7 +129,10 @@ class Requirement:
     function: str = static(default="")
 
     def check(self) -> None:
-        """Raises ValueError for a share above 1, or another event."""
+        """Raises ValueError for a share above 1, another event, or something that is not a
+        quantity.
+        """
+        checks.conforms("Requirement.quantity", self.quantity, Quantity)
         if checks.is_concrete(self.allowed) and self.allowed > 1:
             raise checks.fail("Requirement.allowed", self.allowed, A_SHARE)
         checks.one_of("Requirement.event", self.event, ("value", "violated"))
@@ -277,7 +280,7 @@ def sharper(objective: Objective, factor: float) -> Objective:
     """
     terms = []
     for term in _composed(objective).terms:
-        smoothing = quantity_member(term.quantity, "smoothing")
+        smoothing = term.quantity.smoothing
         if smoothing is not None:
             quantity: Any = term.quantity
             quantity = dataclasses.replace(quantity, smoothing=factor * smoothing)
@@ -288,9 +291,7 @@ def sharper(objective: Objective, factor: float) -> Objective:
 
 def is_smoothed(objective: Objective) -> bool:
     """Whether a term of the objective is smoothed, so that `sharper` changes it."""
-    return any(
-        quantity_member(t.quantity, "smoothing") is not None for t in _composed(objective).terms
-    )
+    return any(t.quantity.smoothing is not None for t in _composed(objective).terms)
 
 
 def depends_on_torque(objective: Objective) -> bool:
@@ -298,7 +299,7 @@ def depends_on_torque(objective: Objective) -> bool:
     do so.
     """
     return any(
-        quantity_member(q, "signal") in ("torque", "torque_rate")
+        q.signal in ("torque", "torque_rate")
         for q in _composed(objective).quantities
         if not (isinstance(q, MetricResult) and isinstance(q.fold, Tracking | Settling))
     )

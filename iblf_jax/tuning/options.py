@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, Self
 import jax
 
 from iblf_jax.core import checks
+from iblf_jax.core.families import required_members
 from iblf_jax.engine import check_backend, differentiates_forward
 from iblf_jax.studies.designs import MAX_RUNS
 from iblf_jax.studies.options import checked_run_options
@@ -183,9 +184,8 @@ def _solver(given: Any) -> Solver | None:
     if isinstance(given, str):
         checks.one_of("solver", given, ("auto", *SOLVERS))
         return None if given == "auto" else SOLVERS[given]()
-    members = tuple(x for x in vars(Solver) if not x.startswith("_"))
     expected = f"a solver: one of {', '.join(map(repr, SOLVERS))}, or as ij.tuning.SQP()"
-    checks.offers("solver", given, members, expected)
+    checks.offers("solver", given, required_members(Solver), expected)
     return given
 
 

@@ -25,19 +25,20 @@ along the run; `iblf_jax.testing.check_objective` checks it.
 
 from __future__ import annotations
 
+import abc
 from collections.abc import Sequence
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 
 from iblf_jax.core import checks
+from iblf_jax.core.families import Part
 from iblf_jax.core.joints import Selection, indices, selection
-from iblf_jax.core.optional import OptionalMembers
 from iblf_jax.core.pytree import component, leaf, static
 from iblf_jax.core.units import INPUT, POSITION, VELOCITY, PlantUnit
 from iblf_jax.engine import Outer
-from iblf_jax.simulation.metrics import Fold, fold_member
+from iblf_jax.simulation.metrics import Fold
 from iblf_jax.simulation.signals import Sample
 
 INITIAL_PEAK = 1e6
@@ -46,27 +47,61 @@ EDGE_WIDTH = 0.1
 """Width of the soft edge of a tolerance, as a part of it."""
 
 
-class Quantity(Protocol):
-    """The contract of a quantity: a component with these methods."""
+class Quantity(Part):
+    """The contract of a quantity."""
 
+    signal: str = "torque"
+    """What it is computed from, one of `TUNED_SIGNALS`; a user's quantity is assumed to depend on
+    the torque."""
+    smoothing: Any = None
+    """Of a maximum, a leaf that `tune` decreases; None for a quantity that is smooth itself."""
+
+    @property
+    def needs(self) -> str | None:
+        """The optional signal of a run that it reads."""
+        return None
+
+    @abc.abstractmethod
     def init(self, sample: Sample) -> Any:
         """The accumulator before the first sample."""
-        ...
 
+    @abc.abstractmethod
     def update(self, acc: Any, sample: Sample) -> Any:
         """The accumulator after one more sample."""
-        ...
 
+    @abc.abstractmethod
     def finish(self, acc: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
         """The smooth value and the exact one (the report's), () each, and the pieces of which the
         exact one is the largest, (m,).
         """
-        ...
+
+    def curvature(self, acc: Any, sample: Sample) -> Outer | None:
+        """What one more sample adds to `products`; None for a quantity without them."""
+        return None
+
+    def hessian(
+        self, products: jax.Array, pieces: jax.Array, slopes: jax.Array
+    ) -> jax.Array | None:
+        """The Gauss-Newton matrix, (D, D); None for a quantity without one.
+
+        Args:
+          products: sum of the products of the tangents that `curvature` gives, (D, D).
+          pieces: of `finish`, (m,).
+          slopes: their gradients, (D, m).
+        """
+        return None
 
 
-quantity_member = OptionalMembers(hessian=None, curvature=None, smoothing=None, signal="torque")
-"""Reads the members for second-order methods, which a quantity may lack, and those of `Peak`.  A
-quantity without a signal is assumed to depend on the torque."""
+def has_curvature(quantity: Quantity) -> bool:
+    """Whether a quantity states `curvature`."""
+    return type(quantity).curvature is not Quantity.curvature
+
+
+def has_hessian(quantity: Quantity) -> bool:
+    """Whether a quantity states `hessian`."""
+    return type(quantity).hessian is not Quantity.hessian
+
+
 DEFICITS = {"deficit": POSITION, "velocity_deficit": VELOCITY, "region_deficit": "m"}
 """Signals of which the largest is minus a margin -> unit; their sign counts, not their absolute
 value."""
@@ -175,7 +210,7 @@ def _last_torque(acc, sample: Sample) -> jax.Array:
 
 
 @component
-class TimeIntegral:
+class TimeIntegral(Quantity):
     """int |w y|^2 dt over the samples with t >= after.
 
     Args:
@@ -245,7 +280,7 @@ class TimeIntegral:
 
 
 @component
-class Peak:
+class Peak(Quantity):
     """max over time and joints of w_i y_i (of its size for error and torque), over the samples with
     t >= after.
 
@@ -355,7 +390,7 @@ class Peak:
 
 
 @component
-class MetricResult:
+class MetricResult(Quantity):
     """sum_i w_i m_i of a named result m of a metric's fold; m is one number or one a joint.
 
     It has no matrix of second derivatives: `tune` estimates that from changes of the gradient.
@@ -382,7 +417,7 @@ class MetricResult:
     @property
     def needs(self) -> str | None:
         """The optional signal of a run that its fold reads."""
-        return fold_member(self.fold, "needs")  # type: ignore[no-any-return]
+        return self.fold.needs
 
     def init(self, sample: Sample):
         """The fold's accumulator."""
@@ -423,7 +458,7 @@ MEMBERS = {"integral": TimeIntegral, "peak": Peak, "metric_result": MetricResult
 
 
 @component
-class Quantities:
+class Quantities(Fold):
     """All quantities of a problem as one fold; results (K,) each.
 
     Args:
@@ -436,7 +471,7 @@ class Quantities:
     @property
     def curvatures(self) -> int:
         """Number of `Outer`."""
-        return sum(_has_curvature(part) for part in self.parts)
+        return sum(has_curvature(part) for part in self.parts)
 
     def init(self, sample: Sample):
         """The quantities' accumulators."""
@@ -468,7 +503,7 @@ class Quantities:
     def curvature(self, acc, sample: Sample) -> tuple[Outer, ...]:
         """One `Outer` for each quantity that offers one."""
         pairs = zip(self.parts, acc, strict=True)
-        return tuple(part.curvature(a, sample) for part, a in pairs if _has_curvature(part))
+        return tuple(part.curvature(a, sample) for part, a in pairs if has_curvature(part))
 
     def hessians(
         self,
@@ -488,12 +523,7 @@ class Quantities:
         none = jnp.zeros((size, size), slopes[0].dtype)
         found = []
         for part, own, slope in zip(self.parts, pieces, slopes, strict=True):
-            product = next(remaining) if _has_curvature(part) else none
-            hessian = quantity_member(part, "hessian")
-            found.append(none if hessian is None else hessian(product, own, slope))
+            product = next(remaining) if has_curvature(part) else none
+            hessian = part.hessian(product, own, slope)
+            found.append(none if hessian is None else hessian)
         return jnp.stack(found)
-
-
-def _has_curvature(part: Any) -> bool:
-    """Whether a quantity has the optional method of the contract."""
-    return quantity_member(part, "curvature") is not None

@@ -51,8 +51,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.control.actuators._base import actuator_member
-from iblf_jax.control.sensors._base import sensor_member, unrounded
 from iblf_jax.core import checks, programs
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.engine.period import radius_at
@@ -409,7 +407,7 @@ def drive_exceeded(scenario: Scenario) -> str:
     rest; empty where it does not.
     """
     actuator = scenario.actuator
-    if scenario.sampling is None or actuator_member(actuator, "unlimited") is None:
+    if scenario.sampling is None or actuator.unlimited is actuator:
         return ""
     commands = _command_steps(scenario, jnp.asarray(TIMES, scenario.initial.q.dtype))
     zero = jnp.zeros_like(scenario.initial.q)
@@ -428,8 +426,8 @@ def _command_steps(scenario: Scenario, times: jax.Array) -> tuple[jax.Array, jax
     """
     sensor = scenario.sensor
     # A sensor without rounding or resolution has no counts.
-    smooth = dataclasses.replace(scenario, sensor=unrounded(sensor))
-    resolution = jnp.asarray(sensor_member(sensor, "resolution"), times.dtype)
+    smooth = dataclasses.replace(scenario, sensor=sensor.unrounded)
+    resolution = jnp.asarray(sensor.resolution, times.dtype)
 
     def command(t: jax.Array, state: LoopState, y: jax.Array, normal: jax.Array) -> jax.Array:
         moved = _with_levels_of_sensor(state, y)

@@ -25,7 +25,6 @@ from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.units import unit_text
 from iblf_jax.tuning.objectives import Objective
 from iblf_jax.tuning.options import TuningRunOptions
-from iblf_jax.tuning.quantities import quantity_member
 from iblf_jax.tuning.robust import combine, worst_count, worst_share
 from iblf_jax.tuning.samples import Sample, SampleRequest, is_random, sample_runs
 from iblf_jax.world import plants
@@ -252,7 +251,7 @@ def has_rate_of_held_torque(scenario: Scenario, objective: Objective) -> bool:
     """Whether an objective contains the rate of a torque that a sampled loop applies without a
     lag.
     """
-    has_rate = any(quantity_member(q, "signal") == "torque_rate" for q in objective.quantities)
+    has_rate = any(q.signal == "torque_rate" for q in objective.quantities)
     if scenario.sampling is None or not has_rate:
         return False
     actuator = scenario.actuator

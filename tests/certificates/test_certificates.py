@@ -900,7 +900,9 @@ def test_where_an_own_claim_is_not_made(own):
 
 
 def test_half_a_claim_is_refused(own):
-    half = ij.component(type("Half", (Passive,), {"__annotations__": {}, "decay": property()}))
+    half = ij.component(
+        type("Half", (Passive,), {"__annotations__": {}, "decay": ij.controllers.Controller.decay})
+    )
     with pytest.raises(ValueError, match="with lyapunov and without decay"):
         certify(dataclasses.replace(own, controller=half(slope=3.0, K=2.0)), **OWN)
 
@@ -976,28 +978,31 @@ def test_batch_reports_the_worst_run(corrected_run, batch, corrected_certificate
     assert f"worst {sound.worst_run}" in repr(sound)
 
 
-class Study:
-    """What `certify` asks of a study."""
+class Study(ij.Study):
+    """A study of known runs."""
 
-    def __init__(self, runs):
-        self.runs, self.metrics, self.status, self.replayed = runs, runs.metrics, runs.status, []
+    duration = dt = 1.0
+
+    def __init__(self, scenario, known):
+        members = {"scenario": scenario, "metrics": known.metrics, "status": known.status}
+        vars(self).update(members, known=known, replayed=[])
 
     def __len__(self):
-        return len(self.runs)
+        return len(self.known)
 
     def replay(self, index):
         self.replayed.append(index)
-        return self.runs[index]
+        return self.known[index]
 
 
 @pytest.mark.slow
 def test_study_is_judged_at_its_worst_runs(corrected_run, batch):
-    study = Study(batch)
+    study = Study(corrected_run.scenario, batch)
     nearest = int(np.argmin(np.min(np.asarray(batch.metrics.xi_margin), axis=1)))
     certificate = certify(corrected_run.scenario, study, worst=1)
     assert study.replayed == [nearest]
     assert certificate.runs == (nearest,)
-    assert certify(corrected_run.scenario, Study(batch), worst=None).runs == (0, 1, 2)
+    assert certify(study.scenario, study, worst=None).runs == (0, 1, 2)
 
 
 @pytest.mark.slow
@@ -1016,7 +1021,7 @@ def test_study_of_another_scenario_is_refused(corrected_run):
 def test_a_study_in_place_of_the_scenario_is_refused_with_the_right_call():
     no_runs = SimpleNamespace(metrics={}, status=())
     with pytest.raises(ValueError, match=r"got 'Study'.*certify\(scenario, study\)"):
-        certify(Study(no_runs))
+        certify(Study(None, no_runs))
 
 
 # --- the gap --------------------------------------------------------------------------------------

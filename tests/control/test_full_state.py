@@ -13,8 +13,6 @@ from scipy.integrate import solve_ivp
 import iblf_jax as ij
 from iblf_jax import barriers, bounds, controllers
 from iblf_jax.certificates.proof_terms import rounding, terms_at
-from iblf_jax.control.barriers._base import ratio_jumps
-from iblf_jax.control.controllers._base import switching_functions
 from iblf_jax.simulation.closed_loop import initial_state
 
 H = np.pi / 2
@@ -643,15 +641,15 @@ def test_a_barrier_states_whether_its_ratio_jumps(name):
         jnp.zeros(1), jnp.zeros(1), -jnp.ones(1), 2.0 * jnp.ones(1), jnp.zeros(1), jnp.zeros(1)
     )
     left, right = (FAMILY[name].error_over_slope(tube, jnp.array([e])) for e in (-1e-9, 1e-9))
-    assert bool(abs(left - right)[0] > 1e-6) == ratio_jumps(FAMILY[name])
+    assert bool(abs(left - right)[0] > 1e-6) == FAMILY[name].ratio_jumps
     law = controllers.FullState(k1=2.0, K2=20.0, c=1.0, velocity_barrier=FAMILY[name])
     scenario = ij.with_parts(ij.presets.zhang_yan_2024_full_state(), controller=law)
     wrapped = controllers.Saturated(law=law, limit=50.0)
     for each in (law, wrapped):
-        found = switching_functions(
-            each, jnp.zeros(()), scenario.initial.q, scenario.initial.dq, scenario.context, ()
+        found = each.switching(
+            jnp.zeros(()), scenario.initial.q, scenario.initial.dq, scenario.context, ()
         )
-        assert (found is not None) == ratio_jumps(FAMILY[name])
+        assert (found is not None) == FAMILY[name].ratio_jumps
 
 
 @pytest.mark.parametrize(

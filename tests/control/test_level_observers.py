@@ -268,3 +268,22 @@ def test_fields_that_do_not_fit_are_refused():
     ):
         with pytest.raises(ValueError, match=text):
             make()
+
+
+def test_an_observer_of_levels_needs_no_further_method():
+    @ij.component
+    class Still:
+        receives_x = True
+
+        def init(self, x, model):
+            return ()
+
+        def estimate(self, t, x, model, state):
+            return 0.0 * x
+
+        def derivative(self, t, x, u, model, state):
+            return ()
+
+    observer = Still()
+    ij.testing.check_observer(observer)
+    assert not observer.advances and not observer.completes and observer.at_period(1e-3) is observer

@@ -1,5 +1,5 @@
 """Actuators map the command of a law to the delivered torque.  The contract is the
-protocol `Actuator`.
+base class `Actuator`.
 """
 
 from iblf_jax.control.actuators._base import Actuator as Actuator

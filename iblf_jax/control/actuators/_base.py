@@ -7,11 +7,13 @@ loop has the delay of the actuator `Delay`.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Protocol
+import abc
+from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 
-from iblf_jax.core.optional import OptionalMembers
+from iblf_jax.core.families import Part
 
 State = Any
 """A pytree of arrays of floats; `()` for an actuator without memory."""
@@ -28,33 +30,64 @@ class Delivered(NamedTuple):
     """Rate of the actuator's state, per second."""
 
 
-class Actuator(Protocol):
+class Actuator(Part):
     """The contract of an actuator.
 
     The command of a law is a torque.  Under a law that commands another input, such as a voltage,
     the actuator may take that input; the observer receives the command, so the observer of such a
     loop may not use it as a torque.
 
-    An actuator may have further members:
-
-    - `unlimited`: the same actuator without its limits.  The fastest mode of a sampled loop is
-      computed with it.
-    - `smooth`: an actuator with the same state, without a dead zone, play and rounding.  The
-      fastest mode of every loop is computed with it.
-    - `deviation`: where it has `smooth`, the width of the interval in which the difference of both
-      torques lies, () or (n,) [N m].  The numerical error of a run is bounded with it.
-    - `resolution`, the distance between two levels, () or (n,) [N m], of an actuator that rounds;
-      with it `distance_to_jump(command, dq, state)`, the distance of the command to the next jump
-      of the torque, (n,) [N m].
-    - `at(t)`: the actuator at time t [s], if it changes with time, such as a drive that fails.
-    - `jump_times()`: the times (m,) [s] at which it is discontinuous in time.  Steps of a run are
-      divided there, as for disturbances.
+    An actuator that changes with time, such as a drive that fails, has `at(t)`, the actuator at
+    time t [s], and `jump_times()`, the times (m,) [s] at which it is discontinuous in time.  Steps
+    of a run are divided there, as for disturbances.
     """
 
+    @property
+    def unlimited(self) -> Actuator:
+        """The same actuator without its limits.  The fastest mode of a sampled loop is computed
+        with it.
+        """
+        return self
+
+    @property
+    def smooth(self) -> Actuator:
+        """An actuator with the same state, without a dead zone, play and rounding.  The fastest
+        mode of every loop is computed with it.
+        """
+        return self
+
+    @property
+    def deviation(self) -> Any:
+        """The width of the interval in which the difference to the torque of `smooth` lies, () or
+        (n,) [N m]; None if it is not known.  The numerical error of a run is bounded with it.
+        """
+        return None
+
+    @property
+    def resolution(self) -> Any:
+        """The distance between two levels of an actuator that rounds, () or (n,) [N m], or None."""
+        return None
+
+    @property
+    def input_delay(self) -> Any:
+        """The `Delay` of an actuator or of its first part; None without one."""
+        return None
+
+    def with_history(self, dt: float) -> Actuator:
+        """The actuator with a history of commands that is long enough for steps dt [s]."""
+        return self
+
+    def distance_to_jump(self, command: jax.Array, dq: jax.Array, state: State) -> jax.Array:
+        """The distance of the command to the next jump of the torque of an actuator that rounds,
+        (n,) [N m]; 0 where it is not known.
+        """
+        return jnp.zeros_like(command)
+
+    @abc.abstractmethod
     def init(self, tau: jax.Array) -> State:
         """The state in which the actuator delivers the torque `tau`, (n,) [N m]."""
-        ...
 
+    @abc.abstractmethod
     def deliver(self, command: jax.Array, dq: jax.Array, state: State) -> Delivered:
         """The torque and the rate of the state.
 
@@ -63,32 +96,3 @@ class Actuator(Protocol):
           dq: velocity of the joints, (n,) [rad/s].
           state: of the actuator.
         """
-        ...
-
-
-actuator_member = OptionalMembers(
-    unlimited=None,
-    smooth=None,
-    deviation=None,
-    resolution=None,
-    input_delay=None,
-    with_history=None,
-)
-"""Reads optional members of an actuator.  Only `Delay` and a `Chain` with a `Delay` have the last
-two: `input_delay` is that `Delay`, and `with_history(dt)` is the actuator with a history that is
-long enough for steps dt [s]."""
-
-
-def unlimited(actuator: Actuator) -> Actuator:
-    """An actuator without its limits; itself if it declares none."""
-    return actuator_member.variant(actuator, "unlimited")  # type: ignore[no-any-return]
-
-
-def smooth(actuator: Actuator) -> Actuator:
-    """An actuator without dead zone, play and rounding; itself if it declares none."""
-    return actuator_member.variant(actuator, "smooth")  # type: ignore[no-any-return]
-
-
-def input_delay(actuator: Actuator) -> Any:
-    """The `Delay` of an actuator or of its first part; None without one."""
-    return actuator_member(actuator, "input_delay")

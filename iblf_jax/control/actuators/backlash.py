@@ -7,13 +7,13 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.actuators._base import Delivered
+from iblf_jax.control.actuators._base import Actuator, Delivered
 from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.core.units import INPUT
 
 
 @component
-class Backlash:
+class Backlash(Actuator):
     """y' = bandwidth (max(u - y - gap/2, 0) + min(u - y + gap/2, 0)),   tau = y.
 
     The torque is constant while it differs from the command by gap/2 at most.  Otherwise it follows

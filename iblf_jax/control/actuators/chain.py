@@ -9,21 +9,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.actuators._base import (
-    Actuator,
-    Delivered,
-    actuator_member,
-    input_delay,
-    smooth,
-    unlimited,
-)
+from iblf_jax.control.actuators._base import Actuator, Delivered
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import component
 from iblf_jax.core.time import as_at, joined, jump_times_of
 
 
 @component
-class Chain:
+class Chain(Actuator):
     """Each actuator receives the torque of the previous one as its command.
 
         u_1 = u,   u_(i+1) = tau_i,   tau = tau_m   for parts 1 to m
@@ -54,7 +47,7 @@ class Chain:
         object.__setattr__(self, "parts", tuple(self.parts))
         for i, part in enumerate(self.parts):
             checks.conforms(f"Chain.parts[{i}]", part, Actuator)
-            if i > 0 and input_delay(part) is not None:
+            if i > 0 and part.input_delay is not None:
                 expected = "a Delay as the first part only"
                 remedy = "It is the command that is late: Chain((Delay(...), ...))."
                 raise checks.fail(f"Chain.parts[{i}]", part, expected, remedy)
@@ -62,20 +55,19 @@ class Chain:
     @property
     def unlimited(self) -> Chain:
         """The same chain without limits."""
-        return dataclasses.replace(self, parts=tuple(map(unlimited, self.parts)))
+        return dataclasses.replace(self, parts=tuple(part.unlimited for part in self.parts))
 
     @property
     def smooth(self) -> Chain:
         """The same chain without dead zones, play and rounding."""
-        return dataclasses.replace(self, parts=tuple(map(smooth, self.parts)))
+        return dataclasses.replace(self, parts=tuple(part.smooth for part in self.parts))
 
     @property
     def deviation(self) -> Any:
         """The sum of those of all parts; None if a part with a dead zone, play or rounding has
         none.
         """
-        parts = [part for part in self.parts if smooth(part) is not part]
-        widths = [actuator_member(part, "deviation") for part in parts]
+        widths = [part.deviation for part in self.parts if part.smooth is not part]
         if any(width is None for width in widths):
             return None
         return sum(widths)
@@ -83,7 +75,7 @@ class Chain:
     @property
     def resolution(self) -> Any:
         """Of the first part that rounds; None without one."""
-        found = [actuator_member(part, "resolution") for part in self.parts]
+        found = [part.resolution for part in self.parts]
         return next((step for step in found if step is not None), None)
 
     def distance_to_jump(self, command: jax.Array, dq: jax.Array, state: Any) -> jax.Array:
@@ -93,8 +85,8 @@ class Chain:
         torque, moves = command, False
         distance = jnp.full(command.shape, jnp.inf)
         for part, state_of_part in zip(self.parts, state, strict=True):
-            if actuator_member(part, "resolution") is not None:
-                own = part.distance_to_jump(torque, dq, state_of_part)  # type: ignore[attr-defined]
+            if part.resolution is not None:
+                own = part.distance_to_jump(torque, dq, state_of_part)
                 distance = jnp.minimum(distance, jnp.zeros_like(own) if moves else own)
             moves = moves or bool(jax.tree.leaves(state_of_part))
             torque = part.deliver(torque, dq, state_of_part).tau
@@ -103,15 +95,14 @@ class Chain:
     @property
     def input_delay(self) -> Any:
         """The `Delay` of the first part; None without one."""
-        return input_delay(self.parts[0])
+        return self.parts[0].input_delay
 
     def with_history(self, dt: float) -> Chain:
         """The same chain, whose delay has a history that is long enough for steps dt [s]."""
-        first, *others = self.parts
-        fitted = actuator_member(first, "with_history")
-        if fitted is None:
+        if self.input_delay is None:
             return self
-        return dataclasses.replace(self, parts=(fitted(dt), *others))
+        first, *others = self.parts
+        return dataclasses.replace(self, parts=(first.with_history(dt), *others))
 
     def at(self, t: jax.Array) -> Chain:
         """The chain as it is at time t [s]."""

@@ -8,14 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.control.actuators._base import Delivered
+from iblf_jax.control.actuators._base import Actuator, Delivered
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.core.units import INPUT, PlantUnit
 
 
 @component
-class DeadZone:
+class DeadZone(Actuator):
     """tau = slope (u - upper) for u > upper,   slope (u - lower) for u < lower,   0 between them.
 
     The torque is a continuous function of the command with a kink at both ends of the zone.  A run

@@ -8,7 +8,7 @@ import math
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.actuators._base import Delivered
+from iblf_jax.control.actuators._base import Actuator, Delivered
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf, static
 
@@ -17,7 +17,7 @@ WHOLE_TOLERANCE = 1e-6
 
 
 @component
-class Delay:
+class Delay(Actuator):
     """tau(t) = u(t - delay) for t >= delay,   the torque that balances gravity before.
 
     The loop keeps the commands of the integrator's stages over the last steps

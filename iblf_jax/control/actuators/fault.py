@@ -7,13 +7,13 @@ import copy
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.actuators._base import Delivered
+from iblf_jax.control.actuators._base import Actuator, Delivered
 from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.core.units import INPUT
 
 
 @component
-class Fault:
+class Fault(Actuator):
     """tau = u for t < time,   tau = effectiveness u + bias for t >= time.
 
     A `Chain` describes several faults: Chain((Fault(0.7, 0.0, 1.0), Fault(0.5, 0.2, 2.0))).  Steps

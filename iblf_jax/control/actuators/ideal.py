@@ -5,12 +5,12 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.actuators._base import Delivered
+from iblf_jax.control.actuators._base import Actuator, Delivered
 from iblf_jax.core.pytree import component
 
 
 @component
-class Ideal:
+class Ideal(Actuator):
     """The applied torque equals the command, without delay.  Source: none; the baseline."""
 
     def init(self, tau: jax.Array) -> tuple[()]:

@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.actuators._base import Delivered
+from iblf_jax.control.actuators._base import Actuator, Delivered
 from iblf_jax.core import checks
 from iblf_jax.core.input_limits import check_lower_limit, is_beyond, lower_or_opposite
 from iblf_jax.core.pytree import Leaf, component, leaf
@@ -16,7 +16,7 @@ from iblf_jax.core.units import INPUT, VELOCITY, PlantUnit
 
 
 @component
-class Motor:
+class Motor(Actuator):
     """A first-order lag with limits of torque and rate, and a torque-speed line.
 
         v = clip(u, lower_limit, limit),   y' = clip(bandwidth (v - y), +-rate_limit),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.actuators._base import Delivered
+from iblf_jax.control.actuators._base import Actuator, Delivered
 from iblf_jax.control.actuators.ideal import Ideal
 from iblf_jax.control.sensors._base import rounded
 from iblf_jax.core.pytree import Leaf, component, leaf
@@ -13,7 +13,7 @@ from iblf_jax.core.units import INPUT
 
 
 @component
-class Quantiser:
+class Quantiser(Actuator):
     """tau = step round(u / step).
 
     Steps of a run are not divided where the torque jumps from one level to the next.  A run of a

@@ -1,5 +1,5 @@
 """Barriers: V1, its slope and the virtual velocity of each.  The contract is the
-protocol `Barrier`.
+base class `Barrier`.
 
 A barrier or a law of your own stays finite at the bound by `guarded_error`, and says so by
 `guard_is_active`.

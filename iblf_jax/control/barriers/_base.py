@@ -20,92 +20,82 @@ velocities (`controllers.FullState`).
 
 from __future__ import annotations
 
+import abc
 import math
-from typing import Any, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.core.optional import OptionalMembers
+from iblf_jax.core.families import Part
 from iblf_jax.core.pytree import Leaf
 from iblf_jax.world.bounds import Tube
 
 GUARD = 1e-3
 """Default distance from the bound, in xi, at which the guard takes over."""
 
-CLAIMS = ("decay_rate", "xi_bound", "error_over_slope", "error_at", "value_unit")
-"""Members that a barrier may lack: it then makes no claim, cannot bound velocities, has a level set
-of V1 that is not known in closed form, or has a V1 without a unit."""
 
-
-class Barrier(Protocol):
+class Barrier(Part):
     """The contract of a barrier.  All arrays are (n,), one number a joint, and joints do
     not mix.
+
+    A barrier without a claim answers None.
     """
 
-    @property
-    def guard(self) -> float:
-        """A static field: the law is exact for |xi| <= 1 - guard; -infinity for a barrier that
-        needs no guard.
-        """
-        ...
+    guard: float
+    """A static field: the law is exact for |xi| <= 1 - guard; -infinity for a barrier that needs no
+    guard."""
+    uses_o: ClassVar[bool] = True
+    """Whether `virtual_velocity` uses `o`."""
+    value_unit: ClassVar[str] = "1"
+    """The unit of V1 where the error is a position, "1" or "rad^2"."""
+    exact_decay: ClassVar[bool] = False
+    """Whether the claim of `decay_rate` is an equality."""
+    ratio_jumps: ClassVar[bool] = True
+    """Whether `error_over_slope` may jump at e1 = 0 in an asymmetric tube."""
 
     @property
-    def uses_o(self) -> bool:
-        """A class attribute: whether `virtual_velocity` uses `o`."""
-        ...
+    def slope_derivatives(self) -> float:
+        """How many continuous derivatives the slope has at e1 = 0."""
+        return math.inf
 
-    @property
-    def value_unit(self) -> str:
-        """A class attribute: the unit of V1, "1" or "rad^2"; "1" for a barrier that does not
-        declare it.
-        """
-        ...
-
+    @abc.abstractmethod
     def value(self, tube: Tube, q: jax.Array) -> jax.Array:
         """V1 of each joint at position q [rad]."""
-        ...
 
+    @abc.abstractmethod
     def slope(self, tube: Tube, q: jax.Array) -> jax.Array:
         """S = dV1/dq of each joint."""
-        ...
 
+    @abc.abstractmethod
     def virtual_velocity(
         self, tube: Tube, q: jax.Array, k1: jax.Array, o: jax.Array | None
     ) -> jax.Array:
         """Alpha of each joint [rad/s], given the gains k1 [1/s] and o [1/s^2]."""
-        ...
 
     def decay_rate(self, k1: jax.Array) -> jax.Array | None:
         """The claim of step one: rate_i [1/s] with V1_i' <= -rate_i V1_i where e2 = 0 and no guard
-        is active, or None for no claim.
-
-        A class attribute `exact_decay = True` states that it is an equality.
+        is active.
         """
-        ...
+        return None
 
     def xi_bound(self, V: jax.Array, tube: Tube) -> jax.Array | None:
-        """The claim on the bounds: b_i with |xi_i| <= b_i wherever V1_i <= V, or None for no claim.
+        """The claim on the bounds: b_i with |xi_i| <= b_i wherever V1_i <= V.
 
         Args:
           V: level of the Lyapunov function, () or (n,), >= 0.
           tube: the tube at that time; for several barriers the level at which a bound is reached
             depends on its width.
         """
-        ...
+        return None
 
     def error_over_slope(self, tube: Tube, q: jax.Array) -> jax.Array | None:
         """The ratio e1/s, finite at e1 = 0, (n,); None for a barrier whose slope is of a higher
-        order there.
-
-        A class attribute `ratio_jumps = False` states that the ratio is continuous at e1 = 0 in an
-        asymmetric tube, too; without it a law assumes that it may jump there.  A class attribute
-        or property `slope_derivatives` states how many continuous derivatives the slope has there;
-        without it a law assumes that it is smooth.
+        order there, which cannot bound velocities.
         """
-        ...
+        return None
 
     def error_at(self, V: jax.Array, tube: Tube, above: jax.Array) -> jax.Array | None:
         """The error e1 at which V1 = V on one side of the tube, inside the bound whatever the guard
@@ -116,40 +106,14 @@ class Barrier(Protocol):
           tube: the tube at that time.
           above: whether the side is the upper one, e1 >= 0, () or (n,) bool.
         """
-        ...
-
-
-barrier_member = OptionalMembers(
-    uses_o=True,
-    value_unit="1",
-    ratio_jumps=True,
-    slope_derivatives=math.inf,
-    exact_decay=False,
-    decay_rate=lambda k1: None,
-    xi_bound=lambda V, tube: None,
-    error_over_slope=lambda tube, q: None,
-    error_at=lambda V, tube, above: None,
-)
-"""Reads what a barrier may lack: without a claim, the answer is None."""
-
-
-def value_unit(barrier: Barrier) -> str:
-    """The unit of a barrier's V1 where its error is a position, "1" if the barrier declares
-    none.
-    """
-    return barrier_member(barrier, "value_unit")  # type: ignore[no-any-return]
+        return None
 
 
 def has_ratio(barrier: Barrier) -> bool:
     """Whether a barrier states the ratio e/s, which laws need above the first level."""
     zero, one = jnp.zeros(1), jnp.ones(1)
     tube = Tube(zero, zero, -one, one, zero, zero)
-    return barrier_member(barrier, "error_over_slope")(tube, zero) is not None
-
-
-def ratio_jumps(barrier: Barrier) -> bool:
-    """Whether `error_over_slope` of a barrier may jump at e1 = 0."""
-    return bool(barrier_member(barrier, "ratio_jumps"))
+    return barrier.error_over_slope(tube, zero) is not None
 
 
 def check_guard(owner: str, guard: float) -> None:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 
 from iblf_jax.control.barriers._base import (
     GUARD,
+    Barrier,
     check_guard,
     guarded_error,
     paper_virtual_velocity,
@@ -19,7 +20,7 @@ from iblf_jax.world.bounds import Tube
 
 
 @component
-class Integral:
+class Integral(Barrier):
     """V1 = int_0^xi 2 s / (1 - s^2) ds = -ln(1 - xi^2).                        (2.6), (3.1)
 
         s = dV1/de1 = 2 e1 / (k^2 - e1^2),   alpha = q_d' - (k1 + kappa) e1    (3.15), (3.5)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 
 from iblf_jax.control.barriers._base import (
     GUARD,
+    Barrier,
     check_guard,
     guarded_error,
     paper_virtual_velocity,
@@ -23,7 +24,7 @@ MAX_P = 100
 
 
 @component
-class Log:
+class Log(Barrier):
     """V1 = 1/(2p) ln 1/(1 - xi^(2p)), with a whole exponent p >= 1.
 
         s = e1^(2p-1) / (k^(2p) - e1^(2p)),   alpha = q_d' - (k1 + kappa) e1

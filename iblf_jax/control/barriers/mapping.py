@@ -11,6 +11,7 @@ import jax.numpy as jnp
 
 from iblf_jax.control.barriers._base import (
     GUARD,
+    Barrier,
     check_guard,
     guarded_error,
     xi_bound_from_errors,
@@ -20,7 +21,7 @@ from iblf_jax.world.bounds import Tube
 
 
 @component
-class Mapping:
+class Mapping(Barrier):
     """V1 = 1/2 z^2,   z = e1 k_l k_u / ((k_l + e1)(k_u - e1)).
 
         s = z z_e,   alpha = q_d' - (k1 z + z_t) / z_e

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 
 from iblf_jax.control.barriers._base import (
     GUARD,
+    Barrier,
     check_guard,
     guarded_error,
     side_width,
@@ -22,7 +23,7 @@ from iblf_jax.world.bounds import Tube
 
 
 @component
-class PrescribedPerformance:
+class PrescribedPerformance(Barrier):
     """V1 = 1/2 eps^2,   eps = 1/2 ln[ (k_l + e1) k_u / ((k_u - e1) k_l) ].
 
         s = eps eps_e,   alpha = q_d' - (k1 eps + eps_t) / eps_e

@@ -8,12 +8,13 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 
+from iblf_jax.control.barriers._base import Barrier
 from iblf_jax.core.pytree import component
 from iblf_jax.world.bounds import Tube
 
 
 @component
-class Quadratic:
+class Quadratic(Barrier):
     """V1 = 1/2 e1^2,   s = e1,   alpha = q_d' - k1 e1.
 
     It knows of no bound, so it keeps none: the unconstrained yardstick.  At e2 = 0, V1' = -2 k1 V1.
@@ -21,7 +22,7 @@ class Quadratic:
       1995.
     """
 
-    guard: ClassVar[float] = -math.inf
+    guard = -math.inf
     uses_o: ClassVar[bool] = False
     value_unit: ClassVar[str] = "rad^2"
     ratio_jumps: ClassVar[bool] = False

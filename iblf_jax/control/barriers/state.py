@@ -31,7 +31,7 @@ from typing import ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.barriers._base import GUARD, check_guard, guarded_error
+from iblf_jax.control.barriers._base import GUARD, Barrier, check_guard, guarded_error
 from iblf_jax.control.barriers._series import log_remainder
 from iblf_jax.core.pytree import component, static
 from iblf_jax.world.bounds import Tube
@@ -59,7 +59,7 @@ def _parts(e: jax.Array, k_l: jax.Array, k_u: jax.Array) -> _Parts:
 
 
 @component
-class State:
+class State(Barrier):
     """V1 = int_0^e1 s kc^2 / (kc^2 - (s + y)^2) ds,   y = q_d - c,   bounds c(t) -+ kc(t).
 
         s = kc^2 e1 / (kc^2 - x^2),   x = q - c

@@ -10,14 +10,14 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.barriers._base import GUARD, check_guard, guarded_error, side_width
+from iblf_jax.control.barriers._base import GUARD, Barrier, check_guard, guarded_error, side_width
 from iblf_jax.control.barriers._series import sinc
 from iblf_jax.core.pytree import component, static
 from iblf_jax.world.bounds import Tube
 
 
 @component
-class Tan:
+class Tan(Barrier):
     """V1 = k^2/pi tan(theta),   theta = pi e1^2 / (2 k^2),   k = k_u if e1 > 0 else k_l.
 
         s = e1 / cos(theta)^2,   alpha = q_d' + e1 k'/k - k^2/(2 pi e1) (k1 + 2 k'/k) sin(2 theta)

@@ -1,4 +1,4 @@
-"""Tracking laws.  The contract is the protocol `Controller`; `law_by_name` makes the paper's
+"""Tracking laws.  The contract is the base class `Controller`; `law_by_name` makes the paper's
 systems.
 """
 

@@ -8,16 +8,18 @@ was active.
 
 from __future__ import annotations
 
+import abc
 from collections.abc import Iterator
 from functools import partial
-from typing import Any, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple, Self
 
 import jax
 import jax.numpy as jnp
 
+from iblf_jax.control.barriers import Barrier
 from iblf_jax.control.decays import Decay, Exponential
-from iblf_jax.core.optional import OptionalMembers
-from iblf_jax.core.pytree import layers
+from iblf_jax.core.families import Part, adopt
+from iblf_jax.core.pytree import Leaf, layers, wrapped_field
 from iblf_jax.world.bounds import Bounds, Tube, speed_limits_at, tube_at
 from iblf_jax.world.references import Reference
 from iblf_jax.world.regions import Along, Region, along
@@ -135,56 +137,92 @@ class Command(NamedTuple):
     """The auxiliary state lambda of a limited input, (n,); `()` for laws without one."""
 
 
-class Controller(Protocol):
+class Controller(Part):
     """The contract of a tracking law.
 
-    A law with a proof of its own may also fit `LyapunovLaw`; then `certify` checks what it states.
+    A law with a proof of its own is a `LyapunovLaw`; then `certify` checks what it states.
 
-    A law may also have these class attributes; `law_member` holds their defaults.
-
-    - `gains`: the names of the leaves that `compare` scales together; ("k1", "K2") by default.
-    - `uses_observer`: False if it does not use f_hat.
-    - `needs_velocity_bounds`: True if it requires `LawContext.velocity_bounds`.
-    - `includes_e2`: True if its V1 contains its term of e2, so that V2 adds no 1/2 e2^T M0 e2.
-    - `filters`: True if its commands have a `slack`.
-    - `takes_shift`: True if it adds `LawContext.shift` to the virtual control of the last level and
-      to its rate (`LawContext.shifted`).
-    - `has_auxiliary`: True if its commands have an `auxiliary`.
-    - `receives_x`: True for a law of plants in strict-feedback form, which receives the state x,
-      (r, n), in the place of q and q': `init(x, context)`, `command(t, x, d_hat, context, state)`
-      and `switching(t, x, d_hat, context, state)`, with d_hat as the observer gives it, (r, n) or
-      (n,).
-    - `unlimited`: the same law without a limit of its own, by which a sampled loop is linearised;
-      None for a law without one.
-    - `wraps`: the name of the field that holds another law.  Paths then reach through it
-      ("controller.K2").
-    - `input_unit`: the unit of the input that an input map such as `WithDrive` commands; None for
-      the input of the model, which is the torque for a robot.
-    - `unit_factors`: the names of leaves that are factors only.  Which of their numbers are 1 may
-      be compiled in (`engine.structural_constants`).
-
-    - `energy`, `energy_decay`: methods of a law with an `input_slope`, which `AdaptiveParameters`
-      uses.  They return the law's Lyapunov function without a term of the estimate, (), and how
-      fast it decays, (), where the plant equals the model and there is no disturbance; arguments
-      (t, q, dq, context), or (t, x, context).
-
-    It may have these methods: `completed(context, x)` returns the law with values that depend on
-    the model and on the start x, (r, n), where none were given; `advice()` returns a list of
-    warnings; `check_start(context)` raises ValueError for fields that do not fit together, once the
-    number of joints is known; `leaf_units()` returns the units of leaves that depend on other
-    fields, by name; `unit_symbols(model)` returns the units of symbols in the units of its leaves.
-
-    A law whose command is discontinuous, such as a sliding-mode law or `FullState` with some
-    barriers, has `switching(t, q, dq, context, state)`.  It returns (m,) functions of q or q', and
-    the command jumps where one of them crosses 0.  The derivatives of a run then contain the effect
-    of such a jump on a perturbation (`engine.switching`); without the method they omit it.  A law
-    that wraps another forwards the call with `switching_functions`.
+    A law of plants in strict-feedback form (`receives_x`) receives the state x, (r, n), in the
+    place of q and q': `init(x, context)`, `command(t, x, d_hat, context, state)` and
+    `switching(t, x, d_hat, context, state)`, with d_hat as the observer gives it, (r, n) or (n,).
     """
 
+    gains: ClassVar[tuple[str, ...]] = ("k1", "K2")
+    """The names of the leaves that `compare` scales together."""
+    unit_factors: ClassVar[tuple[str, ...]] = ()
+    """The names of leaves that are factors only.  Which of their numbers are 1 may be compiled in
+    (`engine.structural_constants`)."""
+    uses_observer: ClassVar[bool] = True
+    """Whether it uses f_hat."""
+    needs_velocity_bounds: ClassVar[bool] = False
+    """Whether it requires `LawContext.velocity_bounds`."""
+    includes_e2: ClassVar[bool] = False
+    """Whether its V1 contains its term of e2, so that V2 adds no 1/2 e2^T M0 e2."""
+    filters: ClassVar[bool] = False
+    """Whether its commands have a `slack`."""
+    receives_x: ClassVar[bool] = False
+    """Whether it is a law of plants in strict-feedback form."""
+    input_unit: ClassVar[str | None] = None
+    """The unit of the input that an input map such as `WithDrive` commands; None for the input of
+    the model, which is the torque for a robot."""
+
+    barrier: Barrier | None = None
+    """The barrier on the position error; None for a law without one."""
+    barriers: tuple[Barrier, ...] = ()
+    """The barriers of all levels of a law that has one a level."""
+    decays: tuple[Decay, ...] = ()
+    """The decays of its levels; exponential ones if there are none."""
+    weight: Leaf = None
+    """Weight of the barrier's V1, (n,); None for a law without one."""
+    K2: Leaf = None
+    """Gain of the velocity error, (n,); None for a law without one."""
+    reading: str = ""
+    """Of a law of the paper, "printed" or "corrected"."""
+    filter: Leaf = None
+    """Time constants of filters in place of exact derivatives [s]; None without filters."""
+
+    @property
+    def takes_shift(self) -> bool:
+        """Whether it adds `LawContext.shift` to the virtual control of the last level and to its
+        rate (`LawContext.shifted`).
+        """
+        return False
+
+    @property
+    def has_auxiliary(self) -> bool:
+        """Whether its commands have an `auxiliary`."""
+        return False
+
+    @property
+    def unlimited(self) -> Controller:
+        """The same law without a limit of its own, by which a sampled loop is linearised."""
+        return self
+
+    def unit_symbols(self, model: Any) -> dict[str, Any]:
+        """The units of symbols in the units of its leaves."""
+        return {}
+
+    def advice(self) -> list[str]:
+        """Warnings about the values of the fields."""
+        return []
+
+    def completed(self, context: LawContext, x: jax.Array) -> Self:
+        """The law with values that depend on the model and on the start x, (r, n), where none were
+        given.
+        """
+        return self
+
+    def check_start(self, context: LawContext) -> None:
+        """Raises ValueError for fields that do not fit together, once the number of joints is
+        known.
+        """
+        return
+
+    @abc.abstractmethod
     def init(self, q: jax.Array, dq: jax.Array, context: LawContext) -> State:
         """State at the start of a run, given q [rad] and dq [rad/s] there; `()` for most laws."""
-        ...
 
+    @abc.abstractmethod
     def command(
         self,
         t: jax.Array,
@@ -203,55 +241,105 @@ class Controller(Protocol):
           context: model, reference and bounds.
           state: the law's own state.
         """
-        ...
 
+    def switching(
+        self, t: jax.Array, q: jax.Array, dq: jax.Array, context: LawContext, state: State
+    ) -> jax.Array | None:
+        """The functions of q or q', (m,), at whose zeros the command jumps, such as that of a
+        sliding-mode law or of `FullState` with some barriers; None for a continuous command.
 
-law_member = OptionalMembers(
-    gains=("k1", "K2"),
-    unit_factors=(),
-    uses_observer=True,
-    needs_velocity_bounds=False,
-    includes_e2=False,
-    filters=False,
-    takes_shift=False,
-    has_auxiliary=False,
-    filter=None,
-    unlimited=None,
-    unit_symbols=lambda model: {},
-    receives_x=False,
-    input_unit=None,
-    completed=None,
-    advice=list,
-    check_start=lambda context: None,
-    switching=lambda t, q, dq, context, state: None,
-    energy=None,
-    energy_decay=None,
-    disturbance_terms=None,
-    barrier=None,
-    barriers=(),
-    decays=(),
-    weight=None,
-    reading="",
-)
-"""Reads optional members of a law: those that `Controller` and `LyapunovLaw` describe, and some
-fields of laws with a barrier."""
-
-
-def unlimited(law: Controller) -> Controller:
-    """A law without its own limit; itself if it declares none."""
-    return law_member.variant(law, "unlimited")  # type: ignore[no-any-return]
-
-
-def switching_functions(law: Controller, *arguments: Any) -> jax.Array | None:
-    """The functions at whose zeros a law's command jumps, (m,), or None if it declares none;
-    arguments as `Controller.command`, without the estimate.
-    """
-    default = law_member.defaults["switching"]
-    own = law_member(law, "switching")
-    if own is default:
+        The derivatives of a run contain the effect of such a jump on a perturbation
+        (`engine.switching`).  A law that wraps another forwards the call.
+        """
         return None
-    functions: jax.Array | None = own(*arguments)
-    return functions
+
+    def energy(
+        self, t: jax.Array, q: jax.Array, dq: jax.Array, context: LawContext
+    ) -> jax.Array | None:
+        """The Lyapunov function of a law with an `input_slope` without a term of the estimate, (),
+        for `AdaptiveParameters`.
+        """
+        return None
+
+    def energy_decay(
+        self, t: jax.Array, q: jax.Array, dq: jax.Array, context: LawContext
+    ) -> jax.Array | None:
+        """How fast `energy` decays, (), where the plant equals the model and there is no
+        disturbance.
+        """
+        return None
+
+    def lyapunov(
+        self,
+        t: jax.Array,
+        q: jax.Array,
+        dq: jax.Array,
+        f_tilde: jax.Array,
+        context: LawContext,
+        state: State,
+    ) -> jax.Array | None:
+        """As `LyapunovLaw.lyapunov`."""
+        return None
+
+    def decay(
+        self,
+        t: jax.Array,
+        q: jax.Array,
+        dq: jax.Array,
+        f_tilde: jax.Array,
+        context: LawContext,
+        state: State,
+    ) -> jax.Array | None:
+        """As `LyapunovLaw.decay`."""
+        return None
+
+    def disturbance_terms(
+        self,
+        t: jax.Array,
+        q: jax.Array,
+        dq: jax.Array,
+        f_tilde: jax.Array,
+        df: jax.Array,
+        context: LawContext,
+        state: State,
+    ) -> jax.Array | None:
+        """T of `LyapunovLaw`, () or (n,), in the unit of V a second: what f_tilde and f' may add to
+        V'; None for what they add for any law.
+
+        Args:
+          t, q, dq, f_tilde, context, state: as `LyapunovLaw.lyapunov`.
+          df: rate of the uncertain term, f', (n,) [N m/s].
+        """
+        return None
+
+
+class Wrapping(Controller):
+    """A law that wraps another one, and has no state and no jump of its own."""
+
+    law: Controller
+    wraps = "law"
+
+    def advice(self) -> list[str]:
+        """The wrapped law's warnings."""
+        return self.law.advice()
+
+    def init(self, *arguments: Any) -> State:
+        """The wrapped law's state."""
+        return self.law.init(*arguments)
+
+    def switching(self, *arguments: Any) -> jax.Array | None:
+        """The functions at whose zeros the wrapped law's command jumps; arguments as its
+        `switching`.
+        """
+        return self.law.switching(*arguments)
+
+
+def adopt_layers(law: Any) -> None:
+    """Makes laws of the classes of a law and of those that it wraps."""
+    adopt(type(law), Controller)
+    field = wrapped_field(law)
+    if field:
+        adopt_layers(vars(law)[field])
 
 
 def state_of_levels(q: jax.Array, dq: jax.Array, higher: Any) -> jax.Array:
@@ -265,21 +353,6 @@ def no_state(law: Any, q: jax.Array, dq: jax.Array, context: LawContext) -> tupl
     return ()
 
 
-def wrapped_advice(law: Any) -> list[str]:
-    """`advice` of a law that wraps another: the other's."""
-    return law_member(law.law, "advice")()  # type: ignore[no-any-return]
-
-
-def wrapped_state(law: Any, *arguments: Any) -> State:
-    """`init` of a law that wraps another and has no state of its own."""
-    return law.law.init(*arguments)
-
-
-def wrapped_switching(law: Any, *arguments: Any) -> jax.Array | None:
-    """`switching` of a law that wraps another and has no state of its own: the other's."""
-    return switching_functions(law.law, *arguments)
-
-
 def layers_with_states(law: Any, state: Any) -> Iterator[tuple[Any, Any]]:
     """A law and the laws that it wraps, the outermost first, each with its state.
 
@@ -289,20 +362,19 @@ def layers_with_states(law: Any, state: Any) -> Iterator[tuple[Any, Any]]:
     """
     for layer in layers(law):
         yield layer, state
-        if law_member(layer, "has_auxiliary"):
+        if layer.has_auxiliary:
             state = state.law
 
 
 def decay_of(law: Any, i: int) -> Decay:
     """The decay of level i + 1 of a law: `Exponential` for a law that has no `decays`."""
-    decays = law_member(law, "decays")
-    if not decays:
+    if not law.decays:
         return Exponential()
-    return decays[i]  # type: ignore[no-any-return]
+    return law.decays[i]  # type: ignore[no-any-return]
 
 
-class LyapunovLaw(Protocol):
-    """The additional methods of a law with a Lyapunov function V and its decay W, which `certify`
+class LyapunovLaw(Controller):
+    """The contract of a law with a Lyapunov function V and its decay W, which `certify`
     checks.
 
         V' <= -W + T
@@ -317,6 +389,7 @@ class LyapunovLaw(Protocol):
     dV/dx . d_tilde + dV/dd_tilde . d' by default.
     """
 
+    @abc.abstractmethod
     def lyapunov(
         self,
         t: jax.Array,
@@ -336,8 +409,8 @@ class LyapunovLaw(Protocol):
           context: model, reference and bounds.
           state: the law's own state.
         """
-        ...
 
+    @abc.abstractmethod
     def decay(
         self,
         t: jax.Array,
@@ -350,23 +423,3 @@ class LyapunovLaw(Protocol):
         """W >= 0, () or (n,), in the unit of V a second: how fast V decreases where f_tilde = 0.
         Arguments as `lyapunov`.
         """
-        ...
-
-    def disturbance_terms(
-        self,
-        t: jax.Array,
-        q: jax.Array,
-        dq: jax.Array,
-        f_tilde: jax.Array,
-        df: jax.Array,
-        context: LawContext,
-        state: State,
-    ) -> jax.Array:
-        """T, () or (n,), in the unit of V a second: what f_tilde and f' may add to V'.  A law may
-        leave this method out.
-
-        Args:
-          t, q, dq, f_tilde, context, state: as `lyapunov`.
-          df: rate of the uncertain term, f', (n,) [N m/s].
-        """
-        ...

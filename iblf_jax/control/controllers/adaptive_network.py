@@ -43,7 +43,7 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.control.barriers import Barrier, Log
-from iblf_jax.control.controllers._base import Command, LawContext
+from iblf_jax.control.controllers._base import Command, Controller, LawContext
 from iblf_jax.control.controllers.adaptive_rbf import scaled_input, sobol_centres
 from iblf_jax.control.controllers.backstepping import (
     alpha_and_rate,
@@ -67,7 +67,7 @@ class NetworkWeights(NamedTuple):
 
 
 @component
-class AdaptiveNetwork:
+class AdaptiveNetwork(Controller):
     """tau = W_hat^T tanh(V_hat^T z) - K2 e2 - w s, with the rates (H.2) of both layers.
 
     s and alpha are the barrier's; no model is used, and f_hat is not.  The state is a
@@ -113,7 +113,6 @@ class AdaptiveNetwork:
     barrier: Barrier = Log()
     nodes: int = static(default=10)
     weight: Leaf = leaf("N m rad", sign="positive", default=None)
-    gains: ClassVar[tuple[str, ...]] = ("k1", "K2")
     unit_factors: ClassVar[tuple[str, ...]] = ("weight",)
     uses_observer: ClassVar[bool] = False
     takes_shift: ClassVar[bool] = True

@@ -44,13 +44,11 @@ from iblf_jax.control.controllers._base import (
     Command,
     Controller,
     LawContext,
+    LyapunovLaw,
+    Wrapping,
     decay_of,
-    law_member,
     layers_with_states,
-    wrapped_advice,
-    wrapped_switching,
 )
-from iblf_jax.control.decays._base import decay_member
 from iblf_jax.core import checks
 from iblf_jax.core.component_paths import member_of, replaced, resolve
 from iblf_jax.core.linalg import inner, solve_spd
@@ -79,7 +77,7 @@ class AdaptiveState(NamedTuple):
 
 
 @component
-class AdaptiveParameters:
+class AdaptiveParameters(Wrapping, LyapunovLaw):
     """theta_hat' = P(-Gamma (Y^T s + sigma (theta_hat - theta_0))),   Y = dtau/dtheta,   s = e2 for
     a robot.
 
@@ -120,9 +118,7 @@ class AdaptiveParameters:
         default=0.0,
     )
     band: Leaf = leaf(PlantUnit(THETA, THETA), sign="positive", shape="any", default=None)
-    wraps: ClassVar[str] = "law"
     uses_observer: ClassVar[bool] = False
-    advice = wrapped_advice
 
     def check(self) -> None:
         """Raises ValueError for a law that states no slope, or numbers that do not fit the
@@ -158,18 +154,19 @@ class AdaptiveParameters:
         """
         law: Any = self.law
         field = "AdaptiveParameters.law"
-        if law_member(law, "energy") is None or law_member(law, "energy_decay") is None:
+        kind = type(law)
+        if Controller.energy is kind.energy or Controller.energy_decay is kind.energy_decay:
             raise checks.fail(field, type(law).__name__, "a law with an `energy`", LAWS)
-        if law_member(law, "reading") == "printed":
+        if law.reading == "printed":
             remedy = "With C0 q' the term 1/2 e2^T M0' e2 remains. Take reading=\"corrected\"."
             raise checks.fail(f"{field}.reading", "printed", "corrected", remedy)
         second = decay_of(law, 1)
-        if law_member(law, "reading") and not decay_member(second, "constant"):
+        if law.reading and not second.constant:
             remedy = "The energy of the second step contains the parameters, so that the torque is"
             remedy += " not affine in them."
             name = type(second).__name__
             raise checks.fail(f"{field}.decays[1]", name, "Exponential()", remedy)
-        if law_member(law, "filter") is not None:
+        if law.filter is not None:
             expected = "exact derivatives"
             remedy = "The lag of filters leaves a term in V'. Leave `filter` out."
             raise checks.fail(f"{field}.filter", law.filter, expected, remedy)
@@ -298,7 +295,7 @@ class AdaptiveParameters:
         """
         *measured, context, state = arguments
         changed = self._with_parameters(context, state.theta)
-        return wrapped_switching(self, t, *measured, changed, state.law)
+        return super().switching(t, *measured, changed, state.law)
 
     # --- the claim (R.3) --------------------------------------------------------------------------
 
@@ -364,7 +361,7 @@ class AdaptiveParameters:
           disturbance: of the model itself, f (n,), or d (r, n).
         """
         true, law = self._with_parameters(context, theta), self.law
-        if law_member(law, "receives_x"):
+        if law.receives_x:
             (x,) = measured
             flow = plants.flow(plants.as_plant(context.model), t, x, command.tau)
             true_flow = plants.flow(plants.as_plant(true.model), t, x, command.tau)
@@ -477,7 +474,7 @@ def _dependence(
     def outputs(theta, t, x):
         changed = law._with_parameters(context, theta)
         measured, estimate = (x[0], x[1]), jnp.zeros_like(x[0])
-        if law_member(inner_law, "receives_x"):
+        if inner_law.receives_x:
             measured, estimate = (x,), jnp.zeros_like(x)  # type: ignore[assignment]
         state = inner_law.init(*measured, changed)
         command, _ = inner_law.command(t, *measured, estimate, changed, state)

@@ -37,16 +37,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.control.barriers import Barrier, Integral
-from iblf_jax.control.barriers._base import CLAIMS, barrier_member, guard_is_active, value_unit
-from iblf_jax.control.controllers._base import (
-    Command,
-    LawContext,
-    decay_of,
-    no_state,
-)
+from iblf_jax.control.barriers._base import guard_is_active
+from iblf_jax.control.controllers._base import Command, Controller, LawContext, decay_of, no_state
 from iblf_jax.control.decays import Decay
 from iblf_jax.control.decays._base import (
-    decay_member,
     energy_gain,
     gain_at,
 )
@@ -61,7 +55,7 @@ READINGS = ("printed", "corrected")
 
 def weight_units(law: Any) -> dict[str, str]:
     """`leaf_units` of a law with a barrier: the weight w has a unit for which w s is a torque."""
-    return {"weight": "N m/rad" if value_unit(law.barrier) == "rad^2" else "N m rad"}
+    return {"weight": "N m/rad" if law.barrier.value_unit == "rad^2" else "N m rad"}
 
 
 ROOT_OF_ENERGY = "N^0.5 m^0.5 rad^0.5"
@@ -72,12 +66,12 @@ def symbols_of_energy(law: Any, field: str, index: int, symbols: Any) -> Any:
     """The units of the symbols in a part of a law whose second decay is that of the energy W."""
     if field != "decays":
         return symbols
-    sizes = ("rad" if value_unit(law.barrier) == "rad^2" else "1", ROOT_OF_ENERGY)
+    sizes = ("rad" if law.barrier.value_unit == "rad^2" else "1", ROOT_OF_ENERGY)
     return {**symbols, "z": sizes[index]}
 
 
 @component
-class Backstepping:
+class Backstepping(Controller):
     """tau = C0 v + G0 + M0 alpha' - f_hat - K2 e2 - w s,   v = q' (printed) or alpha (corrected).
 
     It is (3.14) of the paper.
@@ -105,7 +99,6 @@ class Backstepping:
     reading: str = static(default="printed")
     weight: Leaf = leaf("N m rad", sign="positive", default=None)
     decays: tuple[Decay, ...] = ()
-    gains: ClassVar[tuple[str, ...]] = ("k1", "K2")
     unit_factors: ClassVar[tuple[str, ...]] = ("weight",)
     takes_shift: ClassVar[bool] = True
     leaf_units = weight_units
@@ -188,7 +181,7 @@ def barrier_command(law, tube: Tube, q: jax.Array, alpha: jax.Array, tau: jax.Ar
 
 def stated_decay(barrier: Barrier, gain: jax.Array, V: jax.Array) -> jax.Array:
     """The decay of V, (n,), that a barrier states for a gain; 0 for one that states none."""
-    rate = barrier_member(barrier, "decay_rate")(gain)
+    rate = barrier.decay_rate(gain)
     if rate is None:
         return jnp.zeros_like(V)
     return rate * V  # type: ignore[no-any-return]
@@ -197,7 +190,7 @@ def stated_decay(barrier: Barrier, gain: jax.Array, V: jax.Array) -> jax.Array:
 def check_barrier(law, field: str, barrier: Any, example: str = "Integral") -> None:
     """Raises ValueError unless a field of a law holds a barrier."""
     name = f"{type(law).__name__}.{field}"
-    checks.conforms(name, barrier, Barrier, f"Such as iblf_jax.barriers.{example}().", CLAIMS)
+    checks.conforms(name, barrier, Barrier, f"Such as iblf_jax.barriers.{example}().")
 
 
 def fit_o(law, *barriers: Barrier, like: jax.Array | None = None) -> None:
@@ -207,7 +200,7 @@ def fit_o(law, *barriers: Barrier, like: jax.Array | None = None) -> None:
     Raises:
       ValueError: an `o` for barriers of which none has a kappa.
     """
-    uses_o = any(barrier_member(barrier, "uses_o") for barrier in barriers)
+    uses_o = any(barrier.uses_o for barrier in barriers)
     if uses_o and law.o is None:
         shape_of = law.k1 if like is None else like
         object.__setattr__(law, "o", jnp.full_like(shape_of, 0.1))
@@ -261,7 +254,7 @@ def with_energy_decay(
       tau: torque, (n,) [N m].
     """
     decay = decay_of(law, 1)
-    if decay_member(decay, "constant"):
+    if decay.constant:
         return tau
     of_error = momentum(context.model, q, e2)
     return tau - energy_gain(decay, t, 0.5 * inner(e2, of_error), e2) * of_error

@@ -35,6 +35,8 @@ their e_i/s_i jumps there.  Such a barrier is refused below the last level.  On 
 jumps at e_r = 0 (`switching`), as the exact cancellation requires.
 """
 
+# The methods receive x in the place of q and q'.
+# mypy: disable-error-code="override"
 from __future__ import annotations
 
 import copy
@@ -47,13 +49,10 @@ import numpy as np
 
 from iblf_jax.control.barriers import Barrier, Mapping, Quadratic
 from iblf_jax.control.barriers._base import (
-    barrier_member,
     guard_is_active,
     has_ratio,
-    ratio_jumps,
-    value_unit,
 )
-from iblf_jax.control.controllers._base import Command, LawContext, decay_of
+from iblf_jax.control.controllers._base import Command, Controller, LawContext, decay_of
 from iblf_jax.control.controllers._levels import Design, Level, exact_levels, surface_levels
 from iblf_jax.control.controllers.backstepping import (
     check_barrier,
@@ -62,7 +61,6 @@ from iblf_jax.control.controllers.backstepping import (
     stated_decay,
 )
 from iblf_jax.control.decays import Decay
-from iblf_jax.control.decays._base import decay_member
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.core.units import ByLevel, PlantUnit, resolved
@@ -72,7 +70,7 @@ from iblf_jax.world.references import reference_member
 
 
 @component
-class BarrierBackstepping:
+class BarrierBackstepping(Controller):
     """Backstepping with a barrier on every level, u = alpha_r, for a plant of any order r.
 
         alpha_i = G_i^-1 [ a_i - c_i s_i - (e_i/(w_i s_i)) G_{i-1}^T (w_{i-1} s_{i-1})
@@ -176,7 +174,7 @@ class BarrierBackstepping:
         c, weights = [], []
         for i, barrier in enumerate(self.barriers):
             level = f"x{i + 1}"
-            if value_unit(barrier) == "1":
+            if barrier.value_unit == "1":
                 c.append(PlantUnit("1", f"{level}^2/s"))
                 weights.append(PlantUnit("1", "energy"))
             else:
@@ -189,7 +187,7 @@ class BarrierBackstepping:
         if field != "decays":
             return symbols
         size: Any = "1"
-        if value_unit(self.barriers[index]) != "1":
+        if self.barriers[index].value_unit != "1":
             size = resolved(PlantUnit("1", f"x{index + 1}"), symbols)
         return {**symbols, "z": size}
 
@@ -289,8 +287,8 @@ class BarrierBackstepping:
             return
         # Row i is level i + 1, whose slope u contains with r - (i + 1) - 1 derivatives.
         needed = self.order - i - 2
-        smooth = barrier_member(barrier, "slope_derivatives")
-        if i > 0 and ratio_jumps(barrier):
+        smooth = barrier.slope_derivatives
+        if i > 0 and barrier.ratio_jumps:
             expected = "a barrier whose e/s does not jump at e = 0"
         elif smooth < needed:
             expected = f"a barrier whose slope has {needed} continuous derivatives at e = 0"
@@ -308,7 +306,7 @@ class BarrierBackstepping:
         if self.filter is not None:
             return
         decay = decay_of(self, i)
-        needed, smooth = self.order - i - 1, decay_member(decay, "smooth_derivatives")
+        needed, smooth = self.order - i - 1, decay.smooth_derivatives
         if smooth >= needed:
             return
         expected = f"a decay with {needed} continuous derivatives, as u contains them"
@@ -412,7 +410,7 @@ class BarrierBackstepping:
         self, t: jax.Array, x: jax.Array, d_hat: jax.Array, context: LawContext, state: Any
     ) -> jax.Array | None:
         """e_r, (n,), where u jumps at e_r = 0; None for a last barrier without a jump."""
-        if not ratio_jumps(self.barriers[-1]):
+        if not self.barriers[-1].ratio_jumps:
             return None
         _, tubes = self.levels(t, x, d_hat, context, state)
         return x[-1] - tubes[-1].q_d
@@ -423,7 +421,7 @@ class BarrierBackstepping:
 
 def _ratio(barrier: Barrier, tube: Tube, x: jax.Array) -> jax.Array:
     """The ratio e/s of a barrier; 1 for a barrier that does not state it."""
-    stated = barrier_member(barrier, "error_over_slope")(tube, x)
+    stated = barrier.error_over_slope(tube, x)
     if stated is None:
         return jnp.ones_like(x)
     return stated  # type: ignore[no-any-return]

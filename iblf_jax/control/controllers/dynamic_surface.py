@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.control.barriers import Barrier, Integral
-from iblf_jax.control.controllers._base import Command, LawContext
+from iblf_jax.control.controllers._base import Command, Controller, LawContext
 from iblf_jax.control.controllers.backstepping import (
     barrier_command,
     check_barrier,
@@ -37,7 +37,7 @@ from iblf_jax.world.robots import inverse_dynamics
 
 
 @component
-class DynamicSurface:
+class DynamicSurface(Controller):
     """tau = C0 beta + G0 + M0 beta' - f_hat - K2 e2 - w s,   mu beta' + beta = alpha.
 
     With e2 = q' - beta.  The state is beta, (n,) [rad/s]; records show it as alpha.
@@ -65,7 +65,6 @@ class DynamicSurface:
     barrier: Barrier = Integral()
     weight: Leaf = leaf("N m rad", sign="positive", default=None)
     decays: tuple[Decay, ...] = ()
-    gains: ClassVar[tuple[str, ...]] = ("k1", "K2")
     unit_factors: ClassVar[tuple[str, ...]] = ("weight",)
     takes_shift: ClassVar[bool] = True
     leaf_units = weight_units

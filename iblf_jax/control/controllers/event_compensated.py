@@ -31,21 +31,13 @@ there.  A small epsilon therefore needs a short period.
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.control.controllers._base import (
-    Command,
-    Controller,
-    State,
-    law_member,
-    wrapped_advice,
-    wrapped_state,
-    wrapped_switching,
-)
+from iblf_jax.control.controllers._base import Command, Controller, State, Wrapping
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.core.units import INPUT
@@ -55,7 +47,7 @@ TANH_GAP = 0.2785
 
 
 @component
-class EventCompensated:
+class EventCompensated(Wrapping):
     """u = -(1 + delta) (v tanh(z v/epsilon) + m_bar tanh(z m_bar/epsilon)), v the input of a law.
 
     z is the derivative of the law's Lyapunov function along its input (`Command.input_slope`), e2
@@ -75,10 +67,6 @@ class EventCompensated:
     relative: Leaf = leaf("1", sign="nonnegative")
     absolute: Leaf = leaf(INPUT, sign="nonnegative")
     epsilon: Leaf = leaf("N m rad/s", sign="positive")
-    wraps: ClassVar[str] = "law"
-    advice = wrapped_advice
-    init = wrapped_state
-    switching = wrapped_switching
 
     def check(self) -> None:
         """Raises ValueError for something that is not a law, or a delta of 1 or more."""
@@ -89,7 +77,7 @@ class EventCompensated:
     @property
     def takes_shift(self) -> bool:
         """Whether the wrapped law takes the shift of an auxiliary state."""
-        return bool(law_member(self.law, "takes_shift"))
+        return self.law.takes_shift
 
     def command(self, *arguments: Any) -> tuple[Command, State]:
         """The wrapped law's command with the input (E.1).  Arguments as those of the wrapped law.

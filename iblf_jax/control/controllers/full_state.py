@@ -62,10 +62,8 @@ from iblf_jax.control.barriers import Barrier, Integral
 from iblf_jax.control.barriers._base import (
     guard_is_active,
     has_ratio,
-    ratio_jumps,
-    value_unit,
 )
-from iblf_jax.control.controllers._base import Command, LawContext, decay_of, no_state
+from iblf_jax.control.controllers._base import Command, Controller, LawContext, decay_of, no_state
 from iblf_jax.control.controllers._levels import Design, exact_levels
 from iblf_jax.control.controllers.backstepping import (
     alpha_and_rate,
@@ -92,7 +90,7 @@ of phi."""
 
 
 @component
-class FullState:
+class FullState(Controller):
     """tau = C0 q' + G0 + M0 (a2 - w s1 e2/s2 - c s2) - f_hat,   a2 = alpha' - (K2 + kappa2) e2 for
     the integral barrier.
 
@@ -134,7 +132,6 @@ class FullState:
     velocity_barrier: Barrier = Integral()
     weight: Leaf = leaf("1", sign="positive", default=None)
     decays: tuple[Decay, ...] = ()
-    gains: ClassVar[tuple[str, ...]] = ("k1", "K2")
     unit_factors: ClassVar[tuple[str, ...]] = ("weight",)
     needs_velocity_bounds: ClassVar[bool] = True
     includes_e2: ClassVar[bool] = True
@@ -162,14 +159,14 @@ class FullState:
 
     def leaf_units(self) -> dict[str, str]:
         """The unit of the weight, by those of V1 and phi."""
-        return {"weight": WEIGHT_UNITS[value_unit(self.barrier), value_unit(self.velocity_barrier)]}
+        return {"weight": WEIGHT_UNITS[self.barrier.value_unit, self.velocity_barrier.value_unit]}
 
     def symbols_of_part(self, field: str, index: int, symbols: Any) -> Any:
         """The units of the symbols in a part of the law: that of z = sqrt(2V) in a decay."""
         if field != "decays":
             return symbols
         barrier, unit = ((self.barrier, "rad"), (self.velocity_barrier, "rad/s"))[index]
-        return {**symbols, "z": unit if value_unit(barrier) == "rad^2" else "1"}
+        return {**symbols, "z": unit if barrier.value_unit == "rad^2" else "1"}
 
     def tubes(
         self, t: jax.Array, q: jax.Array, dq: jax.Array, context: LawContext
@@ -189,7 +186,7 @@ class FullState:
         """e2 = q' - alpha, (n,) [rad/s], where the torque jumps at e2 = 0; None for a velocity
         barrier without a jump.
         """
-        if not ratio_jumps(self.velocity_barrier):
+        if not self.velocity_barrier.ratio_jumps:
             return None
         alpha = virtual_velocity(self, t, q, context)
         return dq - context.shifted(alpha, jnp.zeros_like(alpha))[0]

@@ -26,7 +26,7 @@ from typing import Any, ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.controllers._base import Command, Controller, LawContext, switching_functions
+from iblf_jax.control.controllers._base import Command, Controller, LawContext
 from iblf_jax.control.controllers.computed_torque import ComputedTorque
 from iblf_jax.control.controllers.pd_gravity import PDGravity
 from iblf_jax.core import checks
@@ -62,7 +62,7 @@ class _AtRest:
 
 
 @component
-class ReferenceGovernor:
+class ReferenceGovernor(Controller):
     """The law's torque for a reference g at rest,  g' = eta max(Gamma(g) - V, 0) (attraction +
     repulsion).
 
@@ -109,7 +109,9 @@ class ReferenceGovernor:
         tube = context.tube(t, acceleration=False)
         return tube.lower + self.margin, tube.upper - self.margin
 
-    def energy(self, q: jax.Array, dq: jax.Array, g: jax.Array, context: LawContext) -> jax.Array:
+    def energy(  # type: ignore[override]
+        self, q: jax.Array, dq: jax.Array, g: jax.Array, context: LawContext
+    ) -> jax.Array:
         """V, () [N m for PD, rad^2/s^2 for computed torque]."""
         law: Any = self.law
         weighted = dq
@@ -128,7 +130,7 @@ class ReferenceGovernor:
     ) -> jax.Array | None:
         """Where the wrapped law's command jumps."""
         governed = context._replace(reference=_AtRest(state.g))
-        return switching_functions(self.law, t, q, dq, governed, state.law)
+        return self.law.switching(t, q, dq, governed, state.law)
 
     def command(
         self,

@@ -35,15 +35,7 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.controllers._base import (
-    Command,
-    Controller,
-    LawContext,
-    State,
-    wrapped_advice,
-    wrapped_state,
-    wrapped_switching,
-)
+from iblf_jax.control.controllers._base import Command, Controller, LawContext, State, Wrapping
 from iblf_jax.core import checks
 from iblf_jax.core.linalg import matmul, matvec, solve_spd
 from iblf_jax.core.pytree import Leaf, component, leaf, static
@@ -55,7 +47,7 @@ SHAPES2 = ("linear", "cubic")
 
 
 @component
-class SafetyFilter:
+class SafetyFilter(Wrapping):
     """The torque nearest to the law's that meets the conditions on q" (head of this module) and
     |tau| <= limit.
 
@@ -97,11 +89,7 @@ class SafetyFilter:
     shape1: str = static(default="linear")
     shape2: str = static(default="linear")
     margin: Leaf = leaf("rad/s^2", sign="nonnegative", default=None)
-    wraps: ClassVar[str] = "law"
     filters: ClassVar[bool] = True
-    advice = wrapped_advice
-    init = wrapped_state
-    switching = wrapped_switching
 
     def check(self) -> None:
         """Raises ValueError for something that is not a law, or an unknown measure."""

@@ -44,7 +44,7 @@ Then V(t, y) has the rate that it has without limits, plus (dV/dx_{r-1})^T G_{r-
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -56,9 +56,7 @@ from iblf_jax.control.controllers._base import (
     LawContext,
     Shift,
     State,
-    law_member,
-    switching_functions,
-    wrapped_advice,
+    Wrapping,
 )
 from iblf_jax.core import checks
 from iblf_jax.core.input_limits import check_lower_limit, is_beyond, lower_or_opposite
@@ -83,7 +81,7 @@ class AuxiliaryState(NamedTuple):
 
 
 @component
-class Saturated:
+class Saturated(Wrapping):
     """tau = clip(tau_law, lower_limit, limit).
 
     The smooth limit, for gradients, is c + h x/(1 + |x|^8)^(1/8) with x = (tau_law - c)/h, the
@@ -115,8 +113,6 @@ class Saturated:
     edge: str = static(default="hard")
     auxiliary: Leaf = leaf("1/s", sign="positive", default=None)
     lower_limit: Leaf = leaf(INPUT, default=None)
-    wraps: ClassVar[str] = "law"
-    advice = wrapped_advice
 
     def check(self) -> None:
         """Raises ValueError for something that is not a law, an unknown edge, or a lower limit that
@@ -134,7 +130,7 @@ class Saturated:
     @property
     def _receives_x(self) -> bool:
         """Whether the wrapped law receives the levels x in the place of q and q'."""
-        return bool(law_member(unwrapped(self.law), "receives_x"))
+        return unwrapped(self.law).receives_x
 
     def init(self, *arguments: Any) -> State:
         """State of the wrapped law, and lambda(0) = 0.  Arguments as those of the wrapped law."""
@@ -156,7 +152,7 @@ class Saturated:
         *measured, context, state = arguments
         law: Any = self.law
         shift = self.shift(state)
-        if law_member(law, "takes_shift"):
+        if law.takes_shift:
             shifted = context._replace(shift=shift)
             command, rate = law.command(*measured, shifted, state.law)
         else:
@@ -220,14 +216,13 @@ class Saturated:
         the wrapped law.
         """
         if self.auxiliary is None:
-            return switching_functions(self.law, *arguments)
+            return super().switching(*arguments)
         *measured, context, state = arguments
         shift = self.shift(state)
-        if law_member(self.law, "takes_shift"):
-            shifted = context._replace(shift=shift)
-            return switching_functions(self.law, *measured, shifted, state.law)
+        if self.law.takes_shift:
+            return super().switching(*measured, context._replace(shift=shift), state.law)
         moved = self._at_shifted_state(measured, shift.value)
-        return switching_functions(self.law, *moved, context, state.law)
+        return super().switching(*moved, context, state.law)
 
 
 def _with_shifted_control(command: Command, order: int, value: jax.Array) -> Command:

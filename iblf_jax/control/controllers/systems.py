@@ -10,7 +10,6 @@ from collections.abc import Callable
 from typing import Any
 
 from iblf_jax.control import barriers
-from iblf_jax.control.barriers._base import barrier_member
 from iblf_jax.control.controllers._base import Controller
 from iblf_jax.control.controllers.adaptive_rbf import AdaptiveRBF
 from iblf_jax.control.controllers.backstepping import Backstepping
@@ -103,7 +102,7 @@ def law_by_name(
         law = law_by_name("backstepping", k1=k1, K2=K2, reading=reading, weight=weight)
         return SafetyFilter(law=law, nearest="acceleration")
     barrier = barriers.Log(p=p) if name == "log" else BARRIERS[name]()
-    o = o if barrier_member(barrier, "uses_o") else None
+    o = o if barrier.uses_o else None
     return Backstepping(k1=k1, K2=K2, o=o, barrier=barrier, reading=reading, weight=weight)
 
 

@@ -33,11 +33,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.control.controllers._base import (
-    Command,
-    LawContext,
-    no_state,
-)
+from iblf_jax.control.controllers._base import Command, LawContext, LyapunovLaw, no_state
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.world.bounds import Tube
@@ -48,7 +44,7 @@ BEYOND_LAYER = 1e6
 
 
 @component
-class TerminalSlidingMode:
+class TerminalSlidingMode(LyapunovLaw):
     """tau = C0 q' + G0 + M0 (q_d" - beta e1'/g'(e1') - K sat(sigma/layer)) - f_hat.
 
     Head of this module; sat(x) is x between -1 and 1.  The law does not keep bounds: it claims

@@ -15,22 +15,14 @@ from typing import Any, ClassVar
 
 import jax
 
-from iblf_jax.control.controllers._base import (
-    Command,
-    Controller,
-    State,
-    law_member,
-    wrapped_advice,
-    wrapped_state,
-    wrapped_switching,
-)
+from iblf_jax.control.controllers._base import Command, Controller, State, Wrapping
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import component, unwrapped
 from iblf_jax.world.plants import ElectricDrive
 
 
 @component
-class WithDrive:
+class WithDrive(Wrapping):
     """u = R tau/Kt + Kb q', the voltage of a drive for the torque tau of a law of robots.
 
     It is the outermost law of a scenario.  Observers receive the torque tau of the law.  Paths
@@ -46,11 +38,7 @@ class WithDrive:
 
     law: Controller
     drive: ElectricDrive
-    wraps: ClassVar[str] = "law"
     input_unit: ClassVar[str] = "V"
-    advice = wrapped_advice
-    init = wrapped_state
-    switching = wrapped_switching
 
     def check(self) -> None:
         """Raises ValueError for something that is not a law, or no drive."""
@@ -71,6 +59,6 @@ class WithDrive:
 
     def _velocity(self, t: jax.Array, *state: Any) -> jax.Array:
         """The velocity q' among the arguments t, q, q' or t, x of a law, (n,) [rad/s]."""
-        if law_member(unwrapped(self.law), "receives_x"):
+        if unwrapped(self.law).receives_x:
             return state[0][1]  # type: ignore[no-any-return]
         return state[1]  # type: ignore[no-any-return]

@@ -1,5 +1,5 @@
 """Decays: how fast a law drives the error of a level to zero.  The contract is the
-protocol `Decay`.
+base class `Decay`.
 """
 
 from iblf_jax.control.decays._base import Decay as Decay

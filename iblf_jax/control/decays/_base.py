@@ -20,33 +20,29 @@ gain k is 0, and the torque -M0 k(t, W) e2 adds -2 k(t, W) W to W'.
 
 from __future__ import annotations
 
+import abc
 import math
-from typing import Any, Protocol
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.core.optional import OptionalMembers
+from iblf_jax.core.families import Part
 from iblf_jax.core.units import PlantUnit
 
 SIZE = PlantUnit("rad", "z")
 """Unit of z = sqrt(2V)."""
 
 
-class Decay(Protocol):
-    """The contract of a decay.  All arrays are (n,), one number a joint, and joints do not mix.
+class Decay(Part):
+    """The contract of a decay.  All arrays are (n,), one number a joint, and joints do not mix."""
 
-    A decay may also have these members; `decay_member` holds their defaults.
+    constant: ClassVar[bool] = False
+    """Whether the gain is k at all times, so that a law does not compute V for it."""
+    smooth_derivatives: ClassVar[float] = math.inf
+    """The number of continuous derivatives that the gain has as a function of t and V."""
 
-    - `constant`: a class attribute, True if the gain is k at all times, so that a law does not
-      compute V for it.
-    - `smooth_derivatives`: a class attribute, the number of continuous derivatives that the gain
-      has as a function of t and V; infinite by default.
-    - `band()`: the V below which nothing more is claimed, (n,); None by default.
-    - `deadline()`: the time by which V has decayed to what the gain until then implies, (n,) [s];
-      None by default.
-    """
-
+    @abc.abstractmethod
     def effective_gain(self, t: jax.Array, k: jax.Array, V: jax.Array) -> jax.Array:
         """The gain k(t, V) >= k, (n,) [1/s].
 
@@ -55,13 +51,14 @@ class Decay(Protocol):
           k: constant gain of the level, (n,) [1/s], >= 0.
           V: value of the barrier, (n,), in its unit, >= 0.
         """
-        ...
 
+    def band(self) -> jax.Array | None:
+        """The V below which nothing more is claimed, (n,)."""
+        return None
 
-decay_member = OptionalMembers(
-    constant=False, band=lambda: None, deadline=lambda: None, smooth_derivatives=math.inf
-)
-"""Reads the optional members of a decay."""
+    def deadline(self) -> jax.Array | None:
+        """The time by which V has decayed to what the gain until then implies, (n,) [s]."""
+        return None
 
 
 def gain_at(decay: Decay, t: jax.Array, k: jax.Array, barrier: Any, tube: Any, x: jax.Array) -> Any:
@@ -74,7 +71,7 @@ def gain_at(decay: Decay, t: jax.Array, k: jax.Array, barrier: Any, tube: Any, x
       barrier, tube: of the level.
       x: state of the level, (n,).
     """
-    if decay_member(decay, "constant"):
+    if decay.constant:
         return k
     return decay.effective_gain(t, k, barrier.value(tube, x))
 

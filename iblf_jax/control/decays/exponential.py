@@ -6,11 +6,12 @@ from typing import ClassVar
 
 import jax
 
+from iblf_jax.control.decays._base import Decay
 from iblf_jax.core.pytree import component
 
 
 @component
-class Exponential:
+class Exponential(Decay):
     """k(t, V) = k:   z' = -k z, z = sqrt(2V).
 
     z(t) = z(0) exp(-k t): the error tends to 0 and does not reach it.  A law for

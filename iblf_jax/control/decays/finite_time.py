@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import jax
 
-from iblf_jax.control.decays._base import SIZE, power
+from iblf_jax.control.decays._base import SIZE, Decay, power
 from iblf_jax.core.pytree import Leaf, component, leaf
 
 
 @component
-class FiniteTime:
+class FiniteTime(Decay):
     """k(t, V) = k + k_a (2V + delta^2)^((a-1)/2):   z' = -k z - k_a z (z^2 + delta^2)^((a-1)/2).
 
     With z = sqrt(2V).  For delta = 0 it is z' = -k z - k_a z^a, which is 0 after

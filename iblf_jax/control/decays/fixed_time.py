@@ -5,12 +5,12 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.decays._base import SIZE
+from iblf_jax.control.decays._base import SIZE, Decay
 from iblf_jax.core.pytree import Leaf, component, leaf
 
 
 @component
-class FixedTime:
+class FixedTime(Decay):
     """k(t, V) = k + k_a (2V + delta^2)^((a-1)/2) + k_b (2V + delta^2)^((b-1)/2),   a < 1 < b.
 
     With z = sqrt(2V) and delta = 0 it is z' = -k z - k_a z^a - k_b z^b.  The term of b dominates

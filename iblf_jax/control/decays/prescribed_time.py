@@ -7,11 +7,12 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 
+from iblf_jax.control.decays._base import Decay
 from iblf_jax.core.pytree import Leaf, component, leaf
 
 
 @component
-class PrescribedTime:
+class PrescribedTime(Decay):
     """k(t, V) = k + gain/h(T - t),   h(s) = s for s >= 2 gain/cap,   h(s) = gain/cap for s <= 0.
 
     With z = sqrt(2V), z' = -k z - gain z/(T - t) gives z(t) = z(0) exp(-k t) ((T - t)/T)^gain,

@@ -1,4 +1,4 @@
-"""Disturbance observers.  The contract is the protocol `Observer`."""
+"""Disturbance observers.  The contract is the base class `Observer`."""
 
 from iblf_jax.control.observers._base import Observer as Observer
 from iblf_jax.control.observers._base import State as State

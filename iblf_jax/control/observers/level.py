@@ -8,6 +8,8 @@ the others.  The observer estimates disturbances that do not act where the input
 observer of the input torque finds.
 """
 
+# The methods receive x in the place of q and q'.
+# mypy: disable-error-code="override"
 from __future__ import annotations
 
 import dataclasses
@@ -16,6 +18,7 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 
+from iblf_jax.control.observers._base import Observer
 from iblf_jax.control.observers._eta import STARTS
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf, static
@@ -25,7 +28,7 @@ from iblf_jax.world.plants import Plant
 
 
 @component
-class LevelObserver:
+class LevelObserver(Observer):
     """d_hat_j = eta_j + kappa_j x_j,   eta_j' = -kappa_j (f_j + G_j x_{j+1} + d_hat_j),   j = 1..r.
 
     Then d_tilde_j' = d_j' - kappa_j d_tilde_j exactly.  Noise of a measured level j appears in

@@ -5,12 +5,13 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from iblf_jax.control.observers._base import Observer
 from iblf_jax.core.pytree import component
 from iblf_jax.world.robots import Robot
 
 
 @component
-class NoObserver:
+class NoObserver(Observer):
     """f_hat = 0.  Source: none; the baseline."""
 
     def init(self, q: jax.Array, dq: jax.Array, model: Robot) -> tuple[()]:

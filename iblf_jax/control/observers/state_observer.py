@@ -39,6 +39,8 @@ polynomial filter with fading memory, with which all poles of the chain are at
 a = exp(-bandwidth T).
 """
 
+# The methods receive x in the place of q and q'.
+# mypy: disable-error-code="override"
 from __future__ import annotations
 
 import math
@@ -49,6 +51,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.control.observers._base import Observer
 from iblf_jax.control.observers.level import check_rows
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf, static
@@ -82,7 +85,7 @@ Gains: TypeAlias = Callable[[int], list[jax.Array]]
 
 
 @component
-class StateObserver:
+class StateObserver(Observer):
     """x_hat' = f + G x_hat_+ + d_hat + correction by (x_s - x_hat_s) at each measured level s.
 
     The law receives x_hat in the place of the levels that are not measured (head of this module).

@@ -1,10 +1,10 @@
 """Sensors: the measurements of q and q', or of all levels of a plant, for a sampled law.  The
-contracts are the protocols `Sensor`, `LevelSensor` and `Velocity`.
+contracts are the base classes `Sensor`, `LevelSensor` and `Velocity`.
 """
 
+from iblf_jax.control.sensors._base import LevelReading as LevelReading
 from iblf_jax.control.sensors._base import LevelSensor as LevelSensor
 from iblf_jax.control.sensors._base import Measurement as Measurement
-from iblf_jax.control.sensors._base import Part as Part
 from iblf_jax.control.sensors._base import Sensor as Sensor
 from iblf_jax.control.sensors._base import State as State
 from iblf_jax.control.sensors._base import Velocity as Velocity
@@ -32,11 +32,11 @@ __all__ = [
     "Encoder",
     "FilteredDifference",
     "Ideal",
+    "LevelReading",
     "LevelSensor",
     "Levels",
     "Measured",
     "Measurement",
-    "Part",
     "Sensor",
     "State",
     "Tracking",

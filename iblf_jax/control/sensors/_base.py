@@ -7,14 +7,15 @@ depend only on seed, run, sample and joint.  Torque is never measured.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Protocol
+import abc
+from typing import Any, ClassVar, NamedTuple, Self
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.core.optional import OptionalMembers
+from iblf_jax.core.families import Part
 
 State = Any
 """A pytree of arrays of floats; `()` for a sensor without memory."""
@@ -32,32 +33,67 @@ class Measurement(NamedTuple):
     robot."""
 
 
-class Sensor(Protocol):
-    """The contract of a sensor.
+class LevelReading(Part):
+    """What a part of `Levels` states: a `Sensor` of a position and its velocity, or a
+    `LevelSensor`.
+    """
 
-    A sensor that rounds also has the properties `unrounded`, the same sensor without rounding, with
-    which the fastest mode of a loop is computed, and `resolution`, the size of a count, () or (n,)
-    [rad], for the default ranges of gains.  A sensor may have a method `advice(period)`, a list of
-    warnings.
+    receives_x: ClassVar[bool] = False
+    """Whether it measures all levels of a plant in strict-feedback form."""
+    levels: ClassVar[int] = 2
+    """Number of levels that it measures as a part of `Levels`."""
+    is_measured: ClassVar[bool] = True
+    """Whether it measures anything."""
+    velocity: Velocity | None = None
+    """The velocity estimate of a sensor that measures positions."""
+
+    @property
+    @abc.abstractmethod
+    def draws(self) -> int:
+        """Number of normal numbers per joint, or component, and sample."""
+
+    @property
+    def unrounded(self) -> Self:
+        """The same sensor without rounding, with which the fastest mode of a loop is computed."""
+        return self
+
+    @property
+    def resolution(self) -> Any:
+        """Size of a count, () or (n,) [rad], for the default ranges of gains; 0 for a sensor that
+        does not round.  (r, n) in the units of the levels for a sensor that `receives_x`.
+        """
+        return 0.0
+
+    def advice(self, period: jax.Array) -> list[str]:
+        """Warnings about the values of the fields at the period, () [s]."""
+        return []
+
+
+class Sensor(LevelReading):
+    """The contract of a sensor.
 
     A sensor of all levels of a plant in strict-feedback form has the class attribute
     `receives_x = True`; its methods then receive the state x, (r, n), in the place of q and q'.
-    With any other sensor the levels from the third on are measured without error.  The `resolution`
-    of such a sensor is (r, n), and it may have the properties `order`, the number of levels r, and
-    `measured`, the levels that it measures, counted from 1; without it it measures all.
+    With any other sensor the levels from the third on are measured without error.
     """
 
     @property
-    def draws(self) -> int:
-        """Number of normal numbers per joint and sample."""
-        ...
+    def order(self) -> int | None:
+        """The number of levels r of a sensor that `receives_x`; None for any number."""
+        return None
 
+    @property
+    def measured(self) -> tuple[int, ...] | None:
+        """The levels that a sensor that `receives_x` measures, counted from 1; None for all."""
+        return None
+
+    @abc.abstractmethod
     def init(self, q: jax.Array, dq: jax.Array, period: jax.Array) -> State:
         """State before the first sample, given q [rad] and dq [rad/s] there and the period, ()
         [s].
         """
-        ...
 
+    @abc.abstractmethod
     def measure(
         self, q: jax.Array, dq: jax.Array, normal: jax.Array, period: jax.Array, state: State
     ) -> tuple[Measurement, State]:
@@ -69,30 +105,21 @@ class Sensor(Protocol):
           period: () [s].
           state: of the sample before.
         """
-        ...
 
 
-class LevelSensor(Protocol):
+class LevelSensor(LevelReading):
     """The contract of a sensor of one level of a plant in strict-feedback form, a part of `Levels`.
 
-    A member that rounds has a leaf `resolution` and a property `unrounded`, as a `Sensor`; one that
-    measures nothing has `is_measured = False`.
+    All numbers are in the unit of the level.
     """
 
-    @property
-    def draws(self) -> int:
-        """Number of normal numbers per component and sample."""
-        ...
+    levels = 1
 
-    @property
-    def levels(self) -> int:
-        """1, by which `Levels` distinguishes it from a sensor of position and velocity."""
-        ...
-
+    @abc.abstractmethod
     def init_level(self, x: jax.Array, period: jax.Array) -> State:
         """State before the first sample, given the level there, (n,), and the period, () [s]."""
-        ...
 
+    @abc.abstractmethod
     def measure_level(
         self, x: jax.Array, normal: jax.Array, period: jax.Array, state: State
     ) -> tuple[jax.Array, State]:
@@ -104,35 +131,27 @@ class LevelSensor(Protocol):
           period: () [s].
           state: of the sample before.
         """
-        ...
 
 
-class Part(Protocol):
-    """A part of `Levels`: a `Sensor` of a position and its velocity, or a `LevelSensor`."""
-
-    @property
-    def draws(self) -> int:
-        """Number of normal numbers per component and sample."""
-        ...
-
-
-class Velocity(Protocol):
-    """The contract of a velocity estimate from measured positions.
-
-    It may have a method `advice(period)`, which returns a list of warnings.
-    """
+class Velocity(Part):
+    """The contract of a velocity estimate from measured positions."""
 
     @property
+    @abc.abstractmethod
     def draws(self) -> int:
         """Number of normal numbers per joint and sample."""
-        ...
 
+    def advice(self, period: jax.Array) -> list[str]:
+        """Warnings about the values of the fields at the period, () [s]."""
+        return []
+
+    @abc.abstractmethod
     def init(self, y: jax.Array, dq: jax.Array, period: jax.Array) -> State:
         """State before the first sample, for a joint that arrives at y [rad] with the velocity
         dq [rad/s].
         """
-        ...
 
+    @abc.abstractmethod
     def estimate(
         self, y: jax.Array, dq: jax.Array, normal: jax.Array, period: jax.Array, state: State
     ) -> tuple[jax.Array, State]:
@@ -145,26 +164,6 @@ class Velocity(Protocol):
           period: () [s].
           state: of the sample before.
         """
-        ...
-
-
-sensor_member = OptionalMembers(
-    receives_x=False,
-    unrounded=None,
-    resolution=0.0,
-    velocity=None,
-    advice=lambda period: [],
-    order=None,
-    measured=None,
-    levels=2,
-    is_measured=True,
-)
-"""Reads optional members of a sensor, of the sensor of a level or of a velocity estimate."""
-
-
-def unrounded(sensor: Sensor) -> Sensor:
-    """A sensor without its rounding; itself if it does not round."""
-    return sensor_member.variant(sensor, "unrounded")  # type: ignore[no-any-return]
 
 
 def rounded(x: jax.Array, step: jax.Array | float) -> jax.Array:

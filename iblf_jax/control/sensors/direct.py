@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import ClassVar
 
 import jax
 
-from iblf_jax.control.sensors._base import rounded
+from iblf_jax.control.sensors._base import LevelSensor, rounded
 from iblf_jax.core.pytree import Leaf, component, leaf
 
 
 @component
-class Direct:
+class Direct(LevelSensor):
     """y = resolution round((x + offset + noise w) / resolution),   w standard normal.
 
     It reads one level, a part of `Levels`; all numbers are in the unit of that level.  The
@@ -29,7 +28,6 @@ class Direct:
     noise: Leaf = leaf("1", sign="nonnegative", default=None)
     resolution: Leaf = leaf("1", sign="positive", default=None)
     offset: Leaf = leaf("1", default=0.0)
-    levels: ClassVar[int] = 1
 
     @property
     def draws(self) -> int:

@@ -9,14 +9,14 @@ import math
 
 import jax
 
-from iblf_jax.control.sensors._base import Measurement, State, Velocity, rounded, sensor_member
+from iblf_jax.control.sensors._base import Measurement, Sensor, State, Velocity, rounded
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.core.units import POSITION
 
 
 @component
-class Encoder:
+class Encoder(Sensor):
     """y = step round((q + offset + noise w) / step),   step = 2 pi / counts,   w standard normal.
 
     The derivative of y by q is defined as 1, that of the reading before rounding, because the
@@ -49,7 +49,7 @@ class Encoder:
 
     def advice(self, period: jax.Array) -> list[str]:
         """The velocity's warnings."""
-        return sensor_member(self.velocity, "advice")(period)  # type: ignore[no-any-return]
+        return self.velocity.advice(period)
 
     @property
     def unrounded(self) -> Encoder:

@@ -7,7 +7,7 @@ from typing import ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.sensors._base import above_nyquist
+from iblf_jax.control.sensors._base import Velocity, above_nyquist
 from iblf_jax.core.pytree import Leaf, component, leaf
 
 
@@ -21,7 +21,7 @@ class FilteredDifferenceValues(NamedTuple):
 
 
 @component
-class FilteredDifference:
+class FilteredDifference(Velocity):
     """v_k = a v_(k-1) + (1 - a) (y_k - y_(k-1)) / T,   a = exp(-cutoff T).
 
     Args:

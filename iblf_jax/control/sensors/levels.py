@@ -1,5 +1,7 @@
 """Sensors of all levels of a plant in strict-feedback form."""
 
+# The methods receive x in the place of q and q'.
+# mypy: disable-error-code="override"
 from __future__ import annotations
 
 import dataclasses
@@ -9,17 +11,10 @@ from typing import Any, ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.sensors._base import (
-    LevelSensor,
-    Measurement,
-    Part,
-    Sensor,
-    State,
-    sensor_member,
-    unrounded,
-)
+from iblf_jax.control.sensors._base import LevelReading, LevelSensor, Measurement, Sensor, State
 from iblf_jax.control.sensors.unmeasured import Unmeasured
 from iblf_jax.core import checks
+from iblf_jax.core.attributes import has_members
 from iblf_jax.core.pytree import component
 
 
@@ -34,7 +29,7 @@ class Span(NamedTuple):
 
 
 @component
-class Levels:
+class Levels(Sensor):
     """One sensor after the other, for the levels of a plant in their order.
 
     An ordinary sensor, such as `Encoder`, measures two levels: a position and its velocity.  The
@@ -49,7 +44,7 @@ class Levels:
     Source: none; the construction is common.
     """
 
-    parts: tuple[Part, ...]
+    parts: tuple[LevelReading, ...]
     receives_x: ClassVar[bool] = True
 
     def check(self) -> None:
@@ -59,9 +54,10 @@ class Levels:
             raise checks.fail(name, self.parts, "a tuple of sensors", remedy)
         parts = tuple(Unmeasured() if part is None else part for part in self.parts)
         for i, part in enumerate(parts):
-            protocol = LevelSensor if sensor_member(part, "levels") == 1 else Sensor
-            checks.conforms(f"{name}[{i}]", part, protocol, remedy)
-            if sensor_member(part, "receives_x"):
+            is_of_level = has_members(part, "levels") and part.levels == 1
+            base = LevelSensor if is_of_level else Sensor
+            checks.conforms(f"{name}[{i}]", part, base, remedy)
+            if part.receives_x:
                 expected = "a sensor of one or two levels"
                 raise checks.fail(f"{name}[{i}]", type(part).__name__, expected, remedy)
         object.__setattr__(self, "parts", parts)
@@ -70,7 +66,7 @@ class Levels:
         """The parts with their levels and their normal random numbers."""
         level, draw = 0, 0
         for part in self.parts:
-            next_level = level + sensor_member(part, "levels")
+            next_level = level + part.levels
             next_draw = draw + part.draws
             yield Span(part, slice(level, next_level), slice(draw, next_draw))
             level, draw = next_level, next_draw
@@ -78,14 +74,14 @@ class Levels:
     @property
     def order(self) -> int:
         """Number of levels."""
-        return sum(sensor_member(part, "levels") for part in self.parts)
+        return sum(part.levels for part in self.parts)
 
     @property
     def measured(self) -> tuple[int, ...]:
         """The levels that are measured, counted from 1."""
         found: list[int] = []
         for span in self.spans():
-            if sensor_member(span.part, "is_measured"):
+            if span.part.is_measured:
                 found += range(span.levels.start + 1, span.levels.stop + 1)
         return tuple(found)
 
@@ -97,7 +93,7 @@ class Levels:
     @property
     def unrounded(self) -> Levels:
         """The same without rounding."""
-        parts = tuple(unrounded(span.part) for span in self.spans())
+        parts = tuple(span.part.unrounded for span in self.spans())
         return dataclasses.replace(self, parts=parts)
 
     @property
@@ -105,7 +101,7 @@ class Levels:
         """Step of the readings of each level, (r, 1) or (r, n); 0 for a level without rounding."""
         rows: list[Any] = [0.0] * self.order
         for span in self.spans():
-            step = sensor_member(span.part, "resolution")
+            step = span.part.resolution
             if step is not None:
                 # A sensor of two levels rounds the position; its velocity follows from it.
                 rows[span.levels.start] = step
@@ -115,7 +111,7 @@ class Levels:
         """The warnings of the parts."""
         found: list[str] = []
         for i, part in enumerate(self.parts):
-            texts = sensor_member(part, "advice")(period)
+            texts = part.advice(period)
             found += [text.replace("sensor.", f"sensor.parts[{i}].", 1) for text in texts]
         return found
 

@@ -6,12 +6,13 @@ from typing import ClassVar
 
 import jax
 
+from iblf_jax.control.sensors._base import Velocity
 from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.core.units import VELOCITY
 
 
 @component
-class Measured:
+class Measured(Velocity):
     """V = q' + noise w,   w standard normal.
 
     Args:

@@ -7,7 +7,7 @@ from typing import ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.sensors._base import above_nyquist
+from iblf_jax.control.sensors._base import Velocity, above_nyquist
 from iblf_jax.core.pytree import Leaf, component, leaf
 
 
@@ -21,7 +21,7 @@ class TrackingValues(NamedTuple):
 
 
 @component
-class Tracking:
+class Tracking(Velocity):
     """r = y - q_hat - T v_hat;   q_hat <- y - a^2 r,   v_hat <- v_hat + (1 - a)^2 r / T,   a =
     exp(-bandwidth T).
 

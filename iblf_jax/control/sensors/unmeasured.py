@@ -7,11 +7,12 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 
+from iblf_jax.control.sensors._base import LevelSensor
 from iblf_jax.core.pytree import component
 
 
 @component
-class Unmeasured:
+class Unmeasured(LevelSensor):
     """No measurement of a level, a part of `Levels`; `None` means the same.
 
     An observer that has `complete`, such as `observers.StateObserver`, then estimates the level.
@@ -20,7 +21,6 @@ class Unmeasured:
     """
 
     draws: ClassVar[int] = 0
-    levels: ClassVar[int] = 1
     is_measured: ClassVar[bool] = False
 
     def init_level(self, x: jax.Array, period: jax.Array) -> tuple[()]:

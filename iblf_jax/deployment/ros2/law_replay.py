@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.control import sensors
-from iblf_jax.control.sensors._base import sensor_member
 from iblf_jax.simulation.closed_loop import LoopState, initial_state, run_sampled_law
 from iblf_jax.simulation.scenario import Initial, Scenario
 
@@ -19,7 +18,7 @@ def without_effects(sensor: Any) -> Any:
     """The part of a sensor that belongs to the law: its velocity filter, without counts, offset and
     noise.
     """
-    velocity = sensor_member(sensor, "velocity")
+    velocity = sensor.velocity
     if velocity is None:
         return sensors.Ideal()
     return sensors.Encoder(velocity)

@@ -28,7 +28,7 @@ from iblf_jax.simulation.error_growth import errors_by_step
 from iblf_jax.simulation.noise import NOISE_NAME, noise_values
 from iblf_jax.studies import statistics
 from iblf_jax.studies.blocks import BlockResults
-from iblf_jax.studies.distributions import Distribution, Perturbation, distribution_member
+from iblf_jax.studies.distributions import Distribution, Perturbation, is_interval
 from iblf_jax.studies.draws import draw, draw_shapes
 from iblf_jax.studies.execution import run_all_cases
 from iblf_jax.studies.options import ThisProcess
@@ -44,7 +44,7 @@ run."""
 
 
 @component
-class NormalCoordinates:
+class NormalCoordinates(Distribution):
     """A distribution in the coordinate z = Phi^-1(u).
 
     Args:
@@ -56,21 +56,16 @@ class NormalCoordinates:
     @property
     def group(self) -> str:
         """As the distribution's."""
-        return distribution_member(self.distribution, "group")  # type: ignore[no-any-return]
+        return self.distribution.group
 
     @property
     def draws(self) -> int:
         """As the distribution's."""
-        return distribution_member(self.distribution, "draws")  # type: ignore[no-any-return]
+        return self.distribution.draws
 
     def quantile(self, z: jax.Array) -> jax.Array:
         """F^-1(Phi(z))."""
-        of_normal = distribution_member(self.distribution, "of_normal")
-        if of_normal is not None:
-            return of_normal(z)  # type: ignore[no-any-return]
-        limits = jnp.finfo(z.dtype)
-        u = jax.scipy.special.ndtr(z)
-        return self.distribution.quantile(jnp.clip(u, limits.tiny, 1 - limits.eps / 2))
+        return self.distribution.of_normal(z)
 
     def support(self) -> tuple[np.ndarray, np.ndarray]:
         """As the distribution's."""
@@ -91,7 +86,8 @@ def in_normal_coordinates(prepared: PreparedStudy) -> PreparedStudy:
 
 def is_discrete(perturbations: Mapping[str, Perturbation]) -> bool:
     """Whether a distribution is discrete, so that a margin has no gradient by its draw."""
-    return any(distribution_member(p.distribution, "is_discrete") for p in perturbations.values())
+    distributions: Any = (p.distribution for p in perturbations.values() if not is_interval(p))
+    return any(distribution.is_discrete for distribution in distributions)
 
 
 class NormalSpace:

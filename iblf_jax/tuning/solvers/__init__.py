@@ -1,6 +1,6 @@
 """Solvers of tuning problems.
 
-The Protocol `Solver` in `_base` is the contract of a solver.  An object that satisfies it can be
+The base class `Solver` in `_base` is the contract of a solver.  An object with its members can be
 passed as `tune(..., solver=...)` as it is.  A solver of this package needs
 
 1. a file in this folder with a frozen dataclass, whose fields are its options;
@@ -12,7 +12,7 @@ Three base classes take over most of the contract:
 
 | If the algorithm | derive from | and write | Example |
 |---|---|---|---|
-| can be advanced step by step | nothing | all of `Solver` | `adam`, `lbfgs`, `sqp` |
+| can be advanced step by step | `Solver` | all of it | `adam`, `lbfgs`, `sqp` |
 | belongs to a library with its own loop | `programme.RunsToItsEnd` | `minimise` | `uno` |
 | uses values of many points only | `population.Population` | `begin`, `generation` | `cma_es` |
 """

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import abc
 from collections.abc import Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.core.optional import has_members
+from iblf_jax.core.attributes import has_members
 from iblf_jax.core.pytree import field_values
 from iblf_jax.studies.designs import MAX_RUNS
 from iblf_jax.tuning.parameters import Box
@@ -82,7 +83,7 @@ class SearchSpace(NamedTuple):
     """Largest number of steps of the search, for schedules."""
 
 
-class Solver(Protocol):
+class Solver(abc.ABC):
     """An algorithm with its options; a frozen dataclass without state of its own.
 
     It advances S starts together.  `evaluate` is a function of coordinates z, (S, p), that returns
@@ -95,60 +96,34 @@ class Solver(Protocol):
     minimises the largest excess alone.
     """
 
-    @property
-    def name(self) -> str:
-        """Name of the solver in `SOLVERS`, in files and in results."""
-        ...
+    name: ClassVar[str]
+    """Name of the solver in `SOLVERS`, in files and in results."""
+    handles_requirements: ClassVar[bool]
+    """Whether requirements are constraints of the solver.  Otherwise the loss is an augmented
+    Lagrangian, of which the search updates the multipliers."""
+    mode: str
+    """Mode of differentiation: "forward", "reverse", or "auto" to let the number of coordinates
+    decide."""
+    resample: bool
+    """Whether the runs are drawn anew at every step."""
+    starts: int | None
+    """Number of starting points, or None to let the effort of the tuning decide.
 
-    @property
-    def handles_requirements(self) -> bool:
-        """Whether requirements are constraints of the solver.  Otherwise the loss is an augmented
-        Lagrangian, of which the search updates the multipliers.
-        """
-        ...
+    With None, the tuning evaluates many points without derivatives, begins at several of them and
+    continues from the best one (see `search`)."""
+    tolerance: float
+    """Relative change of the loss below which a start has converged."""
+    sharpenings: int
+    """How often the smoothing of peaks in the objective is divided by 4, each time once the starts
+    have converged."""
+    patience: int
+    """Steps without a better result after which the search or its stage ends."""
 
-    @property
-    def mode(self) -> str:
-        """Mode of differentiation: "forward", "reverse", or "auto" to let the number of coordinates
-        decide.
-        """
-        ...
-
-    @property
-    def resample(self) -> bool:
-        """Whether the runs are drawn anew at every step."""
-        ...
-
-    @property
-    def starts(self) -> int | None:
-        """Number of starting points, or None to let the effort of the tuning decide.
-
-        With None, the tuning evaluates many points without derivatives, begins at several of them
-        and continues from the best one (see `search`).
-        """
-        ...
-
-    @property
-    def tolerance(self) -> float:
-        """Relative change of the loss below which a start has converged."""
-        ...
-
-    @property
-    def sharpenings(self) -> int:
-        """How often the smoothing of peaks in the objective is divided by 4, each time once the
-        starts have converged.
-        """
-        ...
-
-    @property
-    def patience(self) -> int:
-        """Steps without a better result after which the search or its stage ends."""
-        ...
-
+    @abc.abstractmethod
     def init(self, space: SearchSpace, z: np.ndarray) -> Any:
         """The state of S starts at z, (S, p), before the first evaluation."""
-        ...
 
+    @abc.abstractmethod
     def step(self, evaluate: Any, state: Any, tolerance: float) -> tuple[np.ndarray, Any]:
         """Advances the active starts by one trial each.
 
@@ -160,12 +135,12 @@ class Solver(Protocol):
         Returns:
           The trial points (S, p) and their `Derivatives`.
         """
-        ...
 
+    @abc.abstractmethod
     def converged(self, state: Any) -> np.ndarray:
         """Whether each start has converged or cannot continue, (S,) bool."""
-        ...
 
+    @abc.abstractmethod
     def restart(
         self, space: SearchSpace, state: Any, start: int, z: np.ndarray | None = None
     ) -> None:
@@ -174,7 +149,6 @@ class Solver(Protocol):
         Without z the start continues from where it is.  As the loss has changed, what was stored of
         the former loss, such as curvature, is discarded.
         """
-        ...
 
 
 EXCESS_WEIGHT = 200.0

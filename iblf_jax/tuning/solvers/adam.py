@@ -13,14 +13,14 @@ import numpy as np
 import optax
 
 from iblf_jax.tuning.solvers import optax_steps
-from iblf_jax.tuning.solvers._base import SearchSpace, check_options
+from iblf_jax.tuning.solvers._base import SearchSpace, Solver, check_options
 
 FINAL_RATE = 0.02
 """Last learning rate of the cosine schedule, relative to the first."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Adam:
+class Adam(Solver):
     """Adam; requirements are penalties.  `Optax` takes any other optimiser.
 
     Args:
@@ -44,7 +44,7 @@ class Adam:
     batch: int | None = None
     name: ClassVar[str] = "adam"
     handles_requirements: ClassVar[bool] = False
-    sharpenings: ClassVar[int] = 0
+    sharpenings = 0
 
     def __post_init__(self) -> None:
         check_options(self)

@@ -26,7 +26,7 @@ import numpy as np
 import optax
 
 from iblf_jax.tuning.parameters import squashed, unsquash
-from iblf_jax.tuning.solvers._base import SearchSpace, check_options, where_rows
+from iblf_jax.tuning.solvers._base import SearchSpace, Solver, check_options, where_rows
 
 SUFFICIENT_DECREASE = 1e-4
 """c1."""
@@ -35,7 +35,7 @@ CURVATURE = 0.9
 
 
 @dataclasses.dataclass(frozen=True)
-class LBFGS:
+class LBFGS(Solver):
     """L-BFGS; requirements are penalties.
 
     All starts take the steps of their line searches together, in one batch.
@@ -60,7 +60,7 @@ class LBFGS:
     patience: int = 15
     name: ClassVar[str] = "lbfgs"
     handles_requirements: ClassVar[bool] = False
-    resample: ClassVar[bool] = False
+    resample = False
 
     def __post_init__(self) -> None:
         check_options(self)

@@ -35,7 +35,7 @@ import optax
 
 from iblf_jax.core import checks, notices
 from iblf_jax.tuning.parameters import squashed, unsquash
-from iblf_jax.tuning.solvers._base import SearchSpace, check_options, where_rows
+from iblf_jax.tuning.solvers._base import SearchSpace, Solver, check_options, where_rows
 
 CHECK_STEPS = 5
 """Steps from one value on all runs to the next, where the runs of the steps differ; at most the
@@ -45,7 +45,7 @@ SEED_OF_BATCHES = 6
 
 
 @dataclasses.dataclass(frozen=True)
-class Optax:
+class Optax(Solver):
     """Any optimiser of optax, such as `Optax(optax.lion(1e-3))`; requirements are penalties.
 
     Gradient clipping, weight decay and schedules are parts of the optimiser:
@@ -78,7 +78,7 @@ class Optax:
     tolerance: float = 1e-5
     name: ClassVar[str] = "optax"
     handles_requirements: ClassVar[bool] = False
-    sharpenings: ClassVar[int] = 0
+    sharpenings = 0
 
     def __post_init__(self) -> None:
         check_options(self)

@@ -23,7 +23,7 @@ from typing import Any, ClassVar, NamedTuple
 import jax
 import numpy as np
 
-from iblf_jax.tuning.solvers._base import EXCESS_WEIGHT, SearchSpace, violations
+from iblf_jax.tuning.solvers._base import EXCESS_WEIGHT, SearchSpace, Solver, violations
 
 INVALID_LOSS = 1e6
 BATCHES_IN_FIRST_STEP = 2
@@ -79,7 +79,7 @@ class PopulationState:
     """The library's object; not part of a checkpoint."""
 
 
-class Population:
+class Population(Solver):
     """Base class of solvers that use values only.
 
     A derived class defines its options, `begin`, `generation` and the members of `Solver` that are
@@ -90,10 +90,10 @@ class Population:
     population: int
     """Number of points of a generation."""
     handles_requirements: ClassVar[bool] = True
-    mode: ClassVar[str] = "forward"
-    resample: ClassVar[bool] = False
-    starts: ClassVar[int] = 1
-    sharpenings: ClassVar[int] = 0
+    mode = "forward"
+    resample = False
+    starts = 1
+    sharpenings = 0
 
     def begin(self, space: SearchSpace, z: np.ndarray) -> Any:
         """The library's own object for a search that begins at z, (p,)."""

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from iblf_jax.tuning.solvers._base import SearchSpace, violations
+from iblf_jax.tuning.solvers._base import SearchSpace, Solver, violations
 from iblf_jax.tuning.solvers.sqp import MAX_PIECES, TARGET_EXCESS
 
 INVALID_OBJECTIVE = 1e3
@@ -219,7 +219,7 @@ class Programme:
         return bool(np.any(missing))
 
 
-class RunsToItsEnd:
+class RunsToItsEnd(Solver):
     """Base class of solvers whose library runs its own loop.
 
     One step is a whole run of the library from each start, so that a checkpoint exists only after

@@ -44,8 +44,8 @@ class SLSQP(RunsToItsEnd):
     patience: int = 15
     name: ClassVar[str] = "slsqp"
     handles_requirements: ClassVar[bool] = True
-    mode: ClassVar[str] = "forward"
-    resample: ClassVar[bool] = False
+    mode = "forward"
+    resample = False
 
     def __post_init__(self) -> None:
         check_options(self)
@@ -95,8 +95,8 @@ class TrustConstr(RunsToItsEnd):
     patience: int = 15
     name: ClassVar[str] = "trust-constr"
     handles_requirements: ClassVar[bool] = True
-    mode: ClassVar[str] = "forward"
-    resample: ClassVar[bool] = False
+    mode = "forward"
+    resample = False
 
     def __post_init__(self) -> None:
         check_options(self)

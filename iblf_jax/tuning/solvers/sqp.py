@@ -73,7 +73,7 @@ from scipy.linalg import block_diag
 from iblf_jax.core import checks
 from iblf_jax.tuning.parameters import Box
 from iblf_jax.tuning.solvers import quadratic
-from iblf_jax.tuning.solvers._base import Constraints, SearchSpace, check_options
+from iblf_jax.tuning.solvers._base import Constraints, SearchSpace, Solver, check_options
 
 INITIAL_RADIUS = 1.0
 """First delta in the coordinates z; 1 is a factor e for a gain."""
@@ -429,7 +429,7 @@ class SQPState:
 
 
 @dataclasses.dataclass(frozen=True)
-class SQP:
+class SQP(Solver):
     """Sequential quadratic programming with requirements as constraints; forward mode.
 
     Args:
@@ -449,8 +449,8 @@ class SQP:
     radius: float | None = None
     name: ClassVar[str] = "sqp"
     handles_requirements: ClassVar[bool] = True
-    mode: ClassVar[str] = "forward"
-    resample: ClassVar[bool] = False
+    mode = "forward"
+    resample = False
 
     def __post_init__(self) -> None:
         check_options(self)

@@ -41,8 +41,8 @@ class Uno(RunsToItsEnd):
     patience: int = 15
     name: ClassVar[str] = "uno"
     handles_requirements: ClassVar[bool] = True
-    mode: ClassVar[str] = "forward"
-    resample: ClassVar[bool] = False
+    mode = "forward"
+    resample = False
 
     def __post_init__(self) -> None:
         check_options(self)

@@ -19,8 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.core.attributes import has_members
 from iblf_jax.core.linalg import matvec, solve_gain, solve_spd
-from iblf_jax.core.optional import OptionalMembers, has_members
+from iblf_jax.core.optional import OptionalMembers
 from iblf_jax.core.status import VELOCITY_LIMIT
 from iblf_jax.core.units import ByLevel, Unit, per_second, product
 from iblf_jax.kernels import jaxprs

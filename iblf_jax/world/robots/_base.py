@@ -22,9 +22,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.core.attributes import attributes, has_members
 from iblf_jax.core.disk_cache import keep_programs
 from iblf_jax.core.linalg import inner, matvec
-from iblf_jax.core.optional import OptionalMembers, attributes, has_members
+from iblf_jax.core.optional import OptionalMembers
 from iblf_jax.core.time import as_at
 
 T = TypeVar("T")

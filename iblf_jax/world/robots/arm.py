@@ -34,8 +34,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.core.attributes import attributes
 from iblf_jax.core.linalg import sums_from, sums_to, symmetric
-from iblf_jax.core.optional import attributes
 from iblf_jax.core.pytree import Leaf, component, leaf, static
 from iblf_jax.world.robots import spatial
 from iblf_jax.world.robots._base import broadcast_fields
@@ -166,7 +166,7 @@ class Arm:
     )
     """Fields of which zeros, ones, minus ones and equal numbers may be compiled in
     (`engine.structural_constants`)."""
-    rows: ClassVar[dict[str, tuple[str, tuple[str, ...]]]] = {
+    named_rows: ClassVar[dict[str, tuple[str, tuple[str, ...]]]] = {
         "link": ("links", ("mass", "centre", "inertia")),
         "joint": ("joints", ("position", "rotation", "axis", *NUMBERS_OF_A_JOINT)),
     }

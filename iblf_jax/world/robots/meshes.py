@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from iblf_jax.core import checks
-from iblf_jax.core.optional import attributes
+from iblf_jax.core.attributes import attributes
 from iblf_jax.world.robots.description import Shown, contents
 
 LARGEST_MESHES = 512 << 20

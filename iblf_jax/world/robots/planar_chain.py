@@ -31,8 +31,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.core.attributes import attributes
 from iblf_jax.core.linalg import inner, sums_from, sums_to, symmetric
-from iblf_jax.core.optional import attributes
 from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.world.robots._base import broadcast_fields, from_energy, planar_skeleton
 

@@ -1,0 +1,256 @@
+"""Base classes of families, and the adoption of classes that inherit from none."""
+
+from __future__ import annotations
+
+import copy
+import math
+import pickle
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+import iblf_jax as ij
+from iblf_jax.core.families import Part, adopt, required_members
+from iblf_jax.core.pytree import note_code
+
+OWN = """
+import iblf_jax as ij
+
+@ij.component
+class Steep:
+    gain: ij.Leaf = ij.leaf("1", default=3.0)
+    guard: float = ij.static(default=1e-3)
+    uses_o = False
+
+    def value(self, tube, q):
+        return self.gain * (q - tube.q_d) ** 2
+
+    def slope(self, tube, q):
+        return 2 * self.gain * (q - tube.q_d)
+
+    def virtual_velocity(self, tube, q, k1, o):
+        return tube.dq_d - k1 * (q - tube.q_d)
+"""
+
+
+def own_class(base: str = "", field: str = "") -> type:
+    names = {"__name__": "__main__"}
+    text = OWN.replace("Steep:", f"Steep{base}:")
+    exec(text.replace("    gain:", f"    {field}\n    gain:", 1), names)
+    return names["Steep"]
+
+
+def law_with(barrier):
+    return ij.controllers.Backstepping(k1=2.0, K2=20.0, barrier=barrier)
+
+
+def test_a_class_without_a_base_class_gets_what_it_lacks_and_keeps_what_it_has():
+    own = own_class()
+    barrier = law_with(own()).barrier
+    assert type(barrier) is own and isinstance(barrier, ij.barriers.Barrier)
+    assert barrier.uses_o is False
+    assert barrier.value_unit == "1" and barrier.slope_derivatives == math.inf
+    assert barrier.decay_rate(jnp.ones(2)) is None
+
+
+@pytest.mark.parametrize("base", ["", "(ij.barriers.Barrier)"])
+def test_a_field_is_not_replaced_by_a_property_of_the_base_class(base):
+    own = own_class(base, "slope_derivatives: int = ij.static()")
+    part = law_with(own(slope_derivatives=2)).barrier
+    assert part.slope_derivatives == 2
+    assert jax.tree.map(lambda x: x, part).slope_derivatives == 2
+
+
+def test_an_attribute_of_an_object_is_not_replaced_by_a_property_of_the_base_class():
+    class Kinked(own_class()):
+        def __init__(self, derivatives: int) -> None:
+            object.__setattr__(self, "gain", jnp.ones(2))
+            object.__setattr__(self, "slope_derivatives", derivatives)
+
+    jax.tree_util.register_pytree_node(
+        Kinked,
+        lambda part: ((part.gain,), part.slope_derivatives),
+        lambda derivatives, _: Kinked(derivatives),
+    )
+    first = law_with(Kinked(1)).barrier
+    assert (first.slope_derivatives, law_with(Kinked(2)).barrier.slope_derivatives) == (1, 2)
+
+
+def test_a_default_does_not_hide_a_member_of_another_base_class():
+    class Claiming:
+        def decay_rate(self, k1):
+            return k1
+
+    plain = own_class()
+    claiming = ij.component(type("ClaimingSteep", (plain, Claiming), {}))
+    with_both = law_with(claiming()).barrier
+    assert law_with(plain()).barrier.decay_rate(3.0) is None
+    assert with_both.decay_rate(3.0) == 3.0
+    later = ij.component(type("Later", (plain, Claiming), {}))
+    assert law_with(later()).barrier.decay_rate(3.0) == 3.0
+
+
+def test_the_default_of_a_family_replaces_that_of_all_components():
+    class Gravity(Part):
+        own_joints: ClassVar[Mapping[str, int]] = {"mass": 3}
+
+    own = own_class()
+    assert own.own_joints == {}
+    for base in (Gravity, ij.barriers.Barrier):
+        adopt(own, base)
+        assert own.own_joints == {"mass": 3}
+
+
+def test_a_leaf_may_have_the_name_of_a_statement_of_classes():
+    own = own_class(field='rows: ij.Leaf = ij.leaf("1")')
+    scenario = ij.with_parts(ij.presets.zhang_yan_2024(), controller=law_with(own(rows=2.0)))
+    assert any(x.path == "controller.barrier.rows" for x in ij.parameters(scenario))
+
+
+def test_a_module_of_another_library_gets_the_members():
+    equinox = pytest.importorskip("equinox")
+
+    class Module(equinox.Module):
+        gain: jax.Array
+        guard: float = equinox.field(static=True, default=1e-3)
+
+        def value(self, tube, q):
+            return self.gain * q
+
+        def slope(self, tube, q):
+            return self.gain
+
+        def virtual_velocity(self, tube, q, k1, o):
+            return q
+
+    barrier = law_with(Module(jnp.ones(2))).barrier
+    assert isinstance(barrier, ij.barriers.Barrier) and barrier.slope_derivatives == math.inf
+    assert jax.tree.map(lambda x: x, barrier).value_unit == "1"
+
+
+@pytest.mark.parametrize("base", ["", "(ij.barriers.Barrier)"])
+def test_the_key_of_a_class_changes_once(base):
+    own = own_class(base)
+    barrier = law_with(own()).barrier
+    note_code(barrier)
+    first = jax.tree.structure(barrier)
+    law_with(own())
+    note_code(barrier)
+    assert jax.tree.structure(barrier) == first
+
+
+@pytest.mark.parametrize("base", ["", "(ij.barriers.Barrier)"])
+def test_a_class_that_another_process_gets_by_value_has_the_members(base):
+    cloudpickle = pytest.importorskip("cloudpickle")
+    packed = cloudpickle.dumps(law_with(own_class(base)(gain=5.0)))
+    code = (
+        "import pickle, sys; import iblf_jax as ij; law = pickle.load(sys.stdin.buffer);"
+        "print(float(law.barrier.gain), law.barrier.value_unit, law.barrier.slope_derivatives,"
+        "isinstance(law.barrier, ij.barriers.Barrier))"
+    )
+    assert output_of(code, packed) == [b"5.0", b"1", b"inf", b"True"]
+
+
+def test_a_field_without_a_value_is_required_although_the_base_class_has_a_default():
+    @ij.component
+    class Timed(ij.decays.Decay):
+        smooth_derivatives: int = ij.static()
+
+        def effective_gain(self, t, k, V):
+            return k
+
+    with pytest.raises(ValueError, match="smooth_derivatives"):
+        Timed()
+    assert Timed(smooth_derivatives=3).smooth_derivatives == 3
+
+
+def test_a_method_that_is_missing_is_an_error_at_the_definition():
+    with pytest.raises(ValueError, match=r"It lacks slope, virtual_velocity\."):
+
+        @ij.component
+        class Half(ij.barriers.Barrier):
+            guard: float = ij.static(default=1e-3)
+
+            def value(self, tube, q):
+                return q
+
+
+def test_a_class_without_a_base_class_that_lacks_a_method_is_refused_where_it_is_used():
+    @ij.component
+    class Half:
+        guard: float = ij.static(default=1e-3)
+
+    with pytest.raises(ValueError, match="It lacks slope, value, virtual_velocity"):
+        law_with(Half())
+
+
+def test_required_members_are_abstract_methods_and_attributes_without_a_value():
+    found = required_members(ij.barriers.Barrier)
+    assert found == ("guard", "slope", "value", "virtual_velocity")
+
+
+def test_adoption_is_done_once_and_is_inherited():
+    own = own_class()
+    adopt(own, ij.barriers.Barrier)
+    first = dict(vars(own))
+    adopt(own, ij.barriers.Barrier)
+    assert dict(vars(own)) == first
+
+    class Steeper(own):
+        pass
+
+    assert issubclass(Steeper, ij.barriers.Barrier)
+
+
+def test_copies_have_the_members():
+    barrier = law_with(own_class()(gain=4.0)).barrier
+    for twin in (copy.copy(barrier), copy.deepcopy(barrier)):
+        assert float(twin.gain) == 4.0 and twin.value_unit == "1"
+
+
+def test_a_process_that_imports_the_class_adopts_it(tmp_path, monkeypatch):
+    (tmp_path / "own_barriers.py").write_text(OWN)
+    monkeypatch.syspath_prepend(tmp_path)
+    from own_barriers import Steep  # type: ignore[import-not-found]
+
+    packed = pickle.dumps(law_with(Steep(gain=5.0)))
+    code = (
+        "import pickle, sys; law = pickle.loads(sys.stdin.buffer.read());"
+        "print(float(law.barrier.gain), law.barrier.value_unit)"
+    )
+    assert output_of(code, packed, str(tmp_path)) == [b"5.0", b"1"]
+
+
+def output_of(code: str, packed: bytes, *folders: str) -> list[bytes]:
+    """The words that a process with these folders on its path prints."""
+    path = [*folders, str(Path(ij.__file__).parents[1])]
+    done = subprocess.run(
+        [sys.executable, "-c", f"import sys; sys.path[:0] = {path}; {code}"],
+        input=packed,
+        capture_output=True,
+        check=True,
+    )
+    return done.stdout.split()
+
+
+def test_a_field_may_have_the_name_of_a_property_of_the_base_class():
+    @ij.component
+    class Counting(ij.sensors.Sensor):
+        draws: int = ij.static()
+        resolution: ij.Leaf = ij.leaf("rad")
+
+        def init(self, q, dq, period):
+            return ()
+
+        def measure(self, q, dq, normal, period, state):
+            return ij.sensors.Measurement(q, dq), ()
+
+    sensor = Counting(draws=2, resolution=0.1)
+    assert sensor.draws == 2 and float(sensor.resolution) == pytest.approx(0.1)
+    assert sensor.unrounded is sensor
