@@ -12,6 +12,7 @@ import dataclasses
 import difflib
 import errno
 import functools
+import inspect
 import math
 import numbers
 import os
