@@ -136,7 +136,7 @@ class Observer:
 
 
 @ij.component
-class Push:
+class Push(ij.disturbances.Disturbance):
     """A disturbance of a user's."""
 
     size: ij.Leaf = ij.leaf("N m")

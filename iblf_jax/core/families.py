@@ -13,11 +13,29 @@ from __future__ import annotations
 
 import abc
 import inspect
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from types import MappingProxyType
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 NO_NAMES: Mapping[str, Any] = MappingProxyType({})
+
+
+if TYPE_CHECKING:
+    attribute = property
+else:
+
+    class attribute:  # noqa: N801 (used as `property`)
+        """A property of a base class in whose place a member may have a field, a class attribute or
+        a property of its own.
+        """
+
+        def __init__(self, value: Callable[[Any], Any]) -> None:
+            self.value = value
+            self.__doc__ = value.__doc__
+            self.__isabstractmethod__ = getattr(value, "__isabstractmethod__", False)
+
+        def __get__(self, part: Any, owner: type | None = None) -> Any:
+            return self if part is None else self.value(part)
 
 
 class Part(metaclass=abc.ABCMeta):  # noqa: B024 (the families have abstract methods)
@@ -29,8 +47,11 @@ class Part(metaclass=abc.ABCMeta):  # noqa: B024 (the families have abstract met
     """Rows of leaves with names."""
     stacked: ClassVar[Mapping[str, Any]] = NO_NAMES
     """Names for several leaves as the rows of one array."""
-    own_joints: Mapping[str, int] = NO_NAMES
-    """Field -> number of joints, of parts whose number differs from that of the scenario."""
+
+    @attribute
+    def own_joints(self) -> Mapping[str, int]:
+        """Field -> number of joints, of parts whose number differs from that of the scenario."""
+        return NO_NAMES
 
     def check(self) -> None:
         """Raises ValueError for fields that do not fit together; called after construction."""
@@ -69,15 +90,27 @@ def adopt(cls: type, base: type) -> None:
     if not issubclass(base, Part) or issubclass(cls, base):
         return
     own = {*dir(cls), *_annotated(cls)}
+    lacking: dict[str, Any] = {}
     for owner in _lines_of(base):
         for name, member in vars(owner).items():
-            if name not in own and not _is_of_python(name) and not _is_abstract(member):
-                setattr(cls, name, member)
+            if name not in own and not _is_of_python(name):
+                lacking.setdefault(name, member)
+    defaults = {name: x for name, x in lacking.items() if not _is_abstract(x)}
+    if hasattr(cls, "__getattr__"):
+        cls.__getattr__ = _with_defaults(cls.__getattr__, defaults)
+    else:
+        for name, member in defaults.items():
+            setattr(cls, name, member)
     base.register(cls)  # type: ignore[attr-defined]
     if cls.__reduce__ is object.__reduce__:
         # Another process that imports the class by its name adopts it, too.
         cls.__reduce__ = _reduced  # type: ignore[assignment, method-assign]
     cls._adopted_by = (*vars(cls).get("_adopted_by", ()), base)  # type: ignore[attr-defined]
+
+
+def is_default(method: Any, default: Any) -> bool:
+    """Whether the method of a part is that of its base class, `is_default(plant.at, Plant.at)`."""
+    return getattr(method, "__func__", None) is default
 
 
 def required_members(base: type) -> list[str]:
@@ -99,6 +132,25 @@ def _restored(cls: type, bases: tuple[type, ...]) -> Any:
     for base in bases:
         adopt(cls, base)
     return object.__new__(cls)
+
+
+def _with_defaults(
+    own: Callable[[Any, str], Any], defaults: Mapping[str, Any]
+) -> Callable[[Any, str], Any]:
+    """The method `__getattr__` of a class that takes members from another object: what that object
+    lacks as well is a default.
+    """
+
+    def member(part: Any, name: str) -> Any:
+        try:
+            return own(part, name)
+        except AttributeError:
+            if name not in defaults:
+                raise
+            found = defaults[name]
+            return found.__get__(part, type(part)) if hasattr(found, "__get__") else found
+
+    return member
 
 
 def _lines_of(base: type) -> Iterator[type]:

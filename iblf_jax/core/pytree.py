@@ -84,10 +84,14 @@ def component(cls: type[T]) -> type[T]:
         raise checks.fail(
             "component", cls, "a class of annotated fields, those with defaults last", f"{error}."
         ) from error
+    fields = dataclasses.fields(cls)  # type: ignore[arg-type]
+    if inspect.isabstract(cls):
+        # A field without a value is no attribute of the class, and has a value in every object.
+        abstract: Any = cls
+        abstract.__abstractmethods__ -= {field.name for field in fields}
     if inspect.isabstract(cls):
         missing = sorted(cls.__abstractmethods__)  # type: ignore[attr-defined]
         raise checks.fail("component", cls, "a complete class", f"It lacks {', '.join(missing)}.")
-    fields = dataclasses.fields(cls)  # type: ignore[arg-type]
     dataclass_init = cls.__init__
 
     @functools.wraps(dataclass_init)

@@ -1,21 +1,39 @@
 """Time-varying parts of a scenario: their values at an instant, and the times at which they jump.
 
-A time-varying part may have `at(t)`, which returns the part as it is at time t [s]. A part that is
+A time-varying part has `at(t)`, which returns the part as it is at time t [s]. A part that is
 discontinuous in time declares the instants by `jump_times()`, and steps of a run are divided there.
-Both methods are optional in every family, except for `jump_times` of disturbances.
 """
 
 from __future__ import annotations
 
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
 import jax
 import jax.numpy as jnp
 
 from iblf_jax.core import checks
+from iblf_jax.core.families import Part
 from iblf_jax.core.optional import has_members
 
 T = TypeVar("T")
+
+
+class Timed(Part):
+    """The base of the families whose members may be discontinuous in time."""
+
+    def jump_times(self) -> jax.Array:
+        """The times at which the part or its rate jumps, (m,) [s]; steps of a run are divided
+        there.
+        """
+        return no_times()
+
+
+class TimeVarying(Timed):
+    """The base of the families whose members may change during a run."""
+
+    def at(self, t: jax.Array) -> Self:
+        """The part as it is at time t [s]."""
+        return self
 
 
 def as_at(part: T, t: jax.Array) -> T:

@@ -101,10 +101,9 @@ def _declared(name: str, part: Any, found: Operations) -> str:
     """The sentence on a part with cases or kinks that declares its continuous derivatives."""
     refuse_unknown(f"scenario.{name}", found)
     kind = type(part).__name__
-    if has_members(part, "continuous_derivatives"):
-        number = float(part.continuous_derivatives)
-        if np.isfinite(number):
-            return f"The {name} {kind} has {number:g} continuous derivatives, as it declares."
+    number = float(part.continuous_derivatives)
+    if np.isfinite(number):
+        return f"The {name} {kind} has {number:g} continuous derivatives, as it declares."
     listed = ", ".join(sorted(found.cases | found.kinks))
     got = f"{kind}, which has operations that select a case or have a kink ({listed})"
     expected = "a smooth function of time, or a class with the attribute continuous_derivatives"

@@ -21,7 +21,6 @@ from iblf_jax.core.linalg import solve_spd
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.time import as_at
 from iblf_jax.world import plants
-from iblf_jax.world.disturbances import rates_of
 from iblf_jax.world.robots import at_time, friction_torque, inverse_dynamics, momentum
 
 # --- the start ------------------------------------------------------------------------------------
@@ -285,7 +284,7 @@ def motion(
         known = plants.robot_of(model)
         torque = disturbance.torque(t, q, dq, robot, known) + friction_torque(robot, dq)
     rate = plants.flow(plant, t, x, u, torque)
-    added = rates_of(disturbance, t, x, plant, model)
+    added = disturbance.rates(t, x, plant, model)
     if added is not None:
         rate = rate + added
     if len(rate) == 2:
@@ -299,7 +298,7 @@ def _robot_motion(
     """The rate of q and q' of a robot."""
     ddq = acceleration(scenario, t, q, dq, tau)
     x = jnp.stack([q, dq])
-    added = rates_of(scenario.disturbance, t, x, scenario.plant, scenario.model)
+    added = scenario.disturbance.rates(t, x, scenario.plant, scenario.model)
     if added is None:
         return Motion(dq, ddq, ())
     return Motion(dq + added[0], ddq + added[1], ())

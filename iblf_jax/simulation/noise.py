@@ -22,7 +22,6 @@ from iblf_jax.simulation.integrators import STOCHASTIC, TABLEAUS, tableau
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import Sample, has
 from iblf_jax.world import plants
-from iblf_jax.world.process_noise import noise_member
 
 NOISE_NAME = "noise"
 """Name of the noise key among the replaced values of a run; no leaf of a scenario has this name."""
@@ -165,7 +164,7 @@ def check_method(scenario: Scenario, method: str) -> None:
 def _no_command_between_steps(scenario: Scenario, method: str) -> ValueError:
     """The error for a method of a single stage where the input has a delay."""
     noise = scenario.process_noise
-    if noise is not None and not noise_member(noise, "additive"):
+    if noise is not None and not noise.additive:
         expected = "noise that does not depend on the state, as the input has a delay"
         remedy = 'A delay needs method="stochastic_heun", which needs additive noise.'
         return checks.fail("scenario.process_noise", type(noise).__name__, expected, remedy)
@@ -188,7 +187,7 @@ def _check_kind_of_method(scenario: Scenario, method: str) -> None:
         expected = f"one of {', '.join(STOCHASTIC)}, as the plant has process noise"
         remedy = 'Take method="euler_maruyama", or with_parts(scenario, process_noise=None).'
         raise checks.fail("method", method, expected, remedy)
-    if method == "stochastic_heun" and not noise_member(noise, "additive"):
+    if method == "stochastic_heun" and not noise.additive:
         expected = "euler_maruyama, as the noise depends on the state"
         remedy = (
             "The process noise is that of Ito, and Heun's method converges to the solution in the"
@@ -207,7 +206,7 @@ def brownian_increment(scenario: Scenario, key: jax.Array, step: jax.Array, dt: 
       dt: its length, () [s].
     """
     noise: Any = scenario.process_noise
-    levels, parts = len(noise.levels), noise_member(noise, "substeps")
+    levels, parts = len(noise.levels), noise.substeps
     first = step.astype(jnp.int32) * parts
     total = normals(key, first, levels, scenario.n, PROCESS_STREAM)
     for part in range(1, parts):

@@ -166,9 +166,12 @@ def _has_members(findings: Findings, member: Any, base: type) -> None:
         if method is None:
             findings.add(f"the attribute {name!r} is missing", f"See {base.__name__}")
             continue
-        names = [word for word in inspect.signature(method).parameters if word != "self"]
+        arguments = ""
+        if callable(method):
+            names = [word for word in inspect.signature(method).parameters if word != "self"]
+            arguments = f"({', '.join(names)})"
         text = (inspect.getdoc(method) or "").split("\n")[0]
-        findings.add(f"{name}({', '.join(names)}) is missing", text)
+        findings.add(f"{name}{arguments} is missing", text)
 
 
 def shape_of(findings: Findings, label: str, call: Callable, *args: Any) -> Any:

@@ -15,46 +15,45 @@ and with their rates.  `tube_at` computes them by automatic differentiation and 
 
 from __future__ import annotations
 
+import abc
 import math
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.core.optional import OptionalMembers
+from iblf_jax.core.families import attribute
 from iblf_jax.core.pytree import Leaf, component, leaf
+from iblf_jax.core.time import Timed
 from iblf_jax.core.units import POSITION
 from iblf_jax.world.references import Reference
 from iblf_jax.world.robots import Robot
 from iblf_jax.world.robots._base import robot_member
 
 
-class Side(Protocol):
-    """The contract of one side of the bounds.
+class Side(Timed):
+    """The contract of one side of the bounds."""
 
-    A side that is discontinuous in time also has `jump_times()`, the times (m,) [s] at which it or
-    its rate jumps; steps of a run are divided there, as for disturbances.  A side that is not
-    smooth has `continuous_derivatives`, the number of its continuous derivatives in time and in
-    q_d; a law for a plant of order r needs r - i + 1 of them on level i.
-    """
+    @attribute
+    def continuous_derivatives(self) -> float:
+        """The number of its continuous derivatives in time and in q_d; a law for a plant of order r
+        needs r - i + 1 of them on level i.
+        """
+        return math.inf
 
+    @abc.abstractmethod
     def at(self, t: jax.Array, q_d: jax.Array) -> jax.Array:
         """The bound on q at time t [s], (n,) [rad]; a bound may depend on the reference q_d at t,
         (n,) [rad].
 
         A bound on q' is in rad/s and receives q_d' in place of q_d.
         """
-        ...
-
-
-side_member = OptionalMembers(continuous_derivatives=math.inf)
-"""Reads optional members of a side."""
 
 
 @component
-class Constant:
+class Constant(Side):
     """The bound is `value`, for all time.
 
     Args:
@@ -69,7 +68,7 @@ class Constant:
 
 
 @component
-class Sinusoid:
+class Sinusoid(Side):
     """The bound is offset + amplitude sin(frequency t + phase).
 
     Args:
@@ -94,7 +93,7 @@ class Sinusoid:
 
 
 @component
-class Funnel:
+class Funnel(Side):
     """A bound at a distance r(t) = (initial - final) exp(-rate t) + final from the reference.
 
     `initial` and `final` are signed: positive for an upper side (bound = q_d + r), negative for a

@@ -63,8 +63,7 @@ from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.core.units import ByLevel, PlantUnit, resolved
 from iblf_jax.world import plants
-from iblf_jax.world.bounds import Bounds, Funnel, Tube, side_member
-from iblf_jax.world.references import reference_member
+from iblf_jax.world.bounds import Bounds, Funnel, Tube
 
 
 @component
@@ -236,7 +235,7 @@ class BarrierBackstepping:
         """Raises ValueError for a reference with too few continuous derivatives."""
         if self.filter is not None:
             return
-        smooth = reference_member(context.reference, "continuous_derivatives")
+        smooth = context.reference.continuous_derivatives
         if smooth >= self.order:
             return
         expected = f"a reference with {self.order} continuous derivatives, as u contains them"
@@ -255,7 +254,7 @@ class BarrierBackstepping:
         name = "bounds" if i == 0 else f"state_bounds[{i - 1}]"
         needed = self.order - i
         for side_name, side in (("lower", bounds.lower), ("upper", bounds.upper)):
-            smooth = side_member(side, "continuous_derivatives")
+            smooth = side.continuous_derivatives
             if smooth >= needed:
                 continue
             expected = f"a side with {needed} continuous derivatives, as u contains them"
