@@ -32,7 +32,9 @@ def evaluate_annotations(names: dict[str, Any]) -> None:
             continue
         methods = vars(thing).values() if isinstance(thing, type) else ()
         functions = [method for method in methods if isinstance(method, types.FunctionType)]
-        for annotated in (thing, *functions):
+        # A class without a base class has adopted methods of the package.
+        own = [method for method in functions if method.__module__ == names["__name__"]]
+        for annotated in (thing, *own):
             inspect.get_annotations(annotated, globals=names, eval_str=True)
 
 

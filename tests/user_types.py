@@ -180,7 +180,7 @@ class Sensor:
 
 
 @ij.component
-class Plant:
+class Plant(ij.plants.Plant):
     """A plant of a user's."""
 
     n: ClassVar[int] = 1

@@ -46,7 +46,6 @@ from iblf_jax.simulation.signals import SIGNALS
 from iblf_jax.world import plants
 from iblf_jax.world.disturbances import Nothing
 from iblf_jax.world.robots import at_time
-from iblf_jax.world.robots._base import robot_member
 
 
 @notices.each_warning_once
@@ -117,7 +116,7 @@ def cosimulate(
     _check_no_process_noise(scenario)
     scenario = canonical(with_period(scenario, period))
     seed, throw = checks.seed(seed), checks.boolean("throw", throw)
-    names = tuple(robot_member(scenario.plant, "joints"))
+    names = scenario.plant.joints
     if locked is None:
         locked = {}
     checks.mapping("locked", locked, '{"gripper_joint": 0.02}')

@@ -834,7 +834,7 @@ def metric_units(folds: Sequence[Fold], scenario: Scenario) -> tuple[tuple[str, 
     """
     of_folds = [fold_member(fold, "units") for fold in folds]
     pairs = [pair for units in of_folds for pair in units.items()]
-    if plants.plant_member(scenario.plant, "switching") is not None:
+    if plants.has_modes(scenario.plant):
         pairs += plants.SWITCHING_UNITS.items()
     return tuple((name, unit_text(scenario, unit)) for name, unit in (*pairs, *ACCURACY_UNITS))
 

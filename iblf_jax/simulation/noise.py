@@ -21,7 +21,6 @@ from iblf_jax.simulation.discontinuities import Piece
 from iblf_jax.simulation.integrators import STOCHASTIC, TABLEAUS, tableau
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import Sample, has
-from iblf_jax.world import plants
 
 NOISE_NAME = "noise"
 """Name of the noise key among the replaced values of a run; no leaf of a scenario has this name."""
@@ -60,7 +59,7 @@ def has_noise(scenario: Scenario) -> bool:
     """Whether a run of a scenario draws random numbers: noise of the sensor, process noise, or
     switching times.
     """
-    if scenario.process_noise is not None or plants.plant_member(scenario.plant, "mode_draws"):
+    if scenario.process_noise is not None or scenario.plant.mode_draws:
         return True
     return has_sensor_noise(scenario)
 
@@ -360,7 +359,7 @@ def with_extremes(
 
 def realised(scenario: Scenario, key: Any) -> Scenario:
     """The scenario with the switching times and modes of one run, where its plant draws them."""
-    draws = plants.plant_member(scenario.plant, "mode_draws")
+    draws = scenario.plant.mode_draws
     if not draws:
         return scenario
     dtype = scenario.initial.q.dtype

@@ -30,7 +30,7 @@ from iblf_jax.core.time import Timed
 from iblf_jax.core.units import POSITION
 from iblf_jax.world.references import Reference
 from iblf_jax.world.robots import Robot
-from iblf_jax.world.robots._base import robot_member
+from iblf_jax.world.robots._base import is_robot
 
 
 class Side(Timed):
@@ -149,9 +149,10 @@ def _distance(name: str, value: Any, n: int, sign: str | None) -> jax.Array:
     return array
 
 
-def _limits_of(robot: Robot, member: str, what: str, unlimited: Any) -> tuple[Any, Any]:
+def _checked_limits(
+    robot: Robot, member: str, limits: Any, what: str, unlimited: Any
+) -> tuple[Any, Any]:
     """The limits that a robot declares, and the value for joints without limits."""
-    limits = robot_member(robot, member)
     if limits is None:
         expected, remedy = f"a robot with {what} limits, such as an Arm", "Give bounds of your own."
         raise checks.fail("robot", type(robot).__name__, expected, remedy)
@@ -177,7 +178,8 @@ def from_limits(robot: Robot, *, margin: float = 0.0, unlimited: float | None = 
       ValueError: a robot without `limits`, or with joints that have none and no `unlimited`; a
         margin that leaves nothing.
     """
-    limits, replacement = _limits_of(robot, "limits", "joint", unlimited)
+    stated = robot.limits if is_robot(robot) else None
+    limits, replacement = _checked_limits(robot, "limits", stated, "joint", unlimited)
     margins = _distance("margin", margin, robot.n, None)
     lower = jnp.where(jnp.isfinite(limits[0]), limits[0] + margins, -replacement)
     upper = jnp.where(jnp.isfinite(limits[1]), limits[1] - margins, replacement)
@@ -205,7 +207,8 @@ def from_speed_limits(
       ValueError: a robot without `speed`, or with joints that have no limit and no `unlimited`; a
         share that is not positive.
     """
-    speed, replacement = _limits_of(robot, "speed", "speed", unlimited)
+    stated = robot.speed if is_robot(robot) else None
+    speed, replacement = _checked_limits(robot, "speed", stated, "speed", unlimited)
     share = checks.positive_number("share", share, "1")
     limit = share * jnp.where(jnp.isfinite(speed), speed, replacement)
     return Bounds(lower=Constant(-limit), upper=Constant(limit))

@@ -14,7 +14,7 @@ records the `distance` to the boundary as its margin; a `controllers.SafetyFilte
 from __future__ import annotations
 
 import abc
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -147,7 +147,10 @@ def row_of(robot: Robot, point: str | int) -> int:
 def position_of(robot: Robot, point: str | int, q: jax.Array) -> jax.Array:
     """Position of a region's point at q, (2,) or (3,) [m]."""
     row = row_of(robot, point)
-    return robot.tip(q) if row == robot.n else robot.skeleton(q)[row]
+    if row == robot.n:
+        return robot.tip(q)
+    points: Any = robot.skeleton(q)
+    return points[row]  # type: ignore[no-any-return]
 
 
 def margins(regions: tuple[Region, ...], robot: Robot, q: jax.Array) -> jax.Array:

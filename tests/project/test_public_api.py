@@ -141,17 +141,25 @@ ELSEWHERE = (
     "tuple",
     "None",
     "ClassVar",
+    "Self",
 )
 """What annotations of the protocols name that is not of this package."""
 
 
+BASES = {"Protocol", "Part", "Timed", "TimeVarying", "Dynamics"}
+"""What the contract of a family inherits from."""
+
+
 def protocols() -> dict[str, ast.ClassDef]:
-    """Every Protocol of the package, "module:Name" -> its definition."""
+    """The contract of every family, "module:Name" -> its definition."""
     found = {}
     for path in sorted((ROOT / "iblf_jax").rglob("*.py")):
         module = ".".join(path.relative_to(ROOT).with_suffix("").parts)
         for node in ast.parse(path.read_text(encoding="utf-8")).body:
-            if isinstance(node, ast.ClassDef) and "Protocol" in map(ast.unparse, node.bases):
+            if not isinstance(node, ast.ClassDef) or ".core." in module:
+                continue
+            is_member = "component" in map(ast.unparse, node.decorator_list)
+            if not is_member and BASES & set(map(ast.unparse, node.bases)):
                 found[f"{module}:{node.name}"] = node
     return found
 

@@ -194,10 +194,10 @@ class BarrierBackstepping:
         """The law with weights, (r, n), that belong to its model and to a state x."""
         if self.weights is not None or plants.order_of(context.model) != self.order:
             return self
-        scale = plants.plant_member(plants.as_plant(context.model), "weights")
+        scale = plants.as_plant(context.model).weights(x)
         weights = jnp.ones_like(x)
         if scale is not None:
-            weights = scale(x) * self._centre_ratios(context, x)
+            weights = scale * self._centre_ratios(context, x)
         # The fields are checked already; `dataclasses.replace` would check them again.
         found = copy.copy(self)
         object.__setattr__(found, "weights", weights)
@@ -220,7 +220,7 @@ class BarrierBackstepping:
             expected = f"{order} levels, as the model ({kind}) has"
             remedy = "Give k, barriers and weights one entry a level."
             raise checks.fail("controller.k", f"{self.order} levels", expected, remedy)
-        if self.filter is None and plants.plant_member(context.model, "needs_filters"):
+        if self.filter is None and plants.as_plant(context.model).needs_filters:
             kind = type(context.model).__name__
             expected = f"filters in place of the derivatives that {kind} does not have"
             remedy = "Such as BarrierBackstepping(..., filter=0.01)."
