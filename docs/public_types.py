@@ -14,6 +14,7 @@ from types import FunctionType, ModuleType
 from typing import Any
 
 from iblf_jax.core import pytree
+from iblf_jax.core.families import Part, attribute
 from iblf_jax.simulation.signals import SIGNALS, Sample
 
 ALIASES = {"Leaf": pytree}
@@ -21,8 +22,11 @@ ALIASES = {"Leaf": pytree}
 
 
 def is_contract(thing: Any) -> bool:
-    """Whether something is the base class of a family, or a protocol."""
-    return inspect.isabstract(thing) or getattr(thing, "_is_protocol", False)
+    """Whether something is a protocol or a base class, the contract of a family."""
+    if not inspect.isclass(thing):
+        return False
+    is_base = issubclass(thing, Part) and not pytree.is_component_class(thing)
+    return is_base or getattr(thing, "_is_protocol", False)
 
 
 def is_record(thing: Any) -> bool:
@@ -95,21 +99,42 @@ def page(
         for field, text in fields_of(thing).items():
             lines.append(f"- **{field}**: {' '.join(text.split())}" if text else f"- **{field}**")
         lines.append("")
-    for member, value in vars(thing).items():
-        if member.startswith("_") or not isinstance(value, FunctionType | property):
+    for member, value in _members(thing).items():
+        if member.startswith("_") or not isinstance(value, FunctionType | property | attribute):
             continue
         lines += [f"{'#' * (level + 1)} {name}.{member}", ""]
         if isinstance(value, FunctionType):
             arguments = ", ".join(list(inspect.signature(value).parameters)[1:])
             lines += [defined("method", module, f"{short}.{member}", f"({arguments})")]
         lines += [body(inspect.getdoc(value) or ""), ""]
-    for attribute, text in ({} if is_record(thing) else _attributes(thing)).items():
-        lines += [f"- **{attribute}**: {' '.join(text.split())}", ""]
+    for name_of_field, text in ({} if is_record(thing) else _attributes(thing)).items():
+        lines += [f"- **{name_of_field}**: {' '.join(text.split())}", ""]
     return "\n".join(lines)
 
 
+def _bases(contract: type) -> list[type]:
+    """A protocol, or the base class of a family with those that it inherits from, except for what
+    all components may state; the most special one first.
+    """
+    inherited = [cls for cls in contract.__mro__[1:] if issubclass(cls, Part) and cls is not Part]
+    return [contract, *inherited]
+
+
+def _members(thing: type) -> dict[str, Any]:
+    """The members of a class by name, with those that the base class of a family inherits."""
+    if is_record(thing):
+        return dict(vars(thing))
+    found: dict[str, Any] = {}
+    for cls in _bases(thing):
+        found = {**found, **{name: x for name, x in vars(cls).items() if name not in found}}
+    return found
+
+
 def _attributes(contract: type) -> dict[str, str]:
-    """Annotated attributes of a base class -> what they are."""
-    definition = ast.parse(textwrap.dedent(inspect.getsource(contract))).body[0]
-    assert isinstance(definition, ast.ClassDef)
-    return texts_of_fields(definition.body)
+    """Annotated attributes of a contract -> what they are."""
+    texts: dict[str, str] = {}
+    for cls in _bases(contract):
+        definition = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0]
+        assert isinstance(definition, ast.ClassDef)
+        texts = {**texts_of_fields(definition.body), **texts}
+    return texts

@@ -136,7 +136,7 @@ class Observer(ij.observers.Observer):
 
 
 @ij.component
-class Push:
+class Push(ij.disturbances.Disturbance):
     """A disturbance of a user's."""
 
     size: ij.Leaf = ij.leaf("N m")
@@ -180,7 +180,7 @@ class Sensor(ij.sensors.Sensor):
 
 
 @ij.component
-class Plant:
+class Plant(ij.plants.Plant):
     """A plant of a user's."""
 
     n: ClassVar[int] = 1

@@ -35,7 +35,6 @@ from iblf_jax.core.units import Unit, of_component, per_second
 from iblf_jax.world import plants
 from iblf_jax.world.bounds import Tube
 from iblf_jax.world.plants._base import Units
-from iblf_jax.world.references import reference_member
 
 LEVEL_ROUNDING = 16.0
 """Error of V' in units of the last place, relative to the sizes of its terms, over that of Theorem
@@ -100,7 +99,7 @@ def _smoothness(summary: LevelSummary) -> Line:
         return not_applicable(SMOOTH, summary.claims.why_not)
     if law.filter is not None:
         return not_applicable(SMOOTH, "a law with filters forms no derivatives")
-    spare = float(reference_member(context.reference, "continuous_derivatives")) - law.order
+    spare = float(context.reference.continuous_derivatives) - law.order
     try:
         law.check_start(context)
     except ValueError as error:

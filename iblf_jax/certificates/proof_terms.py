@@ -54,7 +54,6 @@ from iblf_jax.control.decays._base import energy_gain, gain_at
 from iblf_jax.control.observers import Printed
 from iblf_jax.core.linalg import matvec, solve_spd
 from iblf_jax.core.pytree import unwrapped
-from iblf_jax.core.time import as_at
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, rate
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import Sample, has, speed_margin
@@ -206,7 +205,7 @@ def terms_and_sample(
     f_tilde = now["disturbance"] - now["disturbance_estimate"]
     dropped_e2, dropped_f = _dropped_terms(scenario, dM0, state.dq, now["e2"], f_tilde)
     dV_size, sqrt_V_size = _term_sizes(scenario, t, state, M0, now, rates, f_tilde)
-    plant_is_model = _are_equal(as_at(scenario.plant, t), scenario.model)
+    plant_is_model = _are_equal(scenario.plant.at(t), scenario.model)
     proof = {
         "V": now["V"],
         "dV": rates["V"],
@@ -257,7 +256,7 @@ def _signals(scenario: Scenario, t: jax.Array, state: LoopState):
         barrier_slope = law.weight * law.barrier.slope(scenario.context.tube(t), state.q)
     # All of f where the plant is the model: the torques besides that of the law.
     external = jnp.zeros_like(state.q)
-    robot = plants.robot_of(as_at(scenario.plant, t))
+    robot = plants.robot_of(scenario.plant.at(t))
     if robot is not None:
         external = scenario.disturbance.torque(t, state.q, state.dq, robot, scenario.model)
         external += friction_torque(robot, state.dq)

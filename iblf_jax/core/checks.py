@@ -422,9 +422,7 @@ PUBLIC_MODULES = {
 """Module with the base class of a family -> where users find it."""
 
 
-def conforms(
-    name: str, value: Any, base: type, remedy: str = "", optional: tuple[str, ...] = ()
-) -> None:
+def conforms(name: str, value: Any, base: type, remedy: str = "") -> None:
     """Raises unless `value` is an object that JAX can flatten and that has what the family `base`
     requires; its class is then adopted by the family.
     """
@@ -435,8 +433,7 @@ def conforms(
         raise fail(name, value, expected, "It is a class: make an instance, with brackets.")
     if _is_plain(value):
         raise fail(name, value, expected, remedy)
-    required = [x for x in required_members(base) if x not in optional]
-    offers(name, value, required, expected, remedy)
+    offers(name, value, required_members(base), expected, remedy)
     fields = vars(value) if has_members(value, "__dict__") else {}
     for field, part in fields.items():
         flat_enough(f"{name}.{field}", part)

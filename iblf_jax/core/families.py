@@ -14,13 +14,32 @@ from __future__ import annotations
 import abc
 import inspect
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from types import MappingProxyType
-from typing import Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from iblf_jax.core.caches import CACHE
 
 NO_NAMES: Mapping[str, Any] = MappingProxyType({})
+
+
+if TYPE_CHECKING:
+    attribute = property
+else:
+
+    class attribute:  # noqa: N801 (used as `property`)
+        """A property of a base class in whose place a member may have a field, a class attribute or
+        a property of its own.
+        """
+
+        def __init__(self, value: Callable[[Any], Any]) -> None:
+            self.value = value
+            self.__doc__ = value.__doc__
+            self.__isabstractmethod__ = getattr(value, "__isabstractmethod__", False)
+
+        def __get__(self, part: Any, owner: type | None = None) -> Any:
+            return self if part is None else self.value(part)
 
 
 class Part(metaclass=abc.ABCMeta):  # noqa: B024 (the families have abstract methods)
@@ -32,8 +51,11 @@ class Part(metaclass=abc.ABCMeta):  # noqa: B024 (the families have abstract met
     """Rows of leaves with names."""
     stacked: ClassVar[Mapping[str, Any]] = NO_NAMES
     """Names for several leaves as the rows of one array."""
-    own_joints: Mapping[str, int] = NO_NAMES
-    """Field -> number of joints, of parts whose number differs from that of the scenario."""
+
+    @attribute
+    def own_joints(self) -> Mapping[str, int]:
+        """Field -> number of joints, of parts whose number differs from that of the scenario."""
+        return NO_NAMES
 
     def check(self) -> None:
         """Raises ValueError for fields that do not fit together; called after construction."""
@@ -76,8 +98,14 @@ class Default:
         self.name = name
 
     def __get__(self, part: Any, cls: type) -> Any:
-        found = (vars(owner).get(self.name, self) for owner in (*cls.__mro__, self.base))
-        member = next(x for x in found if not isinstance(x, Default))
+        own = (vars(owner).get(self.name, self) for owner in cls.__mro__)
+        member = next((x for x in own if not isinstance(x, Default)), None)
+        if member is None and part is not None and hasattr(cls, "__getattr__"):
+            # A wrapper of another object, whose members it takes.
+            with suppress(AttributeError):
+                return part.__getattr__(self.name)
+        if member is None:
+            member = vars(self.base)[self.name]
         return member.__get__(part, cls) if hasattr(member, "__get__") else member
 
 
@@ -116,12 +144,14 @@ _BASES = "_adopted_by"
 """Attribute of a class with the base classes that have adopted it."""
 
 
+def is_default(method: Any, default: Any) -> bool:
+    """Whether the method of a part is that of its base class, `is_default(plant.at, Plant.at)`."""
+    return getattr(method, "__func__", None) is default
+
+
 @CACHE.memoised(64)
 def required_members(base: type) -> tuple[str, ...]:
     """The names of the members without a default."""
-    if Protocol in base.__mro__:  # until the last family has its base class
-        members = {*vars(base), *inspect.get_annotations(base)}
-        return tuple(sorted(x for x in members if not x.startswith("_")))
     abstract = set(getattr(base, "__abstractmethods__", ()))
     without_value = {name for name in _annotated(base) if not hasattr(base, name)}
     return tuple(sorted(abstract | without_value))

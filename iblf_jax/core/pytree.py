@@ -29,7 +29,7 @@ import jax
 
 from iblf_jax.core import checks, modules
 from iblf_jax.core.exact_keys import behaviour_of, key_of_fields
-from iblf_jax.core.families import Default, Part, adopt, statements_of
+from iblf_jax.core.families import Part, adopt, statements_of
 
 T = TypeVar("T")
 
@@ -86,18 +86,12 @@ def component(cls: type[T]) -> type[T]:
         ) from error
     fields = dataclasses.fields(cls)  # type: ignore[arg-type]
     if inspect.isabstract(cls):
-        # A field takes the place of a property that a base class requires.
-        cls.__abstractmethods__ -= {field.name for field in fields}  # type: ignore[attr-defined]
+        # A field without a value is no attribute of the class, and has a value in every object.
+        abstract: Any = cls
+        abstract.__abstractmethods__ -= {field.name for field in fields}
+    if inspect.isabstract(cls):
         missing = sorted(cls.__abstractmethods__)  # type: ignore[attr-defined]
-        if missing:
-            lacks = f"It lacks {', '.join(missing)}."
-            raise checks.fail("component", cls, "a complete class", lacks)
-    for field in fields:
-        name = field.name
-        if isinstance(inspect.getattr_static(cls, name, None), property):
-            # It would hide the values of the field.
-            base = next(x for x in cls.__mro__ if name in vars(x))
-            setattr(cls, name, Default(base, name))
+        raise checks.fail("component", cls, "a complete class", f"It lacks {', '.join(missing)}.")
     dataclass_init = cls.__init__
 
     @functools.wraps(dataclass_init)

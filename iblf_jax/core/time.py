@@ -1,28 +1,36 @@
 """Time-varying parts of a scenario: their values at an instant, and the times at which they jump.
 
-A time-varying part may have `at(t)`, which returns the part as it is at time t [s]. A part that is
+A time-varying part has `at(t)`, which returns the part as it is at time t [s]. A part that is
 discontinuous in time declares the instants by `jump_times()`, and steps of a run are divided there.
-Both methods are optional in every family, except for `jump_times` of disturbances.
 """
 
 from __future__ import annotations
 
-from typing import Any, TypeVar
+from typing import Self
 
 import jax
 import jax.numpy as jnp
 
 from iblf_jax.core import checks
-from iblf_jax.core.attributes import has_members
-
-T = TypeVar("T")
+from iblf_jax.core.families import Part
 
 
-def as_at(part: T, t: jax.Array) -> T:
-    """A part as it is at time t [s]: itself, unless it has a method `at`."""
-    if not has_members(part, "at"):
-        return part
-    return part.at(t)  # type: ignore[attr-defined, no-any-return]
+class Timed(Part):
+    """The base of the families whose members may be discontinuous in time."""
+
+    def jump_times(self) -> jax.Array:
+        """The times at which the part or its rate jumps, (m,) [s]; steps of a run are divided
+        there.
+        """
+        return no_times()
+
+
+class TimeVarying(Timed):
+    """The base of the families whose members may change during a run."""
+
+    def at(self, t: jax.Array) -> Self:
+        """The part as it is at time t [s]."""
+        return self
 
 
 def no_times(dtype: jax.typing.DTypeLike | None = None) -> jax.Array:
@@ -30,19 +38,17 @@ def no_times(dtype: jax.typing.DTypeLike | None = None) -> jax.Array:
     return jnp.zeros((0,), dtype)
 
 
-def jump_times_of(name: str, part: Any, dtype: jax.typing.DTypeLike | None = None) -> jax.Array:
-    """The jump times of a part, (m,) [s] in a floating-point type; none if it declares none.
+def jump_times_of(name: str, part: Timed, dtype: jax.typing.DTypeLike | None = None) -> jax.Array:
+    """The jump times of a part, (m,) [s] in a floating-point type.
 
     Args:
       name: of the part, for the error message.
-      part: any part of a scenario.
+      part: of a scenario.
       dtype: of the times; JAX's default if not given.
 
     Raises:
       ValueError: `jump_times` fails, or does not return times.
     """
-    if not has_members(part, "jump_times"):
-        return no_times(dtype)
     expected = "times [s], one number or (m,), made of the fields by jnp"
     try:
         times = jnp.asarray(part.jump_times(), dtype)

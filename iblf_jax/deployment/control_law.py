@@ -32,10 +32,11 @@ from iblf_jax.simulation.levels import (
 from iblf_jax.simulation.sampling import nothing_sent
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.world import plants
+from iblf_jax.world.references import Reference
 
 
 @component
-class GivenReference:
+class GivenReference(Reference):
     """A reference that is an input of every sample: q_d(s) = q_d + q_d' (s - t) + q_d" (s - t)^2 /
     2 + ...
 

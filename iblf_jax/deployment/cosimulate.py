@@ -24,7 +24,6 @@ from iblf_jax.core import checks, notices
 from iblf_jax.core.attributes import attributes
 from iblf_jax.core.progress import announced
 from iblf_jax.core.status import Status
-from iblf_jax.core.time import as_at
 from iblf_jax.deployment.mujoco_plant import INTEGRATORS, MujocoPlant, Stages
 from iblf_jax.deployment.transit import CommandsInTransit
 from iblf_jax.engine import folded, sample_status
@@ -46,7 +45,6 @@ from iblf_jax.simulation.signals import SIGNALS
 from iblf_jax.world import plants
 from iblf_jax.world.disturbances import Nothing
 from iblf_jax.world.robots import at_time
-from iblf_jax.world.robots._base import robot_member
 
 
 @notices.each_warning_once
@@ -117,7 +115,7 @@ def cosimulate(
     _check_no_process_noise(scenario)
     scenario = canonical(with_period(scenario, period))
     seed, throw = checks.seed(seed), checks.boolean("throw", throw)
-    names = tuple(robot_member(scenario.plant, "joints"))
+    names = scenario.plant.joints
     if locked is None:
         locked = {}
     checks.mapping("locked", locked, '{"gripper_joint": 0.02}')
@@ -245,7 +243,7 @@ def _law(scenario: Scenario, t, state: LoopState, index, noise) -> LoopState:
 @jax.jit
 def _delivered(scenario: Scenario, t, q, dq, command, state):
     """The actuator's output, and its torque plus that of the disturbance."""
-    delivered = as_at(scenario.actuator, t).deliver(command, dq, state)
+    delivered = scenario.actuator.at(t).deliver(command, dq, state)
     return delivered, delivered.tau + scenario.disturbance.torque(
         t, q, dq, at_time(scenario.plant, t), scenario.model
     )

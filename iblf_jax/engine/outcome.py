@@ -65,7 +65,7 @@ def outcome_of(
     if scenario.process_noise is not None:
         metrics = error_estimate.unknown(metrics)
     plant: Any = scenario.plant
-    if plants.plant_member(plant, "switching") is not None:
+    if plants.has_modes(plant):
         end = inputs.dt * inputs.steps
         metrics |= plant.switching(end)
         status |= flag(~plant.has_complete_path(end), Status.MODES_EXHAUSTED)

@@ -22,7 +22,7 @@ from iblf_jax.core.pytree import layers, wrapped_field
 from iblf_jax.kernels import Known
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.world import plants
-from iblf_jax.world.robots._base import robot_member
+from iblf_jax.world.robots import Robot
 
 QUATERNIONS = ("rotation", "tip_rotation")
 """Fields whose rows have equal numbers for a systematic reason: a right angle."""
@@ -88,7 +88,7 @@ def _geometry_fields(scenario: Scenario) -> dict[tuple[str, ...], tuple[str, ...
         if plants.is_chain(part):
             robots[name, "robot"] = plants.robot_of(part)
     return {
-        path: _field_names(robot_member(type(robot), "geometry_fields"))
+        path: _field_names(robot.geometry_fields if isinstance(robot, Robot) else ())
         for path, robot in robots.items()
     }
 

@@ -83,7 +83,7 @@ FAMILIES: dict[Any, Family] = {
     process_noise.ProcessNoise: family("process_noise", process_noise.MEMBERS),
     actuators.Actuator: family("actuators", actuators.MEMBERS),
 }
-"""Protocol -> its family; modules above this one add theirs."""
+"""Base class -> its family; modules above this one add theirs."""
 
 
 def field_hints(cls: Any) -> dict[str, Any]:

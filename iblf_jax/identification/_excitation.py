@@ -27,7 +27,6 @@ from iblf_jax.identification.replay import LeafSlice, inverse_dynamics
 from iblf_jax.simulation.levels import torque_needed
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.world.references import WaypointSpline
-from iblf_jax.world.robots._base import robot_member
 
 WAYPOINT_SPACING = 0.8
 """Time between waypoints, unless their number is given [s]."""
@@ -189,7 +188,7 @@ def _bounds(scenario: Scenario, t: jax.Array, q: jax.Array) -> tuple[jax.Array, 
     """Bounds of positions at times t (K,), for a reference q (K, n), and the arm's limits."""
     lower = jax.vmap(scenario.bounds.lower.at)(t, q)
     upper = jax.vmap(scenario.bounds.upper.at)(t, q)
-    limits = robot_member(scenario.plant, "limits")
+    limits = scenario.plant.limits
     if limits is None:
         return lower, upper
     return jnp.maximum(lower, limits.lower), jnp.minimum(upper, limits.upper)
@@ -197,8 +196,8 @@ def _bounds(scenario: Scenario, t: jax.Array, q: jax.Array) -> tuple[jax.Array, 
 
 def _drive_limits(scenario: Scenario) -> DriveLimits:
     speed, torque = (
-        jnp.broadcast_to(jnp.asarray(drive_limit(scenario.plant, name)), (scenario.n,))
-        for name in ("speed", "effort")
+        jnp.broadcast_to(jnp.asarray(drive_limit(limit)), (scenario.n,))
+        for limit in (scenario.plant.speed, scenario.plant.effort)
     )
     return DriveLimits((1.0 - BOUND_MARGIN) * speed, TORQUE_SHARE * torque)
 

@@ -30,7 +30,6 @@ from iblf_jax.simulation import paths
 from iblf_jax.simulation.scenario import Scenario, with_parts
 from iblf_jax.studies.draws import check_paths, paths_overlap
 from iblf_jax.world import plants
-from iblf_jax.world.robots._base import robot_member
 
 MIN_POSITIVE_FACTOR = 1e-3
 """Default lower limit of a number that must be positive, by its start."""
@@ -357,16 +356,12 @@ def scales(c: Coordinates, scenario: Scenario, by_x: np.ndarray, torque: np.ndar
 
 def _mean_link_length(scenario: Scenario) -> float:
     """The mean distance between joints [m]; 0 for a robot without a skeleton."""
-    skeleton = robot_member(scenario.plant, "skeleton")
-    if skeleton is None:
+    joints = scenario.plant.skeleton(scenario.initial.q)
+    if joints is None or len(joints) < 2:
         return 0.0
-    joints = np.asarray(skeleton(scenario.initial.q))
-    if len(joints) < 2:
-        return 0.0
-    return float(np.mean(np.linalg.norm(np.diff(joints, axis=0), axis=1)))
+    return float(np.mean(np.linalg.norm(np.diff(np.asarray(joints), axis=0), axis=1)))
 
 
-def drive_limit(robot: Any, name: str) -> np.ndarray:
-    """The largest speed ("speed") or torque ("effort") of a robot's joints; infinite if unknown."""
-    limit = robot_member(robot, name)
+def drive_limit(limit: Any) -> np.ndarray:
+    """The largest speed or torque of a robot's joints; infinite if unknown."""
     return np.asarray(np.inf if limit is None else limit)

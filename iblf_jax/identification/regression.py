@@ -39,7 +39,6 @@ from iblf_jax.identification.levenberg_marquardt import (
 from iblf_jax.identification.replay import InverseDynamics, inverse_dynamics
 from iblf_jax.identification.smoothing import SmoothedMotion
 from iblf_jax.world.robots import joint_names
-from iblf_jax.world.robots._base import robot_member
 
 WEIGHT_UPDATES, STEPS_PER_UPDATE = 3, 12
 """Estimates of the joints' weights, and steps of the search for each of them."""
@@ -245,7 +244,7 @@ def _check_speed(motion: SmoothedMotion, speed: float) -> None:
 
 def _check_positions(scenario: Any, motion: SmoothedMotion, names: tuple[str, ...]) -> None:
     """Raises ValueError for positions outside the ranges of the joints."""
-    kinds = robot_member(scenario.plant, "kinds") or ("revolute",) * scenario.n
+    kinds = scenario.plant.kinds or ("revolute",) * scenario.n
     for range_name, limits in _ranges(scenario).items():
         for j, (low, high) in enumerate(limits):
             least, most = float(motion.q[:, j].min()), float(motion.q[:, j].max())
@@ -270,7 +269,7 @@ def _ranges(scenario: Any) -> dict[str, np.ndarray]:
     margin of 8 times their width.
     """
     found = {}
-    limits = robot_member(scenario.plant, "limits")
+    limits = scenario.plant.limits
     if limits is not None:
         ends = np.stack([np.asarray(limits.lower), np.asarray(limits.upper)], axis=1)
         found["the arm's limits"] = np.where(np.isfinite(ends), ends, [-1e9, 1e9])
@@ -302,7 +301,7 @@ def _check_torque_size(scenario: Any, modelled: Any, motion: SmoothedMotion) -> 
             "Convert it to N m (from N mm, from a motor's side of its gear, from amperes), or"
             " check q.",
         )
-    effort = np.broadcast_to(drive_limit(scenario.plant, "effort"), (scenario.n,))
+    effort = np.broadcast_to(drive_limit(scenario.plant.effort), (scenario.n,))
     most = np.max(np.abs(motion.tau), axis=0)
     if np.any(most > 3.0 * effort):
         j = int(np.argmax(most / effort))

@@ -17,7 +17,7 @@ from matplotlib.gridspec import SubplotSpec
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from iblf_jax.core import checks
-from iblf_jax.core.attributes import has_members
+from iblf_jax.core.families import is_default
 from iblf_jax.plotting import _style
 from iblf_jax.plotting._curves import Curve, curves_of, escaped
 from iblf_jax.plotting._figures import Runs
@@ -38,7 +38,7 @@ LINES = ("-", "--", ":", "-.")
 
 def has_outline(plant: Any) -> bool:
     """Whether a plant is drawn by its outline in the plane."""
-    return plants.is_chain(plant) and plants.plant_member(plant, "outline") is not None
+    return plants.is_chain(plant) and not is_default(plant.outline, plants.Plant.outline)
 
 
 def skeletons(plant: Any, q: np.ndarray) -> np.ndarray:
@@ -54,14 +54,14 @@ def skeletons(plant: Any, q: np.ndarray) -> np.ndarray:
         (n + 1, 3) points.
     """
     if has_outline(plant):
-        outline = plants.plant_member(plant, "outline")
-        corners = np.asarray(jax.jit(jax.vmap(outline))(q))
+        corners = np.asarray(jax.jit(jax.vmap(plant.outline))(q))
         return np.concatenate([corners, corners[:, :1]], axis=1)
     robot = plants.robot_of(plant)
-    if robot is None or not has_members(robot, "skeleton"):
+    points = None if robot is None else jax.jit(jax.vmap(robot.skeleton))(q)
+    if points is None:
         remedy = "A robot has a skeleton(q); another plant may have an outline(x1), (k, 2) [m]."
         raise checks.fail("plant", type(plant).__name__, "a plant with a shape", remedy)
-    found = np.asarray(jax.jit(jax.vmap(robot.skeleton))(q))
+    found = np.asarray(points)
     if found.shape[1:] not in ((q.shape[1] + 1, 2), (q.shape[1] + 1, 3)):
         expected = "n + 1 points in the plane or in space, the same for all runs"
         raise checks.fail("plant.skeleton(q)", found.shape[1:], expected)

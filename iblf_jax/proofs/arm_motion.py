@@ -43,9 +43,9 @@ import jax.numpy as jnp
 from iblf_jax.core.linalg import inner, matvec
 from iblf_jax.proofs.forms import enclosed
 from iblf_jax.proofs.matrices import inverse
-from iblf_jax.world.bounds import Bounds, Tube, side_member
+from iblf_jax.world.bounds import Bounds, Tube
 from iblf_jax.world.disturbances import Disturbance
-from iblf_jax.world.references import Reference, reference_member
+from iblf_jax.world.references import Reference
 from iblf_jax.world.robots import Robot
 from iblf_jax.world.robots._base import friction_torque
 
@@ -111,8 +111,8 @@ def course(parts: ArmParts, t: jax.Array) -> Course:
 
 def smoothness(reference: Reference, bounds: Bounds) -> float:
     """The number of continuous derivatives of reference and bounds in time."""
-    sides = [side_member(side, "continuous_derivatives") for side in (bounds.lower, bounds.upper)]
-    return float(min(reference_member(reference, "continuous_derivatives"), *sides))
+    parts = (reference, bounds.lower, bounds.upper)
+    return float(min(part.continuous_derivatives for part in parts))
 
 
 class Side(NamedTuple):

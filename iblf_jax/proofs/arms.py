@@ -21,7 +21,7 @@ from iblf_jax.control import controllers, observers
 from iblf_jax.core import checks
 from iblf_jax.core.linalg import matvec
 from iblf_jax.core.pytree import astype
-from iblf_jax.core.time import as_at, jump_times_of
+from iblf_jax.core.time import jump_times_of
 from iblf_jax.proofs import arm_motion, uncertainty
 from iblf_jax.proofs.arm_bound import Constants, arm_bound
 from iblf_jax.proofs.arm_motion import ArmParts, Errors, position
@@ -401,8 +401,8 @@ def _parts_of(scenario: Scenario) -> ArmParts:
     object.__setattr__(law, "barrier", barrier)
     zero = jnp.zeros(())
     return ArmParts(
-        as_at(scenario.model, zero),
-        as_at(scenario.plant, zero),
+        scenario.model.at(zero),
+        scenario.plant.at(zero),
         scenario.disturbance,
         law,
         jnp.broadcast_to(observer.kf, (scenario.n,)),

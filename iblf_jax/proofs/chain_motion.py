@@ -58,7 +58,7 @@ from iblf_jax.core import taylor
 from iblf_jax.proofs.arm_motion import along
 from iblf_jax.world import plants
 from iblf_jax.world.bounds import NARROWEST, Bounds, Tube, bounds_at
-from iblf_jax.world.disturbances import Disturbance, rates_of
+from iblf_jax.world.disturbances import Disturbance
 from iblf_jax.world.references import Reference
 
 Column = tuple[jax.Array, ...]
@@ -392,7 +392,7 @@ def external_at(
     disturbance: Disturbance, t: jax.Array, x: jax.Array, plant: Any, model: Any
 ) -> External:
     """The disturbance at a time."""
-    rates = rates_of(disturbance, t, x, plant, model)
+    rates = disturbance.rates(t, x, plant, model)
     if rates is None:
         rates = jnp.zeros_like(x)
     return External(rates, disturbance.torque(t, x[0], x[1], plant, model))

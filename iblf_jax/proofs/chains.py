@@ -19,8 +19,9 @@ from iblf_jax.control import controllers, observers
 from iblf_jax.control.barriers import Quadratic
 from iblf_jax.control.barriers._base import has_ratio
 from iblf_jax.core import checks
+from iblf_jax.core.families import is_default
 from iblf_jax.core.pytree import astype
-from iblf_jax.core.time import as_at, jump_times_of
+from iblf_jax.core.time import jump_times_of
 from iblf_jax.proofs import chain_motion
 from iblf_jax.proofs.chain_bound import (
     Constants,
@@ -381,7 +382,7 @@ def _parts_of(scenario: Scenario) -> ChainParts:
         gain = scenario.observer.gain
     context = scenario.context
     bounds = tuple(context.level_bounds(i + 1) for i in range(order))
-    model = as_at(scenario.model, jnp.zeros(()))
+    model = scenario.model.at(jnp.zeros(()))
     return ChainParts(
         model, law, _rows(gain, order), scenario.reference, bounds, jnp.asarray(guards)
     )
@@ -464,7 +465,7 @@ def _functions_of(plant: Any) -> dict[str, Callable]:
     """Name and level -> what the law reads of a plant there, as a function of (t, x)."""
     one = jnp.ones(1)
     members = ["level_rate", "transposed_gain", "level_input"]
-    if plants.plant_member(plant, "level_input") is None:
+    if is_default(plant.level_input, plants.Plant.level_input):
         # That of the package is a function of drift and gain, which are in level_rate.
         members.remove("level_input")
 

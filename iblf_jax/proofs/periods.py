@@ -16,7 +16,7 @@ from iblf_jax.world import bounds, disturbances, references
 LARGEST_RATIO = 1000
 """Largest quotient of a frequency by the common one for which a common period is used."""
 
-FREQUENCIES = {
+FREQUENCIES: dict[type, tuple[tuple[str, str], ...]] = {
     references.Sinusoid: (("amplitude", "frequency"),),
     bounds.Sinusoid: (("amplitude", "frequency"),),
     disturbances.Sinusoids: (("amplitude", "frequency"),),

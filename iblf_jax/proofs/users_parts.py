@@ -15,11 +15,10 @@ import numpy as np
 
 from iblf_jax.control import barriers
 from iblf_jax.core import checks
-from iblf_jax.core.attributes import has_members
-from iblf_jax.core.time import as_at
+from iblf_jax.core.families import is_default
+from iblf_jax.core.time import TimeVarying
 from iblf_jax.proofs.examination import Examined, Operations, operations, refuse_unknown
 from iblf_jax.world import bounds, plants, references, robots
-from iblf_jax.world.robots._base import robot_member
 
 BARRIERS = frozenset(
     [
@@ -47,13 +46,13 @@ ACCURACY = 1e-8
 
 def check_constant(name: str, part: Any) -> None:
     """Raises ValueError for a robot or plant with a method `at` that depends on the time."""
-    if not has_members(part, "at"):
+    if is_default(part.at, TimeVarying.at):
         return
 
     def leaves(t: jax.Array) -> list[Any]:
-        return jax.tree.leaves(as_at(part, t))
+        return jax.tree.leaves(part.at(t))
 
-    now = as_at(part, jnp.zeros(()))
+    now = part.at(jnp.zeros(()))
     structures: list[Any] = [jax.tree.structure(x) for x in (now, part)]
     is_same = structures[0] == structures[1] and all(
         np.array_equal(x, y)
@@ -101,10 +100,9 @@ def _declared(name: str, part: Any, found: Operations) -> str:
     """The sentence on a part with cases or kinks that declares its continuous derivatives."""
     refuse_unknown(f"scenario.{name}", found)
     kind = type(part).__name__
-    if has_members(part, "continuous_derivatives"):
-        number = float(part.continuous_derivatives)
-        if np.isfinite(number):
-            return f"The {name} {kind} has {number:g} continuous derivatives, as it declares."
+    number = float(part.continuous_derivatives)
+    if np.isfinite(number):
+        return f"The {name} {kind} has {number:g} continuous derivatives, as it declares."
     listed = ", ".join(sorted(found.cases | found.kinks))
     got = f"{kind}, which has operations that select a case or have a kink ({listed})"
     expected = "a smooth function of time, or a class with the attribute continuous_derivatives"
@@ -165,16 +163,11 @@ def _robot_pairs(
     yield "coriolis", (2.0 * jnp.dot(u, C_u), jnp.dot(u, rate @ u), size)
     size = jnp.abs(C_u) + jnp.abs(C_a) + turned_u + turned_a
     yield "coriolis of a sum", (robot.coriolis(q, v, u + a), C_u + C_a, size)
-    own = robot_member(robot, "momentum")
-    if own is not None:
-        yield "momentum", (own(q, v), M @ v, inertia @ jnp.abs(v))
-    own = robot_member(robot, "energy_gradient")
-    if own is not None:
-        yield "energy_gradient", (own(q, v), rate @ v - C_v, jnp.abs(C_v) + turned_v)
-    own = robot_member(robot, "inverse_dynamics")
-    if own is not None:
-        size = jnp.abs(C_u) + jnp.abs(G) + inertia @ jnp.abs(a) + turned_u
-        yield "inverse_dynamics", (own(q, v, u, a), C_u + G + M @ a, size)
+    yield "momentum", (robot.momentum(q, v), M @ v, inertia @ jnp.abs(v))
+    size = jnp.abs(C_v) + turned_v
+    yield "energy_gradient", (robot.energy_gradient(q, v), rate @ v - C_v, size)
+    size = jnp.abs(C_u) + jnp.abs(G) + inertia @ jnp.abs(a) + turned_u
+    yield "inverse_dynamics", (robot.inverse_dynamics(q, v, u, a), C_u + G + M @ a, size)
 
 
 def check_agreement(

@@ -30,7 +30,6 @@ from iblf_jax.control.controllers._base import state_of_levels
 from iblf_jax.control.sensors import Measurement
 from iblf_jax.core.linalg import inner
 from iblf_jax.core.pytree import unwrapped
-from iblf_jax.core.time import as_at
 from iblf_jax.simulation.delays import initial_commands
 from iblf_jax.simulation.levels import (
     Motion,
@@ -280,7 +279,7 @@ def evaluate(
     else:
         command = state.sampled.commands[0] if torque is None else torque
         signals = state.sampled.signals
-    delivered = as_at(scenario.actuator, t).deliver(command, dq, state.actuator)
+    delivered = scenario.actuator.at(t).deliver(command, dq, state.actuator)
     moved = motion(scenario, t, q, dq, higher, delivered.tau)
     if scenario.sampling is None:
         arguments = observer_arguments(

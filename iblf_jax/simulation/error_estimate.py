@@ -47,7 +47,6 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from iblf_jax.core.linalg import matvec, solve, solve_spd
-from iblf_jax.core.time import as_at
 from iblf_jax.core.units import POSITION
 from iblf_jax.simulation.closed_loop import LoopState, perturbed_state
 from iblf_jax.simulation.discontinuities import has_jump
@@ -469,7 +468,7 @@ def _disturbance_error(
     """
 
     def torque(t: jax.Array, q: jax.Array, dq: jax.Array) -> jax.Array:
-        plant = as_at(scenario.plant, t)
+        plant = scenario.plant.at(t)
         robot = plants.robot_of(plant)
         if robot is None:
             return jnp.zeros_like(q)
@@ -489,7 +488,7 @@ def _disturbance_error(
 
 def with_acceleration(scenario: Scenario, found: UnresolvedSignals) -> UnresolvedSignals:
     """`found` with the error of the disturbance as an acceleration of the plant at the start."""
-    plant = as_at(scenario.plant, jnp.zeros_like(found.disturbance_error[0]))
+    plant = scenario.plant.at(jnp.zeros_like(found.disturbance_error[0]))
     robot = plants.robot_of(plant)
     if robot is None:
         return found

@@ -65,7 +65,6 @@ from jax.flatten_util import ravel_pytree
 from iblf_jax.control.controllers._base import state_of_levels
 from iblf_jax.core import checks
 from iblf_jax.core.linalg import matmul_in_order
-from iblf_jax.core.time import as_at
 from iblf_jax.simulation.closed_loop import (
     LoopState,
     evaluate,
@@ -417,7 +416,7 @@ def _after_law(
         command_error = jnp.where(fires, command_error, sent.input)
         sent = sent._replace(input=command_error, torque=command_error)
     if _rounds_torque(scenario):
-        actuator: Any = as_at(scenario.actuator, t)
+        actuator: Any = scenario.actuator.at(t)
         distance = actuator.distance_to_jump(state.sampled.commands[0], state.dq, state.actuator)
         reaches = reaches | jnp.any(jnp.abs(command_error) + blur >= distance)
     jumped = jnp.where(reaches, 1.0, growth.jumped)

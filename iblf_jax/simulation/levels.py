@@ -18,9 +18,7 @@ from iblf_jax.control.sensors._base import Measurement
 from iblf_jax.core import taylor
 from iblf_jax.core.linalg import solve_spd
 from iblf_jax.core.pytree import unwrapped
-from iblf_jax.core.time import as_at
 from iblf_jax.world import plants
-from iblf_jax.world.disturbances import rates_of
 from iblf_jax.world.robots import at_time, friction_torque, inverse_dynamics, momentum
 
 # --- the start ------------------------------------------------------------------------------------
@@ -38,8 +36,7 @@ def start_levels(scenario: Any) -> tuple[jax.Array, jax.Array, Any]:
         return initial.q, initial.dq, ()
     if initial.higher is not None:
         return initial.q, initial.dq, initial.higher
-    steady = plants.plant_member(plant, "steady_levels")
-    return initial.q, initial.dq, steady(initial.q, initial.dq)
+    return initial.q, initial.dq, plant.steady_levels(initial.q, initial.dq)
 
 
 def levels_on_reference(scenario: Any, t: jax.Array) -> tuple[jax.Array, jax.Array, Any]:
@@ -85,20 +82,18 @@ def steady_input(scenario: Any, q: jax.Array) -> jax.Array:
     """
     if not plants.is_chain(scenario.model) and not plants.is_chain(scenario.plant):
         return scenario.model.gravity(q)  # type: ignore[no-any-return]
-    own = stated_steady_input(scenario)
-    if own is None:
-        return jnp.zeros_like(q)
-    return own(q)  # type: ignore[no-any-return]
+    stated = stated_steady_input(scenario, q)
+    return jnp.zeros_like(q) if stated is None else stated
 
 
-def stated_steady_input(scenario: Any) -> Any:
-    """The function `steady_input` of the model, or of the plant where the model is a robot; None
-    for a plant that states none.
+def stated_steady_input(scenario: Any, q: jax.Array) -> jax.Array | None:
+    """The `steady_input` of the model, or of the plant where the model is a robot; None for a plant
+    that states none.
     """
-    model = scenario.model
+    model: plants.Plant = scenario.model
     if not plants.is_chain(model):
         model = scenario.plant
-    return plants.plant_member(model, "steady_input")
+    return model.steady_input(q)
 
 
 # --- law and sensor -----------------------------------------------------------------------------
@@ -178,7 +173,8 @@ def observer_arguments(
         return t, x, u, plants.as_plant(scenario.model), state
     if plants.is_chain(scenario.model) and not isinstance(observer, NoObserver):
         x = model_state(scenario, q, dq, higher)
-        u = plants.plant_member(scenario.model, "joint_torque")(x, u)
+        model: Any = scenario.model
+        u = model.joint_torque(x, u)
     return t, q, dq, u, _observed_robot(scenario), state
 
 
@@ -269,19 +265,19 @@ def motion(
     """The rate of the plant's state under the input u, (n,)."""
     if not plants.is_chain(scenario.plant):
         return _robot_motion(scenario, t, q, dq, u)
-    plant = as_at(scenario.plant, t)
+    plant = scenario.plant.at(t)
     x, model = state_of_levels(q, dq, higher), scenario.model
     robot = plants.robot_of(plant)
     disturbance = scenario.disturbance
     if robot is None:
-        friction = plants.plant_member(plant, "friction_torque")
-        torque: jax.Array | float = 0.0 if friction is None else friction(x)
+        friction = plant.friction_torque(x)
+        torque: jax.Array | float = 0.0 if friction is None else friction
         u = u + disturbance.torque(t, q, dq, plant, model)
     else:
         known = plants.robot_of(model)
         torque = disturbance.torque(t, q, dq, robot, known) + friction_torque(robot, dq)
     rate = plants.flow(plant, t, x, u, torque)
-    added = rates_of(disturbance, t, x, plant, model)
+    added = disturbance.rates(t, x, plant, model)
     if added is not None:
         rate = rate + added
     if len(rate) == 2:
@@ -295,7 +291,7 @@ def _robot_motion(
     """The rate of q and q' of a robot."""
     ddq = acceleration(scenario, t, q, dq, tau)
     x = jnp.stack([q, dq])
-    added = rates_of(scenario.disturbance, t, x, scenario.plant, scenario.model)
+    added = scenario.disturbance.rates(t, x, scenario.plant, scenario.model)
     if added is None:
         return Motion(dq, ddq, ())
     return Motion(dq + added[0], ddq + added[1], ())

@@ -26,7 +26,7 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.core import checks
-from iblf_jax.core.families import Part
+from iblf_jax.core.families import Part, attribute
 from iblf_jax.core.pytree import Leaf, component, layers, leaf, note_code
 from iblf_jax.core.status import Status
 from iblf_jax.core.units import (
@@ -64,7 +64,7 @@ class Fold(Part):
     """The optional signal, one of `SIGNAL_SOURCES`, that the metric reads and not every scenario
     has."""
 
-    @property
+    @attribute
     def curvatures(self) -> int:
         """The number of `Outer` that `curvature` returns (`engine.derivatives`)."""
         return 0
@@ -834,7 +834,7 @@ def metric_units(folds: Sequence[Fold], scenario: Scenario) -> tuple[tuple[str, 
     included.
     """
     pairs = [pair for fold in folds for pair in fold.units.items()]
-    if plants.plant_member(scenario.plant, "switching") is not None:
+    if plants.has_modes(scenario.plant):
         pairs += plants.SWITCHING_UNITS.items()
     return tuple((name, unit_text(scenario, unit)) for name, unit in (*pairs, *ACCURACY_UNITS))
 

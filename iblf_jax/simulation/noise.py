@@ -20,8 +20,6 @@ from iblf_jax.simulation.discontinuities import Piece
 from iblf_jax.simulation.integrators import STOCHASTIC, TABLEAUS, tableau
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import Sample, has
-from iblf_jax.world import plants
-from iblf_jax.world.process_noise import noise_member
 
 NOISE_NAME = "noise"
 """Name of the noise key among the replaced values of a run; no leaf of a scenario has this name."""
@@ -60,7 +58,7 @@ def has_noise(scenario: Scenario) -> bool:
     """Whether a run of a scenario draws random numbers: noise of the sensor, process noise, or
     switching times.
     """
-    if scenario.process_noise is not None or plants.plant_member(scenario.plant, "mode_draws"):
+    if scenario.process_noise is not None or scenario.plant.mode_draws:
         return True
     return has_sensor_noise(scenario)
 
@@ -164,7 +162,7 @@ def check_method(scenario: Scenario, method: str) -> None:
 def _no_command_between_steps(scenario: Scenario, method: str) -> ValueError:
     """The error for a method of a single stage where the input has a delay."""
     noise = scenario.process_noise
-    if noise is not None and not noise_member(noise, "additive"):
+    if noise is not None and not noise.additive:
         expected = "noise that does not depend on the state, as the input has a delay"
         remedy = 'A delay needs method="stochastic_heun", which needs additive noise.'
         return checks.fail("scenario.process_noise", type(noise).__name__, expected, remedy)
@@ -187,7 +185,7 @@ def _check_kind_of_method(scenario: Scenario, method: str) -> None:
         expected = f"one of {', '.join(STOCHASTIC)}, as the plant has process noise"
         remedy = 'Take method="euler_maruyama", or with_parts(scenario, process_noise=None).'
         raise checks.fail("method", method, expected, remedy)
-    if method == "stochastic_heun" and not noise_member(noise, "additive"):
+    if method == "stochastic_heun" and not noise.additive:
         expected = "euler_maruyama, as the noise depends on the state"
         remedy = (
             "The process noise is that of Ito, and Heun's method converges to the solution in the"
@@ -206,7 +204,7 @@ def brownian_increment(scenario: Scenario, key: jax.Array, step: jax.Array, dt: 
       dt: its length, () [s].
     """
     noise: Any = scenario.process_noise
-    levels, parts = len(noise.levels), noise_member(noise, "substeps")
+    levels, parts = len(noise.levels), noise.substeps
     first = step.astype(jnp.int32) * parts
     total = normals(key, first, levels, scenario.n, PROCESS_STREAM)
     for part in range(1, parts):
@@ -360,7 +358,7 @@ def with_extremes(
 
 def realised(scenario: Scenario, key: Any) -> Scenario:
     """The scenario with the switching times and modes of one run, where its plant draws them."""
-    draws = plants.plant_member(scenario.plant, "mode_draws")
+    draws = scenario.plant.mode_draws
     if not draws:
         return scenario
     dtype = scenario.initial.q.dtype

@@ -27,7 +27,7 @@ from iblf_jax.control.sensors import Ideal as IdealSensor
 from iblf_jax.control.sensors import Sensor
 from iblf_jax.core import checks, modules, notices, programs
 from iblf_jax.core.disk_cache import keep_programs
-from iblf_jax.core.families import statements_of
+from iblf_jax.core.families import is_default, statements_of
 from iblf_jax.core.modules import NUMBERS
 from iblf_jax.core.presentation import present
 from iblf_jax.core.pytree import (
@@ -137,8 +137,6 @@ CLASSES: dict[str, tuple[Any, str]] = {
     ),
 }
 """Class of each other part, and its description in an error message."""
-OPTIONAL_MEMBERS = ("skeleton",)
-"""Members of these protocols that a part may lack."""
 
 HOW_TO_MAKE = "Make one with ij.presets or ij.Scenario."
 
@@ -229,7 +227,7 @@ class Scenario:
             check_plant_or_robot(f"Scenario.{name}", vars(self)[name])
         parts = field_values(self)
         for name, (protocol, remedy) in PROTOCOLS.items():
-            checks.conforms(f"Scenario.{name}", parts[name], protocol, remedy, OPTIONAL_MEMBERS)
+            checks.conforms(f"Scenario.{name}", parts[name], protocol, remedy)
         adopt_layers(self.controller)
         self._check_classes()
         self._fit_state_bounds()
@@ -410,7 +408,7 @@ def check_plant_or_robot(name: str, part: Any) -> None:
         checks.conforms(name, part, Plant, PLANTS)
         plants.check_dimensions(name, part)
         return
-    checks.conforms(name, part, Robot, f"{ROBOTS} {PLANTS}", OPTIONAL_MEMBERS)
+    checks.conforms(name, part, Robot, f"{ROBOTS} {PLANTS}")
 
 
 def check_levels(scenario: Scenario) -> None:
@@ -437,7 +435,7 @@ def check_levels(scenario: Scenario) -> None:
     if higher is not None and len(higher) != order - 2:
         expected = f"{order} levels, as the plant has"
         raise checks.fail("Scenario.initial.x", f"{len(higher) + 2} levels", expected)
-    if order > 2 and higher is None and plants.plant_member(plant, "steady_levels") is None:
+    if order > 2 and higher is None and not plants.has_steady_levels(plant):
         remedy = f"Give all levels: Initial(x=...), shape ({order}, {plant.n})."
         raise checks.fail("Scenario.initial", "q and dq", f"{order} levels", remedy)
 
@@ -452,7 +450,7 @@ def _check_observer(scenario: Scenario) -> None:
     if observer.receives_x:
         observer.check_model(plants.as_plant(model))
         return
-    if plants.is_chain(model) and plants.plant_member(model, "joint_torque") is None:
+    if plants.is_chain(model) and is_default(model.joint_torque, Plant.joint_torque):
         expected = "an observer of plants in strict-feedback form, such as LevelObserver"
         remedy = f"{type(model).__name__} contains no robot."
         raise checks.fail("Scenario.observer", type(observer).__name__, expected, remedy)
@@ -967,7 +965,7 @@ def _check_levels_at_start(scenario: Scenario) -> None:
         if plants.is_chain(plant):
             levels = x[: plant.order]
             _check_gains(name, np.asarray(plant.gain(t, levels)), np.asarray(levels))
-            filtered = name == "model" and plants.plant_member(plant, "needs_filters")
+            filtered = name == "model" and plant.needs_filters
             if not filtered and not isinstance(plant, plants.OF_KNOWN_STRUCTURE):
                 plants.check_dependence(name, _dependence_near(plant, t, levels))
 

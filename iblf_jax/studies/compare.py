@@ -218,14 +218,13 @@ def _no_robot(name: str, model: Any) -> ValueError:
 
 def _model_for(law: Controller, scenario: Scenario) -> Any:
     """The scenario's model; for a law of robots its rigid limit, or the robot inside it."""
-    model = scenario.model
+    model: Any = scenario.model
     if unwrapped(law).receives_x or not plants.is_chain(model):
         return model
-    rigid = plants.plant_member(model, "rigid")
-    if rigid is not None:
-        return rigid()
-    robot = plants.robot_of(model)
-    return model if robot is None else robot
+    for robot in (model.rigid(), model.robot):
+        if robot is not None:
+            return robot
+    return model
 
 
 def _folds(scenario: Scenario, further: Sequence[Fold]) -> tuple[Fold, ...]:

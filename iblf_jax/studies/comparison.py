@@ -10,6 +10,7 @@ import itertools
 import math
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from iblf_jax.control.barriers import Integral
@@ -270,7 +271,8 @@ class Comparison(Result):
         if not plants.is_chain(plant):
             return "torque above gravity, sqrt(mean |tau - G0(q)|^2)"
         name = plants.input_name(plant)
-        if stated_steady_input(self.scenario) is None:
+        q = self.scenario.initial.q
+        if jax.eval_shape(stated_steady_input, self.scenario, q) is None:
             return f"{name}, sqrt(mean |u - u_0|^2) with u_0 = 0 (the plant has no steady_input),"
         return f"{name} above its steady_input u_0(q), sqrt(mean |u - u_0(q)|^2)"
 

@@ -32,7 +32,7 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.core.attributes import has_members
-from iblf_jax.core.families import Part, adopt, required_members
+from iblf_jax.core.families import Part, adopt, attribute, required_members
 from iblf_jax.core.pytree import component, leaf, static
 
 KINDS = ("factor", "offset", "value")
@@ -45,12 +45,12 @@ class Distribution(Part):
     is_discrete: ClassVar[bool] = False
     """Whether its draws are not continuous in u."""
 
-    @property
+    @attribute
     def group(self) -> str:
         """The name of the draws that leaves which vary together share; "" for other leaves."""
         return ""
 
-    @property
+    @attribute
     def draws(self) -> int:
         """The number of uniform numbers that `quantile` takes for a group."""
         return 0

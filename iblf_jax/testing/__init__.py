@@ -1,6 +1,6 @@
 """Checkers that test whether a component satisfies the contract of its family.
 
-The contract of a family is the Protocol in its `_base.py` (or at the top of its file).  A checker
+The contract of a family is the base class in its `_base.py` (or at the top of its file).  A checker
 takes an instance, for example of a class from a notebook cell, and raises a `ContractError` that
 lists all problems with their remedies:
 

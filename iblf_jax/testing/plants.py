@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+from functools import partial
 from typing import Any
 
 import jax
@@ -9,18 +11,21 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks, taylor
+from iblf_jax.core.families import is_default
 from iblf_jax.simulation.scenario import fit_joints
 from iblf_jax.testing._contract import (
     Findings,
+    StoppedCheckError,
     call_has_shape,
     check_function,
     examine,
+    has_shape,
     in_both_types,
     in_dtype,
     shape_of,
 )
 from iblf_jax.world import plants
-from iblf_jax.world.plants import Plant, plant_member
+from iblf_jax.world.plants import Plant
 
 POINTS = 4
 """Number of random states at which a plant is tested."""
@@ -98,32 +103,36 @@ def _shapes(findings: Findings, plant: Any, t: jax.Array, x: jax.Array) -> None:
     remedy = f"It must be {(order, n, n)}, or {(order, n)} for diagonal gains"
     findings.require(gain.shape in ((order, n), (order, n, n)), problem, remedy)
     v = x[0]
-    optional = {
-        "weights": ((x,), (order, n)),
-        "steady_levels": ((v, v), (order - 2, n)),
-        "steady_input": ((v,), (n,)),
-        "joint_torque": ((x, v), (n,)),
+    optional: dict[str, tuple[Any, tuple[Any, ...], tuple[int, ...]]] = {
+        "weights": (plant.weights, (x,), (order, n)),
+        "steady_levels": (plant.steady_levels, (v, v), (order - 2, n)),
+        "steady_input": (plant.steady_input, (v,), (n,)),
+        "joint_torque": (plant.joint_torque, (x, v), (n,)),
     }
-    for name, (args, shape) in optional.items():
-        method = plant_member(plant, name)
-        if method is not None:
-            call_has_shape(findings, name, method, args, shape)
-    by_level: dict[str, tuple[Any, ...]] = {
+    for name, (method, args, shape) in optional.items():
+        with suppress(StoppedCheckError):
+            found = shape_of(findings, name, method, *args)
+            if found is not None:
+                has_shape(findings, name, found, shape)
+    arguments = {
         "level_rate": (t, x, v, 0.0),
         "level_input": (t, x, v, 0.0),
         "transposed_gain": (t, x, v),
     }
-    for name, args in by_level.items():
-        method = plant_member(plant, name)
-        if method is None:
-            continue
+    for name, method in _own_by_level(plant).items():
         for level in range(1, order + 1):
-            call_has_shape(findings, f"{name}({level}, ...)", _at(method, level), args, (n,))
+            at_level = partial(method, level)
+            call_has_shape(findings, f"{name}({level}, ...)", at_level, arguments[name], (n,))
 
 
-def _at(method: Any, level: int) -> Any:
-    """A method of the optional members with its level."""
-    return lambda *args: method(level, *args)
+def _own_by_level(plant: Plant) -> dict[str, Any]:
+    """The methods of a level that do not follow from drift and gain, by name."""
+    pairs = {
+        "level_rate": (plant.level_rate, Plant.level_rate),
+        "level_input": (plant.level_input, Plant.level_input),
+        "transposed_gain": (plant.transposed_gain, Plant.transposed_gain),
+    }
+    return {name: own for name, (own, default) in pairs.items() if not is_default(own, default)}
 
 
 def _dependence(findings: Findings, plant: Any, t: jax.Array, points: jax.Array) -> None:
@@ -139,7 +148,7 @@ def _structure(findings: Findings, plant: Any, t: jax.Array, points: jax.Array) 
     """Requires rows that depend on no later level, except for the model of a law with filters;
     invertible gains, and finite derivatives.
     """
-    if not plant_member(plant, "needs_filters"):
+    if not plant.needs_filters:
         _dependence(findings, plant, t, points)
     gains = np.asarray(jax.vmap(lambda x: plant.gain(t, x))(points))
     _finite_gains(findings, gains, points)
@@ -180,17 +189,14 @@ def _derivatives_along(plant: Any, t: jax.Array, x: jax.Array) -> jax.Array:
 def _functions(plant: Any, t: jax.Array, x: jax.Array) -> Numbers:
     """The functions of a plant whose derivatives are tested."""
     values = {"drift(t, x)": plant.drift(t, x), "gain(t, x)": plant.gain(t, x)}
-    arguments = {
-        "weights": (x,),
-        "steady_levels": (x[0], x[1]),
-        "steady_input": (x[0],),
-        "joint_torque": (x, x[-1]),
+    stated = {
+        "weights": plant.weights(x),
+        "steady_input": plant.steady_input(x[0]),
+        "joint_torque": plant.joint_torque(x, x[-1]),
     }
-    for name, args in arguments.items():
-        method = plant_member(plant, name)
-        if method is not None and not (name == "steady_levels" and plant.order == 2):
-            values[name] = method(*args)
-    return values
+    if plant.order > 2:
+        stated["steady_levels"] = plant.steady_levels(x[0], x[1])
+    return values | {name: value for name, value in stated.items() if value is not None}
 
 
 def _identities(plant: Any, t: jax.Array, x: jax.Array, v: jax.Array, s: jax.Array) -> Numbers:
@@ -202,23 +208,23 @@ def _identities(plant: Any, t: jax.Array, x: jax.Array, v: jax.Array, s: jax.Arr
     matrices = gain if gain.ndim == 3 else gain[:, None, :] * jnp.eye(plant.n)
     levels = range(1, plant.order + 1)
     rates = jnp.stack([drift[i] + matrices[i] @ v for i in range(plant.order)])
-    if plant_member(plant, "level_rate") is not None:
+    own_methods = _own_by_level(plant)
+    if "level_rate" in own_methods:
         own = jnp.stack([plant.level_rate(i, t, x, v, 0.0) for i in levels])
         found["level_rate"] = _relative(own, rates)
-    if plant_member(plant, "level_input") is not None:
+    if "level_input" in own_methods:
         own = jnp.stack([plant.level_input(i, t, x, rates[i - 1], 0.0) for i in levels])
         found["level_input"] = _relative(own, jnp.broadcast_to(v, own.shape))
-    if plant_member(plant, "transposed_gain") is not None:
+    if "transposed_gain" in own_methods:
         own = jnp.stack([plant.transposed_gain(i, t, x, s) for i in levels])
         found["transposed_gain"] = _relative(own, jnp.swapaxes(matrices, 1, 2) @ s)
-    if plant_member(plant, "weights") is not None:
-        found["weights"] = jnp.maximum(-plant.weights(x), 0.0)
-    steady_levels = plant_member(plant, "steady_levels")
-    steady_input = plant_member(plant, "steady_input")
+    weights, rest = plant.weights(x), jnp.zeros_like(x[0])
+    if weights is not None:
+        found["weights"] = jnp.maximum(-weights, 0.0)
+    steady_levels, steady_input = plant.steady_levels(x[0], rest), plant.steady_input(x[0])
     if steady_levels is not None and steady_input is not None:
-        rest = jnp.zeros_like(x[0])
-        state = jnp.concatenate([jnp.stack([x[0], rest]), steady_levels(x[0], rest)])
-        rate = plants.flow(plant, t, state, steady_input(x[0]))
+        state = jnp.concatenate([jnp.stack([x[0], rest]), steady_levels])
+        rate = plants.flow(plant, t, state, steady_input)
         found["steady_input"] = rate / (1.0 + jnp.abs(plants.flow(plant, t, x, v)))
     if plants.robot_of(plant) is not None and "level_rate" in found:
         added = plant.level_rate(2, t, x, v, s) - plant.level_rate(2, t, x, v, 0.0)

@@ -11,7 +11,7 @@ import numpy as np
 from iblf_jax.core import checks
 from iblf_jax.testing._contract import Findings, call_has_shape, check_function
 from iblf_jax.testing.joints import examine_joints
-from iblf_jax.world.process_noise import ProcessNoise, check_structure, noise_member
+from iblf_jax.world.process_noise import ProcessNoise, check_structure
 
 LABEL = "diffusion(t, x)"
 TIMES, SIZES = (0.0, 0.3, 4.0), (0.0, 1.0, 30.0)
@@ -53,7 +53,7 @@ def _structure(findings: Findings, noise: Any) -> None:
     """Requires increasing levels, a number of substeps, and a Boolean `additive`."""
     try:
         check_structure(noise)
-        checks.boolean(f"{type(noise).__name__}.additive", noise_member(noise, "additive"))
+        checks.boolean(f"{type(noise).__name__}.additive", noise.additive)
     except ValueError as error:
         findings.stop(str(error))
 
@@ -67,7 +67,7 @@ def _values(findings: Findings, noise: Any, x: jax.Array) -> None:
     at_states = jax.vmap(lambda t, x: _diffusion(noise, t, x), (None, 0))
     found = np.asarray(jax.jit(jax.vmap(at_states, (0, None)))(jnp.asarray(TIMES), states))
     findings.require(np.all(np.isfinite(found)), f"{LABEL} is not finite somewhere")
-    if noise_member(noise, "additive"):
+    if noise.additive:
         findings.require(
             np.all(found == found[:, :1]),
             f"additive is True, and {LABEL} depends on x",

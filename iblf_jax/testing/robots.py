@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.core.families import is_default
 from iblf_jax.core.linalg import inner, matvec
 from iblf_jax.testing._contract import (
     Findings,
@@ -58,6 +59,11 @@ def check_robot(robot: Any, *, q: Any = None) -> None:
             hasattr(robot, "payload"),
             "it has no leaf `payload`",
             "Add a point mass at the tip [kg], 0 by default",
+        )
+        findings.require(
+            not is_default(robot.skeleton, Robot.skeleton),
+            "skeleton(q) is missing",
+            "Positions of the base, each joint and the tip, (n + 1, 2) or (n + 1, 3) [m]",
         )
         findings.stop_if_any()
         robot = in_dtype(robot, "float64")

@@ -33,7 +33,7 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.core import checks
-from iblf_jax.core.families import Part
+from iblf_jax.core.families import Part, attribute
 from iblf_jax.core.joints import Selection, indices, selection
 from iblf_jax.core.pytree import component, leaf, static
 from iblf_jax.core.units import INPUT, POSITION, VELOCITY, PlantUnit
@@ -56,7 +56,7 @@ class Quantity(Part):
     smoothing: Any = None
     """Of a maximum, a leaf that `tune` decreases; None for a quantity that is smooth itself."""
 
-    @property
+    @attribute
     def needs(self) -> str | None:
         """The optional signal of a run that it reads."""
         return None

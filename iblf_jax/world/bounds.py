@@ -15,46 +15,45 @@ and with their rates.  `tube_at` computes them by automatic differentiation and 
 
 from __future__ import annotations
 
+import abc
 import math
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.core.optional import OptionalMembers
+from iblf_jax.core.families import attribute
 from iblf_jax.core.pytree import Leaf, component, leaf
+from iblf_jax.core.time import Timed
 from iblf_jax.core.units import POSITION
 from iblf_jax.world.references import Reference
 from iblf_jax.world.robots import Robot
-from iblf_jax.world.robots._base import robot_member
+from iblf_jax.world.robots._base import is_robot
 
 
-class Side(Protocol):
-    """The contract of one side of the bounds.
+class Side(Timed):
+    """The contract of one side of the bounds."""
 
-    A side that is discontinuous in time also has `jump_times()`, the times (m,) [s] at which it or
-    its rate jumps; steps of a run are divided there, as for disturbances.  A side that is not
-    smooth has `continuous_derivatives`, the number of its continuous derivatives in time and in
-    q_d; a law for a plant of order r needs r - i + 1 of them on level i.
-    """
+    @attribute
+    def continuous_derivatives(self) -> float:
+        """The number of its continuous derivatives in time and in q_d; a law for a plant of order r
+        needs r - i + 1 of them on level i.
+        """
+        return math.inf
 
+    @abc.abstractmethod
     def at(self, t: jax.Array, q_d: jax.Array) -> jax.Array:
         """The bound on q at time t [s], (n,) [rad]; a bound may depend on the reference q_d at t,
         (n,) [rad].
 
         A bound on q' is in rad/s and receives q_d' in place of q_d.
         """
-        ...
-
-
-side_member = OptionalMembers(continuous_derivatives=math.inf)
-"""Reads optional members of a side."""
 
 
 @component
-class Constant:
+class Constant(Side):
     """The bound is `value`, for all time.
 
     Args:
@@ -69,7 +68,7 @@ class Constant:
 
 
 @component
-class Sinusoid:
+class Sinusoid(Side):
     """The bound is offset + amplitude sin(frequency t + phase).
 
     Args:
@@ -94,7 +93,7 @@ class Sinusoid:
 
 
 @component
-class Funnel:
+class Funnel(Side):
     """A bound at a distance r(t) = (initial - final) exp(-rate t) + final from the reference.
 
     `initial` and `final` are signed: positive for an upper side (bound = q_d + r), negative for a
@@ -150,9 +149,10 @@ def _distance(name: str, value: Any, n: int, sign: str | None) -> jax.Array:
     return array
 
 
-def _limits_of(robot: Robot, member: str, what: str, unlimited: Any) -> tuple[Any, Any]:
+def _checked_limits(
+    robot: Robot, member: str, limits: Any, what: str, unlimited: Any
+) -> tuple[Any, Any]:
     """The limits that a robot declares, and the value for joints without limits."""
-    limits = robot_member(robot, member)
     if limits is None:
         expected, remedy = f"a robot with {what} limits, such as an Arm", "Give bounds of your own."
         raise checks.fail("robot", type(robot).__name__, expected, remedy)
@@ -178,7 +178,8 @@ def from_limits(robot: Robot, *, margin: float = 0.0, unlimited: float | None = 
       ValueError: a robot without `limits`, or with joints that have none and no `unlimited`; a
         margin that leaves nothing.
     """
-    limits, replacement = _limits_of(robot, "limits", "joint", unlimited)
+    stated = robot.limits if is_robot(robot) else None
+    limits, replacement = _checked_limits(robot, "limits", stated, "joint", unlimited)
     margins = _distance("margin", margin, robot.n, None)
     lower = jnp.where(jnp.isfinite(limits[0]), limits[0] + margins, -replacement)
     upper = jnp.where(jnp.isfinite(limits[1]), limits[1] - margins, replacement)
@@ -206,7 +207,8 @@ def from_speed_limits(
       ValueError: a robot without `speed`, or with joints that have no limit and no `unlimited`; a
         share that is not positive.
     """
-    speed, replacement = _limits_of(robot, "speed", "speed", unlimited)
+    stated = robot.speed if is_robot(robot) else None
+    speed, replacement = _checked_limits(robot, "speed", stated, "speed", unlimited)
     share = checks.positive_number("share", share, "1")
     limit = share * jnp.where(jnp.isfinite(speed), speed, replacement)
     return Bounds(lower=Constant(-limit), upper=Constant(limit))

@@ -17,39 +17,36 @@ plant; on a plant without a robot it is added to the input u, in the unit of u.
 
 from __future__ import annotations
 
+import abc
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from iblf_jax.core import checks
 from iblf_jax.core.linalg import matvec
-from iblf_jax.core.optional import OptionalMembers
 from iblf_jax.core.pytree import Leaf, component, leaf
-from iblf_jax.core.time import joined, jump_times_of, no_times
+from iblf_jax.core.time import Timed, joined, jump_times_of, no_times
 from iblf_jax.core.units import TORQUE, VELOCITY, PlantUnit, Unit
 from iblf_jax.world.robots import Robot, momentum
 
 
-class Disturbance(Protocol):
-    """The contract of a disturbance.
-
-    A disturbance of a plant in strict-feedback form may have `rates(t, x, plant, model)`, (r, n):
-    d_1 ... d_r of (S.1), which are added to x'; it returns None if there is nothing to add.  The
-    torque of a disturbance acts on the robot inside such a plant; of a plant without a robot it is
-    added to the input.
+class Disturbance(Timed):
+    """The contract of a disturbance.  Its torque acts on a robot, or on the robot inside a plant in
+    strict-feedback form; on a plant without a robot it is added to the input.
     """
 
+    @abc.abstractmethod
     def torque(
         self, t: jax.Array, q: jax.Array, dq: jax.Array, plant: Robot, model: Robot
     ) -> jax.Array:
         """Generalised torque on the plant, (n,) [N m], at time t [s] and state q [rad], dq
         [rad/s].
         """
-        ...
 
+    @abc.abstractmethod
     def jump_times(self) -> jax.Array:
         """Times at which `torque` is discontinuous, (m,) [s]; empty if it never is.
 
@@ -57,19 +54,12 @@ class Disturbance(Protocol):
         number of times is fixed.  The times are computed from leaves with jnp, may differ between
         runs, and have derivatives.
         """
-        ...
 
-
-disturbance_member = OptionalMembers(rates=None)
-"""Reads optional members of a disturbance."""
-
-
-def rates_of(
-    disturbance: Disturbance, t: jax.Array, x: jax.Array, plant: Any, model: Any
-) -> jax.Array | None:
-    """What a disturbance adds to x', (r, n); None for one that is a torque only."""
-    rates = disturbance_member(disturbance, "rates")
-    return None if rates is None else rates(t, x, plant, model)  # type: ignore[no-any-return]
+    def rates(self, t: jax.Array, x: jax.Array, plant: Any, model: Any) -> jax.Array | None:
+        """D_1 ... d_r of (S.1), (r, n), which are added to x' of a plant in strict-feedback form;
+        None if there is nothing to add.
+        """
+        return None
 
 
 def _never(disturbance: Any) -> jax.Array:
@@ -78,7 +68,7 @@ def _never(disturbance: Any) -> jax.Array:
 
 
 @component
-class Nothing:
+class Nothing(Disturbance):
     """No disturbance."""
 
     def torque(
@@ -91,7 +81,7 @@ class Nothing:
 
 
 @component
-class ModelShaped:
+class ModelShaped(Disturbance):
     """The paper's uncertain term, shaped by the model's own matrices.                       (4.3)
 
         f = M0(q) a(t) + C0(q, q') b(t)
@@ -136,7 +126,7 @@ class ModelShaped:
 
 
 @component
-class Sinusoids:
+class Sinusoids(Disturbance):
     """Joint torques offset + amplitude sin(frequency t + phase).
 
     On a plant without a robot it is added to the input, and inside `Levels` to the rate of a level,
@@ -166,7 +156,7 @@ class Sinusoids:
 
 
 @component
-class Step:
+class Step(Disturbance):
     """A step of the joint torques: `size` from `time` on, zero before.
 
     Args:
@@ -189,7 +179,7 @@ class Step:
 
 
 @component
-class TipForce:
+class TipForce(Disturbance):
     """A force that acts on the tip, +J(q)^T F(t) with F = offset + amplitude sin(frequency t +
     phase).
 
@@ -220,7 +210,7 @@ class TipForce:
 
 
 @component
-class Friction:
+class Friction(Disturbance):
     """Viscous and smoothed Coulomb friction in the joints, -(viscous q' + coulomb tanh(q' /
     width)).
 
@@ -245,7 +235,7 @@ class Friction:
 
 
 @component
-class Sum:
+class Sum(Disturbance):
     """Several disturbances at once: `Sum((Friction(0.1), Step(1.0, 5.0)))`.
 
     Args:
@@ -284,7 +274,7 @@ class Sum:
         """The sum over the parts that disturb levels, (r, n); None if none does."""
         total = None
         for part in self.parts:
-            found = rates_of(part, t, x, plant, model)
+            found = part.rates(t, x, plant, model)
             if found is not None:
                 total = found if total is None else total + found
         return total
@@ -297,7 +287,7 @@ def _rate_of_level(units: Mapping[str, Unit], i: int) -> Mapping[str, Unit]:
 
 
 @component
-class Levels:
+class Levels(Disturbance):
     """d_1 ... d_r of (S.1): one disturbance for each level of the plant.
 
         x_i' = f_i + G_i x_{i+1} + d_i

@@ -7,9 +7,10 @@ q_d", and its derivative alpha' is continuous only if q_d" is.
 
 from __future__ import annotations
 
+import abc
 import math
 import numbers
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -17,33 +18,28 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.core.caches import memoised
+from iblf_jax.core.families import attribute
 from iblf_jax.core.linalg import matvec
-from iblf_jax.core.optional import OptionalMembers
 from iblf_jax.core.pytree import Leaf, component, leaf, static
-from iblf_jax.core.time import jump_times_of
+from iblf_jax.core.time import Timed, jump_times_of
 from iblf_jax.core.units import POSITION
 
 
-class Reference(Protocol):
-    """The contract of a reference.
+class Reference(Timed):
+    """The contract of a reference.  Its `jump_times` are those of q_d, q_d' and q_d"."""
 
-    A reference that is discontinuous in time also has `jump_times()`, the times (m,) [s] at which
-    q_d, q_d' or q_d" jumps; steps of a run are divided there, as for disturbances.  A reference
-    that is not smooth has `continuous_derivatives`, the number of its continuous derivatives; a law
-    for a plant of order r needs r of them.
-    """
+    @attribute
+    def continuous_derivatives(self) -> float:
+        """The number of continuous derivatives; a law for a plant of order r needs r of them."""
+        return math.inf
 
+    @abc.abstractmethod
     def position(self, t: jax.Array) -> jax.Array:
         """q_d(t), (n,) [rad], twice differentiable in t [s]."""
-        ...
-
-
-reference_member = OptionalMembers(continuous_derivatives=math.inf)
-"""Reads optional members of a reference."""
 
 
 @component
-class Sinusoid:
+class Sinusoid(Reference):
     """q_d = offset + amplitude sin(frequency t + phase), joint by joint.              (4.2)
 
     Args:
@@ -66,7 +62,7 @@ class Sinusoid:
 
 
 @component
-class Quintic:
+class Quintic(Reference):
     """Minimum-jerk motion from `start` to `end` in `duration`, at rest before and after.
 
         q_d = start + (end - start) (10 s^3 - 15 s^4 + 6 s^5),   s = clip(t / duration, 0, 1)
@@ -93,7 +89,7 @@ class Quintic:
 
 
 @component
-class SmoothStep:
+class SmoothStep(Reference):
     """A motion from `start` to `end` with m continuous derivatives, at rest before and after.
 
         q_d = start + (end - start) s^(m+1) sum_{k=0}^{m} (m+k)!/(m! k!) (1 - s)^k
@@ -138,7 +134,7 @@ class SmoothStep:
 
 
 @component
-class WaypointSpline:
+class WaypointSpline(Reference):
     """The quintic spline through waypoints, at rest at both ends and constant beyond them; of a
     higher degree for more derivatives.
 
@@ -206,7 +202,7 @@ class WaypointSpline:
 
 
 @component
-class Ellipse:
+class Ellipse(Reference):
     """A motion on an ellipse in the plane with the heading along its tangent, for a vessel.
 
         north = centre_1 + axes_1 cos(frequency t),   east = centre_2 + axes_2 sin(frequency t)
@@ -245,7 +241,7 @@ class Ellipse:
 
 
 @component
-class Leader:
+class Leader(Reference):
     """y_d = b kron x_0 + offset: a leader's motion as the reference of `plants.Agents`.
 
     y_d is the position of the agents relative to their neighbours when each follows the leader,
@@ -288,7 +284,7 @@ class Leader:
     @property
     def continuous_derivatives(self) -> float:
         """Number of continuous derivatives, those of the motion."""
-        return float(reference_member(self.motion, "continuous_derivatives"))
+        return self.motion.continuous_derivatives
 
     def position(self, t: jax.Array) -> jax.Array:
         """y_d(t), (N m,), in the unit of the positions."""

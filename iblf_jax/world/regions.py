@@ -13,12 +13,14 @@ records the `distance` to the boundary as its margin; a `controllers.SafetyFilte
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+import abc
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from iblf_jax.core import checks
+from iblf_jax.core.families import Part
 from iblf_jax.core.pytree import Leaf, component, leaf, static
 from iblf_jax.world.robots import Robot, joint_names
 
@@ -26,7 +28,7 @@ TIP = "tip"
 KEEPS = ("inside", "outside")
 
 
-class Region(Protocol):
+class Region(Part):
     """The contract of a region: a component with a static field that names the point of the
     robot.
     """
@@ -34,21 +36,21 @@ class Region(Protocol):
     point: str | int
     """ "tip", or the name or number of a joint, for the origin of this joint."""
 
+    @abc.abstractmethod
     def distance(self, x: jax.Array) -> jax.Array:
         """Distance of a point (2,) or (3,) [m] to the boundary, () [m]: positive inside,
         negative outside.
         """
-        ...
 
+    @abc.abstractmethod
     def level(self, x: jax.Array) -> jax.Array:
         """A function, () [m], that is twice differentiable inside; it has the sign of the distance
         and, at the boundary, its slope.
         """
-        ...
 
 
 @component
-class HalfSpace:
+class HalfSpace(Region):
     """The half-space  n . x >= offset,  n = normal/|normal|:  h = n . x - offset.
 
     Args:
@@ -82,7 +84,7 @@ class HalfSpace:
 
 
 @component
-class Sphere:
+class Sphere(Region):
     """The inside or outside of a sphere, or of a circle in the plane.
 
     Distance and level are |x - centre| - radius outside.  Inside, where the distance radius - |x -
@@ -145,7 +147,10 @@ def row_of(robot: Robot, point: str | int) -> int:
 def position_of(robot: Robot, point: str | int, q: jax.Array) -> jax.Array:
     """Position of a region's point at q, (2,) or (3,) [m]."""
     row = row_of(robot, point)
-    return robot.tip(q) if row == robot.n else robot.skeleton(q)[row]
+    if row == robot.n:
+        return robot.tip(q)
+    points: Any = robot.skeleton(q)
+    return points[row]  # type: ignore[no-any-return]
 
 
 def margins(regions: tuple[Region, ...], robot: Robot, q: jax.Array) -> jax.Array:

@@ -190,6 +190,40 @@ def test_a_class_without_a_base_class_that_lacks_a_method_is_refused_where_it_is
         law_with(Half())
 
 
+def test_an_attribute_of_a_base_class_may_be_a_field_without_a_value():
+    @ij.component
+    class White(ij.process_noise.ProcessNoise):
+        levels: tuple[int, ...] = ij.static()
+        additive: bool = ij.static()
+
+        def diffusion(self, t, x):
+            return x[:1]
+
+    noise = White(levels=(2,), additive=True)
+    assert (noise.levels, noise.additive, noise.substeps) == ((2,), True, 1)
+    assert copy.copy(noise).levels == (2,)
+
+
+def test_a_class_that_takes_members_from_another_object_takes_the_defaults_last():
+    @ij.component
+    class Delayed:
+        motion: ij.references.Reference
+
+        def __getattr__(self, name):
+            if name.startswith("__") or name == "motion":
+                raise AttributeError(name)
+            return getattr(self.motion, name)
+
+    adopt(Delayed, ij.references.Reference)
+    step = ij.references.SmoothStep(start=0.0, end=1.0, duration=2.0, derivatives=3)
+    assert Delayed(step).continuous_derivatives == 3
+    of_other = Delayed(own_class()())
+    assert of_other.continuous_derivatives == math.inf and of_other.gain == 3.0
+    assert of_other.jump_times().size == 0
+    with pytest.raises(AttributeError, match="unknown"):
+        _ = of_other.unknown
+
+
 def test_required_members_are_abstract_methods_and_attributes_without_a_value():
     found = required_members(ij.barriers.Barrier)
     assert found == ("guard", "slope", "value", "virtual_velocity")

@@ -128,7 +128,7 @@ PUBLIC_MODULE = {
 }
 """Module with a base class -> the public module of its family, where that is not the module or
 folder at the top of the package."""
-BASES = {"LevelReading", "Part", "Protocol", "abc.ABC"}
+BASES = {"Dynamics", "LevelReading", "Part", "Protocol", "TimeVarying", "Timed", "abc.ABC"}
 """What the base classes of families inherit from."""
 ELSEWHERE = (
     "jax.Array",
@@ -155,6 +155,9 @@ def contracts() -> dict[str, ast.ClassDef]:
         module = ".".join(path.relative_to(ROOT).with_suffix("").parts)
         for node in ast.parse(path.read_text(encoding="utf-8")).body:
             if not isinstance(node, ast.ClassDef) or node.name.startswith("_"):
+                continue
+            is_member = "component" in map(ast.unparse, node.decorator_list)
+            if ".core." in module or is_member:
                 continue
             if BASES & {*map(ast.unparse, node.bases)}:
                 found[f"{module}:{node.name}"] = node

@@ -340,7 +340,7 @@ def test_a_robot_whose_matrices_contradict_each_other_is_refused():
 
 
 @component
-class Light(Link):
+class Light(Link, ij.robots.Robot):
     """A light arm whose inertia matrix is not symmetric."""
 
     n: ClassVar[int] = 2

@@ -86,7 +86,7 @@ def test_missing_methods_are_listed_with_their_meaning():
         ij.testing.check_robot,
         Nothing(),
         "mass_matrix(q) is missing",
-        "gravity(q) is missing",
+        "potential(q) is missing",
         "n",
         "[kg m^2]",
     )

@@ -13,7 +13,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.core.families import Part
+from iblf_jax.core.families import attribute
+from iblf_jax.core.time import TimeVarying
 
 State = Any
 """A pytree of arrays of floats; `()` for an actuator without memory."""
@@ -30,45 +31,41 @@ class Delivered(NamedTuple):
     """Rate of the actuator's state, per second."""
 
 
-class Actuator(Part):
+class Actuator(TimeVarying):
     """The contract of an actuator.
 
     The command of a law is a torque.  Under a law that commands another input, such as a voltage,
     the actuator may take that input; the observer receives the command, so the observer of such a
     loop may not use it as a torque.
-
-    An actuator that changes with time, such as a drive that fails, has `at(t)`, the actuator at
-    time t [s], and `jump_times()`, the times (m,) [s] at which it is discontinuous in time.  Steps
-    of a run are divided there, as for disturbances.
     """
 
-    @property
+    @attribute
     def unlimited(self) -> Actuator:
         """The same actuator without its limits.  The fastest mode of a sampled loop is computed
         with it.
         """
         return self
 
-    @property
+    @attribute
     def smooth(self) -> Actuator:
         """An actuator with the same state, without a dead zone, play and rounding.  The fastest
         mode of every loop is computed with it.
         """
         return self
 
-    @property
+    @attribute
     def deviation(self) -> Any:
         """The width of the interval in which the difference to the torque of `smooth` lies, () or
         (n,) [N m]; None if it is not known.  The numerical error of a run is bounded with it.
         """
         return None
 
-    @property
+    @attribute
     def resolution(self) -> Any:
         """The distance between two levels of an actuator that rounds, () or (n,) [N m], or None."""
         return None
 
-    @property
+    @attribute
     def input_delay(self) -> Any:
         """The `Delay` of an actuator or of its first part; None without one."""
         return None

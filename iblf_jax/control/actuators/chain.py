@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from iblf_jax.control.actuators._base import Actuator, Delivered
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import component
-from iblf_jax.core.time import as_at, joined, jump_times_of
+from iblf_jax.core.time import joined, jump_times_of
 
 
 @component
@@ -107,7 +107,7 @@ class Chain(Actuator):
     def at(self, t: jax.Array) -> Chain:
         """The chain as it is at time t [s]."""
         now = copy.copy(self)
-        object.__setattr__(now, "parts", tuple(as_at(part, t) for part in self.parts))
+        object.__setattr__(now, "parts", tuple(part.at(t) for part in self.parts))
         return now
 
     def jump_times(self) -> jax.Array:

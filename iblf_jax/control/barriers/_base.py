@@ -29,7 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.core.families import Part
+from iblf_jax.core.families import Part, attribute
 from iblf_jax.core.pytree import Leaf
 from iblf_jax.world.bounds import Tube
 
@@ -56,7 +56,7 @@ class Barrier(Part):
     ratio_jumps: ClassVar[bool] = True
     """Whether `error_over_slope` may jump at e1 = 0 in an asymmetric tube."""
 
-    @property
+    @attribute
     def slope_derivatives(self) -> float:
         """How many continuous derivatives the slope has at e1 = 0."""
         return math.inf

@@ -18,8 +18,9 @@ import jax.numpy as jnp
 
 from iblf_jax.control.barriers import Barrier
 from iblf_jax.control.decays import Decay, Exponential
-from iblf_jax.core.families import Part, adopt
+from iblf_jax.core.families import adopt, attribute
 from iblf_jax.core.pytree import Leaf, layers, wrapped_field
+from iblf_jax.core.time import Timed
 from iblf_jax.world.bounds import Bounds, Tube, speed_limits_at, tube_at
 from iblf_jax.world.references import Reference
 from iblf_jax.world.regions import Along, Region, along
@@ -137,7 +138,7 @@ class Command(NamedTuple):
     """The auxiliary state lambda of a limited input, (n,); `()` for laws without one."""
 
 
-class Controller(Part):
+class Controller(Timed):
     """The contract of a tracking law.
 
     A law with a proof of its own is a `LyapunovLaw`; then `certify` checks what it states.
@@ -181,19 +182,19 @@ class Controller(Part):
     filter: Leaf = None
     """Time constants of filters in place of exact derivatives [s]; None without filters."""
 
-    @property
+    @attribute
     def takes_shift(self) -> bool:
         """Whether it adds `LawContext.shift` to the virtual control of the last level and to its
         rate (`LawContext.shifted`).
         """
         return False
 
-    @property
+    @attribute
     def has_auxiliary(self) -> bool:
         """Whether its commands have an `auxiliary`."""
         return False
 
-    @property
+    @attribute
     def unlimited(self) -> Controller:
         """The same law without a limit of its own, by which a sampled loop is linearised."""
         return self

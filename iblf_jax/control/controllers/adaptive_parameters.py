@@ -53,7 +53,6 @@ from iblf_jax.core import checks
 from iblf_jax.core.component_paths import member_of, replaced, resolve
 from iblf_jax.core.linalg import inner, solve_spd
 from iblf_jax.core.pytree import Leaf, component, leaf, static
-from iblf_jax.core.time import as_at
 from iblf_jax.core.units import PlantUnit, of_entry
 from iblf_jax.world import plants
 from iblf_jax.world.robots import inverse_dynamics
@@ -380,7 +379,7 @@ class AdaptiveParameters(Wrapping, LyapunovLaw):
         if context.plant is None:
             return self._nominal(context.model)
         try:
-            return _values_at(as_at(context.plant, t), self.parameters)
+            return _values_at(context.plant.at(t), self.parameters)
         except ValueError:
             return self._nominal(context.model)
 
@@ -448,7 +447,6 @@ def _points(context: LawContext, dtype: Any) -> tuple[jax.Array, jax.Array]:
     """Times (POINTS,) and states (POINTS, r, n) inside the bounds of the first level."""
     rng = np.random.default_rng(0)
     plant = plants.as_plant(context.model)
-    steady = plants.plant_member(plant, "steady_levels")
     times = jnp.asarray(rng.uniform(0.0, 5.0, POINTS), dtype)
     spread = jnp.asarray(rng.uniform(-0.5, 0.5, (POINTS, plant.order, plant.n)), dtype)
     states = []
@@ -456,8 +454,9 @@ def _points(context: LawContext, dtype: Any) -> tuple[jax.Array, jax.Array]:
         tube = context.tube(t)
         q = tube.q_d + q * jnp.minimum(tube.k_l, tube.k_u)
         dq = tube.dq_d + dq
+        steady = plant.steady_levels(q, dq)
         if steady is not None and higher:
-            higher = [*(jnp.stack(higher) + steady(q, dq))]
+            higher = [*(jnp.stack(higher) + steady)]
         states.append(jnp.stack([q, dq, *higher]))
     return times, jnp.stack(states)
 

@@ -65,8 +65,7 @@ from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.core.units import ByLevel, PlantUnit, resolved
 from iblf_jax.world import plants
-from iblf_jax.world.bounds import Bounds, Funnel, Tube, side_member
-from iblf_jax.world.references import reference_member
+from iblf_jax.world.bounds import Bounds, Funnel, Tube
 
 
 @component
@@ -197,10 +196,10 @@ class BarrierBackstepping(Controller):
         """The law with weights, (r, n), that belong to its model and to a state x."""
         if self.weights is not None or plants.order_of(context.model) != self.order:
             return self
-        scale = plants.plant_member(plants.as_plant(context.model), "weights")
+        scale = plants.as_plant(context.model).weights(x)
         weights = jnp.ones_like(x)
         if scale is not None:
-            weights = scale(x) * self._centre_ratios(context, x)
+            weights = scale * self._centre_ratios(context, x)
         # The fields are checked already; `dataclasses.replace` would check them again.
         found = copy.copy(self)
         object.__setattr__(found, "weights", weights)
@@ -223,7 +222,7 @@ class BarrierBackstepping(Controller):
             expected = f"{order} levels, as the model ({kind}) has"
             remedy = "Give k, barriers and weights one entry a level."
             raise checks.fail("controller.k", f"{self.order} levels", expected, remedy)
-        if self.filter is None and plants.plant_member(context.model, "needs_filters"):
+        if self.filter is None and plants.as_plant(context.model).needs_filters:
             kind = type(context.model).__name__
             expected = f"filters in place of the derivatives that {kind} does not have"
             remedy = "Such as BarrierBackstepping(..., filter=0.01)."
@@ -238,7 +237,7 @@ class BarrierBackstepping(Controller):
         """Raises ValueError for a reference with too few continuous derivatives."""
         if self.filter is not None:
             return
-        smooth = reference_member(context.reference, "continuous_derivatives")
+        smooth = context.reference.continuous_derivatives
         if smooth >= self.order:
             return
         expected = f"a reference with {self.order} continuous derivatives, as u contains them"
@@ -257,7 +256,7 @@ class BarrierBackstepping(Controller):
         name = "bounds" if i == 0 else f"state_bounds[{i - 1}]"
         needed = self.order - i
         for side_name, side in (("lower", bounds.lower), ("upper", bounds.upper)):
-            smooth = side_member(side, "continuous_derivatives")
+            smooth = side.continuous_derivatives
             if smooth >= needed:
                 continue
             expected = f"a side with {needed} continuous derivatives, as u contains them"

@@ -32,6 +32,7 @@ from iblf_jax.control.controllers.pd_gravity import PDGravity
 from iblf_jax.core import checks
 from iblf_jax.core.linalg import inner
 from iblf_jax.core.pytree import Leaf, component, leaf
+from iblf_jax.world.references import Reference
 from iblf_jax.world.robots import momentum
 
 
@@ -45,7 +46,7 @@ class GovernorState(NamedTuple):
 
 
 @component
-class _AtRest:
+class _AtRest(Reference):
     """A constant reference.
 
     Args:

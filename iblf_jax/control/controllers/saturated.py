@@ -64,7 +64,7 @@ from iblf_jax.core.pytree import Leaf, component, leaf, static, unwrapped
 from iblf_jax.core.units import INPUT
 from iblf_jax.world import plants
 from iblf_jax.world.robots import Robot
-from iblf_jax.world.robots._base import robot_member
+from iblf_jax.world.robots._base import is_robot
 
 EDGES = ("hard", "smooth")
 SHARPNESS = 8
@@ -253,7 +253,7 @@ def within_effort(law: Controller, robot: Robot, *, edge: str = "hard") -> Contr
     Raises:
       ValueError: as `Saturated`.
     """
-    effort = robot_member(robot, "effort")
+    effort = robot.effort if is_robot(robot) else None
     if effort is None or (checks.is_concrete(effort) and not np.isfinite(effort).any()):
         return law
     limit = jnp.where(jnp.isfinite(effort), effort, UNLIMITED)

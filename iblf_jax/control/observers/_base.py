@@ -12,15 +12,16 @@ from typing import Any, ClassVar, Self
 
 import jax
 
-from iblf_jax.core.families import Part
+from iblf_jax.core.families import attribute
 from iblf_jax.core.pytree import Leaf
+from iblf_jax.core.time import Timed
 from iblf_jax.world.robots import Robot
 
 State = Any
 """A pytree of arrays; `()` for an observer without memory."""
 
 
-class Observer(Part):
+class Observer(Timed):
     """The contract of a disturbance observer.
 
     An observer of plants in strict-feedback form has the class attribute `receives_x = True`.  Its
@@ -34,7 +35,7 @@ class Observer(Part):
     kf: Leaf = None
     """Gain of an observer of the form (3.11), (n,) [1/s]; None for another one."""
 
-    @property
+    @attribute
     def error_gain(self) -> jax.Array | None:
         """The claim that the error of the estimate obeys f_tilde' = f' - kappa f_tilde: kappa, (n,)
         [1/s], or that of d_tilde, (r,) or (r, n) [1/s]; None without a claim.  `certify` checks it
@@ -42,24 +43,24 @@ class Observer(Part):
         """
         return None
 
-    @property
+    @attribute
     def noise_gain(self) -> jax.Array | None:
         """The factor from the noise of the measured levels to that of d_hat, (), (r,) or (r, n)
         [1/s]; None if it is not known.  A scenario whose sensor has noise warns with the product.
         """
         return None
 
-    @property
+    @attribute
     def measured(self) -> tuple[int, ...] | None:
         """The levels that an observer with `complete` reads, counted from 1; None for all."""
         return None
 
-    @property
+    @attribute
     def advances(self) -> bool:
         """Whether it has `advance`."""
         return type(self).advance is not Observer.advance
 
-    @property
+    @attribute
     def completes(self) -> bool:
         """Whether it has `complete`."""
         return type(self).complete is not Observer.complete

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.core.families import Part
+from iblf_jax.core.families import Part, attribute
 
 State = Any
 """A pytree of arrays of floats; `()` for a sensor without memory."""
@@ -47,17 +47,17 @@ class LevelReading(Part):
     velocity: Velocity | None = None
     """The velocity estimate of a sensor that measures positions."""
 
-    @property
+    @attribute
     @abc.abstractmethod
     def draws(self) -> int:
         """Number of normal numbers per joint, or component, and sample."""
 
-    @property
+    @attribute
     def unrounded(self) -> Self:
         """The same sensor without rounding, with which the fastest mode of a loop is computed."""
         return self
 
-    @property
+    @attribute
     def resolution(self) -> Any:
         """Size of a count, () or (n,) [rad], for the default ranges of gains; 0 for a sensor that
         does not round.  (r, n) in the units of the levels for a sensor that `receives_x`.
@@ -77,12 +77,12 @@ class Sensor(LevelReading):
     With any other sensor the levels from the third on are measured without error.
     """
 
-    @property
+    @attribute
     def order(self) -> int | None:
         """The number of levels r of a sensor that `receives_x`; None for any number."""
         return None
 
-    @property
+    @attribute
     def measured(self) -> tuple[int, ...] | None:
         """The levels that a sensor that `receives_x` measures, counted from 1; None for all."""
         return None
@@ -136,7 +136,7 @@ class LevelSensor(LevelReading):
 class Velocity(Part):
     """The contract of a velocity estimate from measured positions."""
 
-    @property
+    @attribute
     @abc.abstractmethod
     def draws(self) -> int:
         """Number of normal numbers per joint and sample."""

@@ -31,7 +31,6 @@ from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.sampling import commands_in_transit
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.world.disturbances import Nothing
-from iblf_jax.world.robots._base import robot_member
 
 LIMIT_FACTOR = 3.0
 """Torque limits of a model that has none, relative to the largest torques of a simulated run."""
@@ -144,7 +143,7 @@ def demonstrate(
         plant.write_text(planar_mjcf(scenario.plant) + "\n", encoding="utf-8")
     plant, names = plant_of(scenario, plant, joints)
     expected = cosimulated(scenario, plant, names, duration, robot)
-    effort = robot_member(scenario.model, "effort")
+    effort = scenario.model.effort
     if torque_limits is None and (effort is None or not np.all(np.isfinite(np.asarray(effort)))):
         torque_limits = (LIMIT_FACTOR * np.max(np.abs(np.asarray(expected.tau)), axis=0)).tolist()
     package = folder / "package"

@@ -46,7 +46,7 @@ from iblf_jax.simulation import paths
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies.draws import check_paths
 from iblf_jax.world import plants
-from iblf_jax.world.robots._base import mass_matrix_at, robot_member
+from iblf_jax.world.robots._base import mass_matrix_at
 
 if TYPE_CHECKING:
     from iblf_jax.tuning.parameters import Tunable
@@ -126,7 +126,7 @@ def ros_options(scenario: Scenario, gains: Any, torque_limits: Any, on_fault: st
 def _torque_limits(scenario: Scenario, given: Any) -> np.ndarray:
     """The largest torques, (n,) [N m]: the given ones, at most those of the model."""
     n = scenario.n
-    effort = robot_member(scenario.model, "effort")
+    effort = scenario.model.effort
     largest = np.full(n, math.inf)
     if effort is not None:
         largest = np.broadcast_to(np.asarray(effort, float), (n,))

@@ -10,8 +10,8 @@ import numpy as np
 from iblf_jax.core import checks
 from iblf_jax.deployment.mujoco_plant import LEAST_INERTIA, MujocoPlant
 from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.world.plants import declared_joints
 from iblf_jax.world.robots import PlanarChain, TwoLink
-from iblf_jax.world.robots._base import robot_member
 from iblf_jax.world.robots.tree import mujoco_package
 
 MIN_RADIUS = 0.01
@@ -34,7 +34,7 @@ def plant_of(
     """
     if plant is None:
         plant = mujoco_package().MjSpec.from_string(planar_mjcf(scenario.plant))
-    names = tuple(joints or robot_member(scenario.plant, "joints"))
+    names = tuple(joints or declared_joints(scenario.plant))
     if not names:
         names = MujocoPlant(plant, (), scenario.n, {}, None).joint_names
     if len(names) == scenario.n:

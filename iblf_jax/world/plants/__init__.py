@@ -2,7 +2,7 @@
 
     x_i' = f_i(t, x_1..x_i) + G_i(t, x_1..x_i) x_{i+1} + d_i,   i = 1..r,   x_{r+1} = u      (S.1)
 
-A class of your own has the methods of the protocol `Plant`, which is on this page.
+A class of your own has the base class `Plant`, which is on this page.
 """
 
 from typing import Any
@@ -19,6 +19,8 @@ from iblf_jax.world.plants._base import declared_joints as declared_joints
 from iblf_jax.world.plants._base import dependence_on_levels as dependence_on_levels
 from iblf_jax.world.plants._base import flow as flow
 from iblf_jax.world.plants._base import gain_times as gain_times
+from iblf_jax.world.plants._base import has_modes as has_modes
+from iblf_jax.world.plants._base import has_steady_levels as has_steady_levels
 from iblf_jax.world.plants._base import input_name as input_name
 from iblf_jax.world.plants._base import is_chain as is_chain
 from iblf_jax.world.plants._base import level_input as level_input
@@ -26,7 +28,6 @@ from iblf_jax.world.plants._base import level_names as level_names
 from iblf_jax.world.plants._base import level_rate as level_rate
 from iblf_jax.world.plants._base import nominal_of as nominal_of
 from iblf_jax.world.plants._base import order_of as order_of
-from iblf_jax.world.plants._base import plant_member as plant_member
 from iblf_jax.world.plants._base import robot_of as robot_of
 from iblf_jax.world.plants._base import speed_limit as speed_limit
 from iblf_jax.world.plants._base import torque_as_rates as torque_as_rates
@@ -45,6 +46,7 @@ from iblf_jax.world.plants.rigid import Rigid as Rigid
 from iblf_jax.world.plants.strict_feedback import StrictFeedback as StrictFeedback
 from iblf_jax.world.plants.switched import Switched as Switched
 from iblf_jax.world.plants.vessel import Vessel as Vessel
+from iblf_jax.world.robots import Robot as Robot
 
 
 def as_plant(part: Any) -> Plant:
@@ -98,7 +100,6 @@ __all__ = [
     "level_rate",
     "nominal_of",
     "order_of",
-    "plant_member",
     "robot_of",
     "torque_as_rates",
     "transposed_gain",

@@ -11,8 +11,9 @@ Functions of this module take the number of a level, which counts from 1.
 
 from __future__ import annotations
 
+import abc
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple, TypeGuard
 
 import jax
 import jax.numpy as jnp
@@ -20,13 +21,13 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.core.attributes import has_members
+from iblf_jax.core.families import adopt, attribute, is_default
 from iblf_jax.core.linalg import matvec, solve_gain, solve_spd
-from iblf_jax.core.optional import OptionalMembers
 from iblf_jax.core.status import VELOCITY_LIMIT
 from iblf_jax.core.units import ByLevel, Unit, per_second, product
 from iblf_jax.kernels import jaxprs
-from iblf_jax.world.robots import joint_names
-from iblf_jax.world.robots._base import robot_member
+from iblf_jax.world.robots import Dynamics, Robot, joint_names
+from iblf_jax.world.robots._base import is_robot
 
 Units = str | tuple[str, ...]
 """The unit of a level: one for all its components, or one for each."""
@@ -45,54 +46,44 @@ LIMIT_WITHOUT_ROBOT = 1e12
 """As `status.VELOCITY_LIMIT`, for plants without a robot, whose levels may have any units."""
 
 
-class Plant(Protocol):
+class Plant(Dynamics):
     """The contract of a plant in strict-feedback form.  All methods are pure functions of one
     state.
-
-    A plant may have further members; `plant_member` holds their defaults.
-
-    - `units`: the units of the levels and of the input, a tuple of order + 1 `Units`.
-    - `level_names`, `input_name`: words for figures and tables.
-    - `component_names`: names of the n components.
-    - `outline(x1)`: corners of the plant's shape in the plane at a first level, (k, 2) [m], for
-      figures; the first corner is drawn as its path.
-    - `robot`: the robot inside a plant whose first two levels are its q and q'.  Disturbances,
-      friction and observers of robots then act on it, as the torque that is added to it.
-    - `rigid()`: the robot to which the plant tends in its rigid limit, such as that for a large
-      stiffness: the model of a law of robots, where it is not `robot`.
-    - `level_rate(level, t, x, above, torque)`: f_i + G_i above, (n,), where a member has a shorter
-      formula than `drift` and `gain`.  `torque`, (n,) [N m], is added to a robot; 0.0 for none.
-    - `level_input(level, t, x, rate, torque)`: its inverse, the x_{i+1} for which x_i' is `rate`.
-    - `transposed_gain(level, t, x, s)`: G_i^T s, (n,).
-    - `joint_torque(x, u)`: the torque on the joints of the robot, (n,) [N m].
-    - `steady_levels(q, dq)`: the levels from the third on, (order - 2, n), of a plant that starts
-      with given q and q'; without it a start needs all levels, `Initial(x=...)`.
-    - `steady_input(q)`: the input that holds the plant at q.
-    - `weights(x)`: the scale of each level's energy, (order, n); `BarrierBackstepping` weighs its
-      barriers with it.
-    - `nominal`: the plant whose parameters do not change, for one with modes; it is the default
-      model.
-    - `mode_draws`, `with_path(uniforms)`: how many pairs of random numbers give the modes of a run,
-      and the plant with these modes.
-    - `switching(end)`: results about the modes of a run that ends at this time, by name;
-      `has_complete_path(end)`: whether all of its switches are known.
-    - `friction_torque(x)`: of a plant with several robots inside, the friction of their joints,
-      (n,) [N m], which belongs to the plant only and is passed to `level_rate` as its torque.
-    - `needs_filters`: whether the drift depends on a later level whose derivatives no law may form.
-      Such a plant is the model of a law with filters, and never the plant of a scenario.
-    - `at(t)` and `jump_times()`: as `iblf_jax.robots.Robot`.
     """
 
-    @property
-    def n(self) -> int:
-        """Numbers per level."""
-        ...
+    robot: Robot | None = None
+    """The robot inside a plant whose first two levels are its q and q'.  Disturbances, friction and
+    observers of robots then act on it, as the torque that is added to it."""
+    needs_filters: ClassVar[bool] = False
+    """Whether the drift depends on a later level whose derivatives no law may form.  Such a plant
+    is the model of a law with filters, and never the plant of a scenario."""
 
-    @property
+    @attribute
+    @abc.abstractmethod
     def order(self) -> int:
         """Number of levels r, at least 2."""
-        ...
 
+    @attribute
+    def units(self) -> tuple[Units, ...] | None:
+        """The units of the levels and of the input, order + 1 of them; None if they have none."""
+        return None
+
+    @attribute
+    def level_names(self) -> tuple[str, ...] | None:
+        """Names of the levels, for figures and tables; None for "level 1", "level 2", ..."""
+        return None
+
+    @attribute
+    def input_name(self) -> str:
+        """The name of the input, for figures and tables."""
+        return "input"
+
+    @attribute
+    def component_names(self) -> tuple[str, ...]:
+        """Names of the n components; () for those of the joints of `robot`, or for numbers."""
+        return ()
+
+    @abc.abstractmethod
     def drift(self, t: jax.Array, x: jax.Array) -> jax.Array:
         """f_1 ... f_r, (order, n), in the unit of each level per second.  Row i may depend on t and
         on x[0] ... x[i] only.
@@ -101,42 +92,82 @@ class Plant(Protocol):
           t: time, () [s].
           x: state, (order, n).
         """
-        ...
 
+    @abc.abstractmethod
     def gain(self, t: jax.Array, x: jax.Array) -> jax.Array:
         """G_1 ... G_r, (order, n, n), or (order, n) for diagonal gains; dependence as `drift`."""
-        ...
+
+    def level_rate(
+        self, level: int, t: jax.Array, x: jax.Array, above: jax.Array, torque: jax.Array | float
+    ) -> jax.Array:
+        """f_i + G_i above, (n,); a member may have a shorter formula than `drift` and `gain`.
+        `torque`, (n,) [N m], is added to a robot; 0.0 for none.
+        """
+        gain = _row(self.gain, t, x, level)
+        return _row(self.drift, t, x, level) + _times(gain, above)
+
+    def level_input(
+        self, level: int, t: jax.Array, x: jax.Array, rate: jax.Array, torque: jax.Array | float
+    ) -> jax.Array:
+        """The inverse of `level_rate`: the x_{i+1}, (n,), for which x_i' is `rate`."""
+        gain = _row(self.gain, t, x, level)
+        rest = rate - _row(self.drift, t, x, level)
+        if gain.ndim == 2:
+            return solve_gain(gain, rest)
+        # NaN, as `solve_gain` gives; a division by 0 would give an infinite input.
+        return rest / jnp.where(gain == 0.0, jnp.nan, gain)
+
+    def transposed_gain(self, level: int, t: jax.Array, x: jax.Array, s: jax.Array) -> jax.Array:
+        """G_i^T s, (n,)."""
+        return _times(_row(self.gain, t, x, level).T, s)
+
+    def outline(self, x1: jax.Array) -> jax.Array | None:
+        """Corners of the plant's shape in the plane at a first level, (k, 2) [m], for figures; the
+        first corner is drawn as its path.
+        """
+        return None
+
+    def rigid(self) -> Robot | None:
+        """The robot to which the plant tends in its rigid limit, such as that for a large
+        stiffness: the model of a law of robots, where it is not `robot`.
+        """
+        return None
+
+    def joint_torque(self, x: jax.Array, u: jax.Array) -> jax.Array | None:
+        """The torque on the joints of the robot, (n,) [N m]; None without a robot."""
+        return None
+
+    def steady_levels(self, q: jax.Array, dq: jax.Array) -> jax.Array | None:
+        """The levels from the third on, (order - 2, n), of a plant that starts with given q and q';
+        without it a start needs all levels, `Initial(x=...)`.
+        """
+        return None
+
+    def steady_input(self, q: jax.Array) -> jax.Array | None:
+        """The input that holds the plant at q, (n,)."""
+        return None
+
+    def weights(self, x: jax.Array) -> jax.Array | None:
+        """The scale of each level's energy, (order, n); `BarrierBackstepping` weighs its barriers
+        with it.
+        """
+        return None
+
+    def friction_torque(self, x: jax.Array) -> jax.Array | None:
+        """Of a plant with several robots inside, the friction of their joints, (n,) [N m], which
+        belongs to the plant only and is passed to `level_rate` as its torque.
+        """
+        return None
 
 
-plant_member = OptionalMembers(
-    units=None,
-    level_names=None,
-    input_name="input",
-    component_names=(),
-    outline=None,
-    robot=None,
-    rigid=None,
-    level_rate=None,
-    level_input=None,
-    transposed_gain=None,
-    joint_torque=None,
-    steady_levels=None,
-    steady_input=None,
-    weights=None,
-    nominal=None,
-    mode_draws=0,
-    switching=None,
-    friction_torque=None,
-    needs_filters=False,
-)
-"""Reads optional members of a plant."""
-
-
-def is_chain(part: Any) -> bool:
+def is_chain(part: Any) -> TypeGuard[Plant]:
     """Whether a part has the methods of a plant in strict-feedback form.  A robot has them only
-    inside a `Rigid`, which `as_plant` makes of it.
+    inside a `Rigid`, which `as_plant` makes of it.  A class without the base class is adopted.
     """
-    return has_members(part, "drift", "gain", "order")
+    if isinstance(part, type) or not has_members(part, "drift", "gain", "order"):
+        return False
+    adopt(type(part), Plant)
+    return True
 
 
 def order_of(part: Any) -> int:
@@ -148,20 +179,33 @@ def order_of(part: Any) -> int:
 
 def nominal_of(part: Any) -> Any:
     """The plant that laws know: the part itself, or the plant inside one with modes."""
-    return plant_member.variant(part, "nominal")
+    if is_chain(part) or is_robot(part):
+        return part.nominal
+    return part
+
+
+def has_modes(part: Any) -> bool:
+    """Whether a robot or a plant has results about its modes."""
+    return not is_default(part.switching, Dynamics.switching)
+
+
+def has_steady_levels(plant: Any) -> bool:
+    """Whether a plant states the levels of a start with given q and q'."""
+    rest = jnp.zeros(plant.n)
+    return jax.eval_shape(plant.steady_levels, rest, rest) is not None
 
 
 def robot_of(part: Any) -> Any:
     """The robot itself, the robot inside a plant, or None."""
     if is_chain(part):
-        return plant_member(part, "robot")
+        return part.robot
     return part
 
 
 def declared_joints(part: Any) -> tuple[str, ...]:
     """The names that a robot, or the robot inside a plant, gives its joints; () without names."""
     robot = robot_of(part)
-    return () if robot is None else tuple(robot_member(robot, "joints"))
+    return tuple(robot.joints) if is_robot(robot) else ()
 
 
 def level_rate(
@@ -182,11 +226,8 @@ def level_rate(
       above: x_{i+1}, or the input u for the last level, (n,).
       torque: added to the robot inside the plant, (n,) [N m]; 0.0 for none.
     """
-    own = plant_member(plant, "level_rate")
-    if own is not None:
-        return own(level, t, x, above, torque)  # type: ignore[no-any-return]
-    gain = _row(plant.gain, t, x, level)
-    return _row(plant.drift, t, x, level) + _times(gain, above)
+    adopt(type(plant), Plant)
+    return plant.level_rate(level, t, x, above, torque)
 
 
 def level_input(
@@ -200,15 +241,8 @@ def level_input(
     """G_i^-1 (rate - f_i) of a level, (n,): the inverse of `level_rate`.  A singular gain gives
     NaN.
     """
-    own = plant_member(plant, "level_input")
-    if own is not None:
-        return own(level, t, x, rate, torque)  # type: ignore[no-any-return]
-    gain = _row(plant.gain, t, x, level)
-    rest = rate - _row(plant.drift, t, x, level)
-    if gain.ndim == 2:
-        return solve_gain(gain, rest)
-    # NaN, as `solve_gain` gives; a division by 0 would give an infinite input.
-    return rest / jnp.where(gain == 0.0, jnp.nan, gain)
+    adopt(type(plant), Plant)
+    return plant.level_input(level, t, x, rate, torque)
 
 
 def gain_times(plant: Plant, level: int, t: jax.Array, x: jax.Array, v: jax.Array) -> jax.Array:
@@ -224,10 +258,8 @@ def transposed_gain(
     plant: Plant, level: int, t: jax.Array, x: jax.Array, s: jax.Array
 ) -> jax.Array:
     """G_i^T s of a level, (n,)."""
-    own = plant_member(plant, "transposed_gain")
-    if own is not None:
-        return own(level, t, x, s)  # type: ignore[no-any-return]
-    return _times(_row(plant.gain, t, x, level).T, s)
+    adopt(type(plant), Plant)
+    return plant.transposed_gain(level, t, x, s)
 
 
 def _row(
@@ -329,10 +361,9 @@ def units_of(part: Any) -> tuple[Units, ...]:
     """The units of the levels of a plant and of its input: order + 1 of them."""
     if not is_chain(part):
         return ("rad", "rad/s", "N m")
-    units = plant_member(part, "units")
-    if units is None:
+    if part.units is None:
         return ("1",) * (order_of(part) + 1)
-    return tuple(units)
+    return tuple(part.units)
 
 
 def unit_symbols(plant: Any, model: Any) -> Mapping[str, Unit]:
@@ -343,7 +374,7 @@ def unit_symbols(plant: Any, model: Any) -> Mapping[str, Unit]:
     if robot_of(plant) is None:
         torque = of_input
     energy: Unit = "1"
-    if robot_of(plant) is not None or plant_member(plant, "weights") is not None:
+    if robot_of(plant) is not None or not is_default(plant.weights, Plant.weights):
         energy = product(torque, levels[0])
     uncertain: Unit = rates if is_chain(model) else "N m"
     return {
@@ -363,16 +394,15 @@ def level_names(part: Any) -> tuple[str, ...]:
     """Names of the levels: those that the plant states, else "level 1", "level 2", ..."""
     if not is_chain(part):
         return ("position", "velocity")
-    own = plant_member(part, "level_names")
-    if own is None:
+    if part.level_names is None:
         return tuple(f"level {i + 1}" for i in range(order_of(part)))
-    return tuple(own)
+    return tuple(part.level_names)
 
 
 def input_name(part: Any) -> str:
     """The name of the input: "torque" of a robot."""
     if is_chain(part):
-        return str(plant_member(part, "input_name"))
+        return str(part.input_name)
     return "torque"
 
 
@@ -380,11 +410,8 @@ def component_names(part: Any) -> tuple[str, ...]:
     """Names of the n components of a level: those that the plant states, else those of the joints
     of the robot or of the robot inside the plant, else "component 0", "component 1", ...
     """
-    own: tuple[str, ...] = ()
-    if is_chain(part):
-        own = tuple(plant_member(part, "component_names"))
-    if own:
-        return own
+    if is_chain(part) and part.component_names:
+        return tuple(part.component_names)
     robot = robot_of(part)
     if robot is not None:
         return joint_names(robot, part.n)
@@ -418,14 +445,14 @@ def check_dimensions(name: str, plant: Plant) -> None:
     """Raises ValueError for numbers of components and levels that are no whole numbers, or units
     that do not fit them.
     """
+    adopt(type(plant), Plant)
     checks.positive_integer(f"{name}.n", plant.n, most=checks.MAX_JOINTS)
     checks.positive_integer(f"{name}.order", plant.order, least=2, most=MAX_ORDER)
-    _check_texts(f"{name}.level_names", plant_member(plant, "level_names"), plant.order)
-    _check_texts(f"{name}.component_names", plant_member(plant, "component_names") or None, plant.n)
-    given = plant_member(plant, "units")
-    if not isinstance(given, tuple | list | None):
+    _check_texts(f"{name}.level_names", plant.level_names, plant.order)
+    _check_texts(f"{name}.component_names", plant.component_names or None, plant.n)
+    if not isinstance(plant.units, tuple | list | None):
         expected = "a tuple of units, of every level and of the input"
-        raise checks.fail(f"{name}.units", given, expected)
+        raise checks.fail(f"{name}.units", plant.units, expected)
     units = units_of(plant)
     if len(units) != plant.order + 1:
         expected = f"{plant.order + 1} units, of {plant.order} levels and of the input"

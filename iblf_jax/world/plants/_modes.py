@@ -69,7 +69,7 @@ def _check_inner(owner: str, plant: Any) -> None:
     if is_chain(plant):
         checks.conforms(name, plant, Plant, "iblf_jax.plants has them.")
         return
-    checks.conforms(name, plant, Robot, "iblf_jax.robots has them.", ("skeleton",))
+    checks.conforms(name, plant, Robot, "iblf_jax.robots has them.")
 
 
 def _as_parameters(owner: str, plant: Any, parameters: Any) -> tuple[ModeValues, ...]:

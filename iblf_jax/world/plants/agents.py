@@ -29,7 +29,7 @@ import numpy as np
 
 from iblf_jax.core import checks, sparse
 from iblf_jax.core.pytree import component, static
-from iblf_jax.core.time import as_at, joined, jump_times_of
+from iblf_jax.core.time import joined, jump_times_of
 from iblf_jax.world.plants._base import (
     Plant,
     Units,
@@ -40,7 +40,6 @@ from iblf_jax.world.plants._base import (
     level_input,
     level_names,
     level_rate,
-    plant_member,
     robot_of,
     transposed_gain,
     units_of,
@@ -51,7 +50,7 @@ from iblf_jax.world.robots import friction_torque
 
 
 @component
-class Agents:
+class Agents(Plant):
     """y' = (H kron I) p',   the agents' own levels above,   y = (H kron I) p,   H = L + diag(b).
 
     A law for plants in strict-feedback form then bounds the consensus errors e = y - b kron x_0:
@@ -263,30 +262,15 @@ class Agents:
             parts.append(jnp.zeros_like(dq) if robot is None else friction_torque(robot, dq))
         return jnp.concatenate(parts)
 
-    @property
-    def steady_levels(self) -> Callable[[jax.Array, jax.Array], jax.Array] | None:
+    def steady_levels(self, q: jax.Array, dq: jax.Array) -> jax.Array | None:
         """The agents' levels from the third on for given y and v; None where one has no method."""
-        return self._steady("steady_levels", axis=1)
+        states = zip(self.agents, self._positions(q), self._parts(dq), strict=True)
+        return _joined([agent.steady_levels(p, v) for agent, p, v in states], axis=1)
 
-    @property
-    def steady_input(self) -> Callable[[jax.Array], jax.Array] | None:
+    def steady_input(self, q: jax.Array) -> jax.Array | None:
         """The input that holds the agents at y; None where one has no method."""
-        return self._steady("steady_input", axis=0)
-
-    def _steady(self, name: str, axis: int) -> Callable[..., jax.Array] | None:
-        """A method of the agents, called with their q, or q and q', as a method of the stack; None
-        where an agent does not have it.
-        """
-        methods = [plant_member(agent, name) for agent in self.agents]
-        if None in methods:
-            return None
-
-        def of_stack(y: jax.Array, *rates: jax.Array) -> jax.Array:
-            given = zip(self._positions(y), *map(self._parts, rates), strict=True)
-            parts = [method(*own) for method, own in zip(methods, given, strict=True)]
-            return jnp.concatenate(parts, axis=axis)
-
-        return of_stack
+        states = zip(self.agents, self._positions(q), strict=True)
+        return _joined([agent.steady_input(p) for agent, p in states], axis=0)
 
     def weights(self, x: jax.Array) -> jax.Array:
         """The scales of the agents' energies, (order, n), that of y divided by H_ii^2: with p_i
@@ -294,14 +278,15 @@ class Agents:
         """
         columns = []
         for i, (agent, z) in enumerate(zip(self.agents, self._states(x), strict=True)):
-            own = plant_member(agent, "weights")
-            scale = jnp.ones_like(z) if own is None else own(z)
+            scale = agent.weights(z)
+            if scale is None:
+                scale = jnp.ones_like(z)
             columns.append(jnp.concatenate([scale[:1] / self.matrix[i][i] ** 2, scale[1:]]))
         return jnp.concatenate(columns, axis=1)
 
     def at(self, t: jax.Array) -> Agents:
         """The agents at time t [s]."""
-        return dataclasses.replace(self, agents=tuple(as_at(agent, t) for agent in self.agents))
+        return dataclasses.replace(self, agents=tuple(agent.at(t) for agent in self.agents))
 
     def jump_times(self) -> jax.Array:
         """The times at which an agent jumps, (m,) [s]."""
@@ -310,7 +295,7 @@ class Agents:
 
 
 @component
-class NeighbourModel:
+class NeighbourModel(Plant):
     """y_i' = (d_i + b_i) p_i' - sum_j a_ij p_j',   with the neighbours' p_j' as measured signals.
 
     The model of a distributed law: its motion is that of `Agents`, but only agent i's own velocity
@@ -431,8 +416,8 @@ class NeighbourModel:
 
     def steady_input(self, q: jax.Array) -> jax.Array:
         """The input that holds the agents at y, (n,); 0 if an agent has no such method."""
-        of_stack = self.stack.steady_input
-        return jnp.zeros_like(q) if of_stack is None else of_stack(q)
+        of_stack = self.stack.steady_input(q)
+        return jnp.zeros_like(q) if of_stack is None else of_stack
 
     def weights(self, x: jax.Array) -> jax.Array:
         """As `Agents.weights`."""
@@ -492,6 +477,14 @@ def _check_reached(adjacency: np.ndarray, leader: np.ndarray) -> None:
 
 def _transposed(matrix: sparse.Rows) -> sparse.Rows:
     return tuple(zip(*matrix, strict=True))
+
+
+def _joined(parts: list[jax.Array | None], axis: int) -> jax.Array | None:
+    """The parts of all agents in one array; None where one is missing."""
+    known = [part for part in parts if part is not None]
+    if len(known) < len(parts):
+        return None
+    return jnp.concatenate(known, axis=axis)
 
 
 def _full_gain(gain: jax.Array) -> jax.Array:

@@ -8,11 +8,11 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.core.pytree import Leaf, component, leaf
-from iblf_jax.world.plants._base import EXCHANGE_RATE
+from iblf_jax.world.plants._base import EXCHANGE_RATE, Plant
 
 
 @component
-class DrivenPendulum:
+class DrivenPendulum(Plant):
     """x1' = x2,   D x2' = x3 - B x2 - N sin x1,   M x3' = u - H x3 - Km x2.
 
     The levels are the angle, the angular velocity and the torque of the motor; u is its voltage.

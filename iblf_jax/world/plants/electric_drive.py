@@ -11,8 +11,8 @@ import jax.numpy as jnp
 from iblf_jax.core import checks
 from iblf_jax.core.linalg import solve_spd
 from iblf_jax.core.pytree import Leaf, component, leaf
-from iblf_jax.core.time import as_at, jump_times_of
-from iblf_jax.world.plants._base import EXCHANGE_RATE
+from iblf_jax.core.time import jump_times_of
+from iblf_jax.world.plants._base import EXCHANGE_RATE, Plant
 from iblf_jax.world.plants.rigid import (
     diagonal_inertia,
     inverse_mass_matrix,
@@ -22,7 +22,7 @@ from iblf_jax.world.robots import Robot, inverse_dynamics
 
 
 @component
-class ElectricDrive:
+class ElectricDrive(Plant):
     """M(q) q" + C(q, q') q' + G(q) = Kt i,   L i' = u - R i - Kb q'.
 
     The levels are q, q' and the currents i; u is the voltage.  All quantities of the motors are
@@ -50,9 +50,7 @@ class ElectricDrive:
 
     def check(self) -> None:
         """Raises ValueError for something that is no robot."""
-        checks.conforms(
-            "ElectricDrive.robot", self.robot, Robot, "iblf_jax.robots has them.", ("skeleton",)
-        )
+        checks.conforms("ElectricDrive.robot", self.robot, Robot, "iblf_jax.robots has them.")
 
     @property
     def n(self) -> int:
@@ -131,7 +129,7 @@ class ElectricDrive:
 
     def at(self, t: jax.Array) -> ElectricDrive:
         """The plant at time t [s], with the robot as it is then."""
-        return dataclasses.replace(self, robot=as_at(self.robot, t))
+        return dataclasses.replace(self, robot=self.robot.at(t))
 
     def jump_times(self) -> jax.Array:
         """The times at which the robot jumps, (m,) [s]."""

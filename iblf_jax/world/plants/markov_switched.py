@@ -11,7 +11,7 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf, static
-from iblf_jax.core.time import as_at, joined, jump_times_of
+from iblf_jax.core.time import joined, jump_times_of
 from iblf_jax.world.plants._modes import (
     NEVER,
     ModeValues,
@@ -65,6 +65,7 @@ class MarkovSwitched:
     times: Leaf = leaf("s", sign="positive", shape="any", default=None)
     sequence: Leaf = leaf("1", sign="nonnegative", shape="any", default=None)
     wraps: ClassVar[str] = "plant"
+    geometry_fields: ClassVar[tuple[str, ...]] = ()
     __getattr__ = member_of_inner
 
     def check(self) -> None:
@@ -147,7 +148,7 @@ class MarkovSwitched:
         plant = self.plant
         for part in self.parameters:
             plant = changed(plant, part.path, value_of_mode(part.values, mode))
-        return as_at(plant, t)
+        return plant.at(t)
 
     def jump_times(self) -> jax.Array:
         """The switching times and those of the inner plant, (m,) [s]."""

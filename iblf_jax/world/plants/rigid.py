@@ -11,12 +11,13 @@ import jax.numpy as jnp
 from iblf_jax.core import checks
 from iblf_jax.core.linalg import solve_spd
 from iblf_jax.core.pytree import component
-from iblf_jax.core.time import as_at, jump_times_of
+from iblf_jax.core.time import jump_times_of
+from iblf_jax.world.plants._base import Plant
 from iblf_jax.world.robots import Robot, inverse_dynamics
 
 
 @component
-class Rigid:
+class Rigid(Plant):
     """q' = x_2,   M(q) x_2' + C(q, x_2) x_2 + G(q) = u,   x = (q, q').
 
     A scenario takes robots as they are; this class gives a robot the methods of a plant.
@@ -35,9 +36,7 @@ class Rigid:
 
     def check(self) -> None:
         """Raises ValueError for something that is no robot."""
-        checks.conforms(
-            "Rigid.robot", self.robot, Robot, "iblf_jax.robots has them.", ("skeleton",)
-        )
+        checks.conforms("Rigid.robot", self.robot, Robot, "iblf_jax.robots has them.")
 
     @property
     def n(self) -> int:
@@ -91,7 +90,7 @@ class Rigid:
 
     def at(self, t: jax.Array) -> Rigid:
         """The plant at time t [s], with the robot as it is then."""
-        return dataclasses.replace(self, robot=as_at(self.robot, t))
+        return dataclasses.replace(self, robot=self.robot.at(t))
 
     def jump_times(self) -> jax.Array:
         """The times at which the robot jumps, (m,) [s]."""

@@ -8,11 +8,11 @@ import jax
 
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import component, static
-from iblf_jax.world.plants._base import Units, check_dimensions
+from iblf_jax.world.plants._base import Plant, Units, check_dimensions
 
 
 @component
-class StrictFeedback:
+class StrictFeedback(Plant):
     """x_i' = drift_i(t, x) + gain_i(t, x) x_{i+1},   i = 1..order,   x_{order+1} = u.     (S.1)
 
     The functions are structure: a new pair compiles anew.  A plant whose numbers are to be swept,
@@ -36,8 +36,8 @@ class StrictFeedback:
       1995, chapter 2.
     """
 
-    drift: Callable[[jax.Array, jax.Array], jax.Array] = static()
-    gain: Callable[[jax.Array, jax.Array], jax.Array] = static()
+    drift: Callable[[jax.Array, jax.Array], jax.Array] = static()  # type: ignore[assignment]
+    gain: Callable[[jax.Array, jax.Array], jax.Array] = static()  # type: ignore[assignment]
     n: int = static()
     order: int = static()
     units: tuple[Units, ...] | None = static(default=None)

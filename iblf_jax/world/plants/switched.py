@@ -8,7 +8,7 @@ import jax
 
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf
-from iblf_jax.core.time import as_at, joined, jump_times_of
+from iblf_jax.core.time import joined, jump_times_of
 from iblf_jax.world.plants._modes import (
     ModeValues,
     RobotOrPlant,
@@ -43,6 +43,7 @@ class Switched:
     parameters: tuple[ModeValues, ...]
     times: Leaf = leaf("s", sign="positive", shape="any")
     wraps: ClassVar[str] = "plant"
+    geometry_fields: ClassVar[tuple[str, ...]] = ()
     __getattr__ = member_of_inner
 
     def check(self) -> None:
@@ -64,7 +65,7 @@ class Switched:
         plant = self.plant
         for part in self.parameters:
             plant = changed(plant, part.path, piecewise_constant(part.values, self.times, t))
-        return as_at(plant, t)
+        return plant.at(t)
 
     def jump_times(self) -> jax.Array:
         """The switching times and those of the inner plant, (m,) [s]."""

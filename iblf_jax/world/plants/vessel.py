@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from iblf_jax.core import checks
 from iblf_jax.core.linalg import matvec, solve_spd
 from iblf_jax.core.pytree import Leaf, component, leaf
-from iblf_jax.world.plants._base import Units
+from iblf_jax.world.plants._base import Plant, Units
 
 EXCHANGE_RATE = 0.1
 """Square of the frequency at which the levels exchange energy in the default weights [1/s^2]: slow
@@ -19,7 +19,7 @@ of its length, and needs weights of its own."""
 
 
 @component
-class Vessel:
+class Vessel(Plant):
     """eta' = R(psi) nu,   M nu' + C(nu) nu + D(nu) nu = u   (3 degrees of freedom).
 
     The levels are eta = (north, east, heading psi) and nu = (surge u, sway v, yaw rate r) in the

@@ -1,10 +1,9 @@
-"""Process noise: white noise on levels of the plant.  The contract is the
-protocol `ProcessNoise`.
+"""Process noise: white noise on levels of the plant.  The contract is
+`ProcessNoise`.
 """
 
 from iblf_jax.world.process_noise._base import ProcessNoise as ProcessNoise
 from iblf_jax.world.process_noise._base import check_structure as check_structure
-from iblf_jax.world.process_noise._base import noise_member as noise_member
 from iblf_jax.world.process_noise.additive import Additive as Additive
 from iblf_jax.world.process_noise.diffusion import Diffusion as Diffusion
 from iblf_jax.world.process_noise.proportional import Proportional as Proportional
@@ -23,5 +22,4 @@ __all__ = [
     "ProcessNoise",
     "Proportional",
     "check_structure",
-    "noise_member",
 ]

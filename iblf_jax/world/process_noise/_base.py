@@ -9,34 +9,41 @@ state that they receive.
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+import abc
+from typing import Any
 
 import jax
 
 from iblf_jax.core import checks
-from iblf_jax.core.optional import OptionalMembers
+from iblf_jax.core.families import Part, adopt, attribute
 from iblf_jax.core.units import ByLevel, PlantUnit
 
 MOST_SUBSTEPS = 1024
 """Largest `substeps`; the compiled step contains the code of each increment."""
 
 
-class ProcessNoise(Protocol):
-    """The contract of process noise.  All methods are pure functions of one state.
+class ProcessNoise(Part):
+    """The contract of process noise.  All methods are pure functions of one state."""
 
-    A member may have further attributes; `noise_member` holds their defaults.
-
-    - `additive`: whether `diffusion` does not depend on x.  Methods of strong order 1 need it.
-    - `substeps`: the increment of a step is the sum of this number of independent increments.  Runs
-      whose time steps are in the ratio of their `substeps` have the same Brownian path at their
-      common instants.
-    """
-
-    @property
+    @attribute
+    @abc.abstractmethod
     def levels(self) -> tuple[int, ...]:
         """The levels with noise, counted from 1; m of them."""
-        ...
 
+    @attribute
+    def additive(self) -> bool:
+        """Whether `diffusion` does not depend on x.  Methods of strong order 1 need it."""
+        return False
+
+    @attribute
+    def substeps(self) -> int:
+        """The increment of a step is the sum of this number of independent increments.  Runs whose
+        time steps are in the ratio of their `substeps` have the same Brownian path at their common
+        instants.
+        """
+        return 1
+
+    @abc.abstractmethod
     def diffusion(self, t: jax.Array, x: jax.Array) -> jax.Array:
         """The intensity sigma of each level with noise, (m, n), in the unit of the level per
         sqrt(s).
@@ -45,17 +52,13 @@ class ProcessNoise(Protocol):
           t: time, () [s].
           x: state of the plant, (r, n); of a robot q and q'.
         """
-        ...
-
-
-noise_member = OptionalMembers(additive=False, substeps=1)
-"""Reads optional members of process noise."""
 
 
 def check_structure(noise: Any) -> None:
     """Raises ValueError for levels that are not increasing whole numbers >= 1, or `substeps` that
     is not a whole number from 1 to `MOST_SUBSTEPS`.
     """
+    adopt(type(noise), ProcessNoise)
     name = type(noise).__name__
     levels = noise.levels
     if not isinstance(levels, tuple | list) or not levels:
@@ -65,8 +68,7 @@ def check_structure(noise: Any) -> None:
         checks.positive_integer(f"{name}.levels", level)
     if list(levels) != sorted(set(levels)):
         raise checks.fail(f"{name}.levels", levels, "increasing numbers of levels")
-    substeps = noise_member(noise, "substeps")
-    checks.positive_integer(f"{name}.substeps", substeps, most=MOST_SUBSTEPS)
+    checks.positive_integer(f"{name}.substeps", noise.substeps, most=MOST_SUBSTEPS)
 
 
 def intensity_unit(levels: tuple[int, ...], of_state: bool = True) -> ByLevel:

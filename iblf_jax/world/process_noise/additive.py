@@ -8,11 +8,16 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.core.pytree import Leaf, component, leaf, static
-from iblf_jax.world.process_noise._base import check_rows, check_structure, intensity_unit
+from iblf_jax.world.process_noise._base import (
+    ProcessNoise,
+    check_rows,
+    check_structure,
+    intensity_unit,
+)
 
 
 @component
-class Additive:
+class Additive(ProcessNoise):
     """sigma_i = intensity_i: white noise whose size depends neither on the time nor on the state.
 
     Args:

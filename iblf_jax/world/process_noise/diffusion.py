@@ -8,11 +8,11 @@ import jax
 
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import component, static
-from iblf_jax.world.process_noise._base import check_structure
+from iblf_jax.world.process_noise._base import ProcessNoise, check_structure
 
 
 @component
-class Diffusion:
+class Diffusion(ProcessNoise):
     """sigma = diffusion(t, x): white noise whose intensity varies with the time or the state.
 
     The function is part of the structure: a run with another function is compiled again.  To sweep
@@ -30,7 +30,7 @@ class Diffusion:
       section 4.8.
     """
 
-    diffusion: Callable[[jax.Array, jax.Array], jax.Array] = static()
+    diffusion: Callable[[jax.Array, jax.Array], jax.Array] = static()  # type: ignore[assignment]
     levels: tuple[int, ...] = static(default=(2,))
     additive: bool = static(default=False)
     substeps: int = static(default=1)

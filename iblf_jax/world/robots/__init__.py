@@ -1,7 +1,9 @@
 """Robots: the plant that moves and the model that the law knows.  The contract is the
-protocol `Robot`.
+base class `Robot`.
 """
 
+from iblf_jax.world.robots._base import Dynamics as Dynamics
+from iblf_jax.world.robots._base import Limits as Limits
 from iblf_jax.world.robots._base import Robot as Robot
 from iblf_jax.world.robots._base import at_time as at_time
 from iblf_jax.world.robots._base import coriolis_from_mass_matrix as coriolis_from_mass_matrix
@@ -13,7 +15,6 @@ from iblf_jax.world.robots._base import joint_names as joint_names
 from iblf_jax.world.robots._base import mass_matrix_rate as mass_matrix_rate
 from iblf_jax.world.robots._base import momentum as momentum
 from iblf_jax.world.robots.arm import Arm as Arm
-from iblf_jax.world.robots.arm import Limits as Limits
 from iblf_jax.world.robots.arm import Pose as Pose
 from iblf_jax.world.robots.load import load as load
 from iblf_jax.world.robots.payload import Payload as Payload

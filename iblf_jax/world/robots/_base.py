@@ -8,14 +8,15 @@ Christoffel symbols,
     C(q, v) u = 1/2 [ (dM/dq . v) u + (dM/dq . u) v - d/dq (u^T M v) ],
 
 which makes M' - 2 C skew-symmetric, the property that the proofs of all laws here rest on.
-`from_energy` adds these methods to a class that has the energies; a class with closed forms
-(`TwoLink`) or a recursion writes its own.
+`Robot` has these methods for a class that has the energies; a class with closed forms (`TwoLink`)
+or a recursion writes its own.
 """
 
 from __future__ import annotations
 
+import abc
 from collections.abc import Iterable
-from typing import Any, Protocol, TypeVar
+from typing import Any, ClassVar, NamedTuple, Self, TypeGuard, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -24,14 +25,51 @@ import numpy as np
 from iblf_jax.core import checks
 from iblf_jax.core.attributes import attributes, has_members
 from iblf_jax.core.disk_cache import keep_programs
+from iblf_jax.core.families import adopt, attribute
 from iblf_jax.core.linalg import inner, matvec
-from iblf_jax.core.optional import OptionalMembers
-from iblf_jax.core.time import as_at
+from iblf_jax.core.time import TimeVarying
 
 T = TypeVar("T")
+R = TypeVar("R", bound="Robot")
 
 
-class Robot(Protocol):
+class Limits(NamedTuple):
+    """Ranges of the joints, (n,) each [rad or m]; infinite where a joint has none."""
+
+    lower: jax.Array
+    upper: jax.Array
+
+
+class Dynamics(TimeVarying):
+    """The base of robots and of plants in strict-feedback form."""
+
+    mode_draws: ClassVar[int] = 0
+    """How many pairs of random numbers give the modes of a run."""
+
+    @attribute
+    @abc.abstractmethod
+    def n(self) -> int:
+        """Number of joints, or numbers per level."""
+
+    @attribute
+    def nominal(self) -> Any:
+        """The plant whose parameters do not change, for one with modes; it is the default model."""
+        return self
+
+    def with_path(self, uniforms: jax.Array) -> Self:
+        """The plant with the modes of a run, from `mode_draws` pairs of random numbers."""
+        return self
+
+    def switching(self, end: jax.Array) -> dict[str, jax.Array]:
+        """Results about the modes of a run that ends at this time [s], by name."""
+        return {}
+
+    def has_complete_path(self, end: jax.Array) -> jax.Array:
+        """Whether all switches until this time [s] are known, () bool."""
+        return end >= 0
+
+
+class Robot(Dynamics):
     """The contract of a robot with n joints.  All methods are pure functions of one configuration,
     in SI units.
 
@@ -39,74 +77,106 @@ class Robot(Protocol):
     [kg], a point mass at the tip, is one of them in every member, so that any robot can carry what
     its model does not know.
 
-    A member may have further methods (`robot_member` holds their defaults).  `at(t)` returns the
-    robot as it is at time t [s], for one that changes during a run; `jump_times()`, (m,) [s], are
-    the times at which it jumps, where steps of a run are divided.  `friction_torque(dq)`, (n,)
-    [N m], is the friction of its joints.  These belong to the plant only: law and observer do not
-    know them, and (2.1) has them in f.  `energy_gradient(q, v)`, `momentum(q, v)` and
-    `inverse_dynamics(q, v, u, acceleration)` replace the general formulas of the functions of
-    these names where a member has shorter ones, such as sums along a chain.  A class may name its
-    `geometry_fields`, a tuple of fields whose zeros, ones and equal numbers may be compiled in
-    (`engine.structural_constants`).
+    Friction and changes with time (`friction_torque`, `at`, `jump_times`) belong to the plant only:
+    law and observer do not know them, and (2.1) has them in f.
     """
 
-    @property
-    def n(self) -> int:
-        """Number of joints."""
-        ...
+    geometry_fields: ClassVar[tuple[str, ...]] = ()
+    """Fields whose zeros, ones and equal numbers may be compiled in
+    (`engine.structural_constants`)."""
 
+    @attribute
+    def joints(self) -> tuple[str, ...]:
+        """Names of the joints, (n,); () without names."""
+        return ()
+
+    @attribute
+    def kinds(self) -> tuple[str, ...] | None:
+        """Kinds of the joints, "revolute" or "prismatic", (n,); None if all are revolute."""
+        return None
+
+    @attribute
+    def limits(self) -> Limits | None:
+        """The joints' ranges; None if the robot states none."""
+        return None
+
+    @attribute
+    def speed(self) -> jax.Array | None:
+        """Largest speeds of the joints, (n,) [rad/s]; None if the robot states none."""
+        return None
+
+    @attribute
+    def effort(self) -> jax.Array | None:
+        """Largest torques of the joints, (n,) [N m]; None if the robot states none."""
+        return None
+
+    @abc.abstractmethod
     def mass_matrix(self, q: jax.Array) -> jax.Array:
         """M(q), symmetric positive definite, (n, n) [kg m^2]."""
-        ...
 
     def coriolis(self, q: jax.Array, v: jax.Array, u: jax.Array) -> jax.Array:
         """C(q, v) u, (n,) [N m], with M' - 2 C skew-symmetric; v and u are (n,) [rad/s]."""
-        ...
+        return coriolis_from_mass_matrix(self.mass_matrix, q, v, u)
 
     def gravity(self, q: jax.Array) -> jax.Array:
         """G(q) = dU/dq, (n,) [N m]."""
-        ...
+        return jax.grad(self.potential)(q)
 
+    @abc.abstractmethod
     def potential(self, q: jax.Array) -> jax.Array:
         """U(q), () [J]."""
-        ...
 
+    @abc.abstractmethod
     def tip(self, q: jax.Array) -> jax.Array:
         """Position of the tip, (2,) or (3,) [m]."""
-        ...
 
     def jacobian(self, q: jax.Array) -> jax.Array:
         """D tip / dq, (2, n) or (3, n) [m/rad]."""
-        ...
+        return jax.jacfwd(self.tip)(q)
 
-    def skeleton(self, q: jax.Array) -> jax.Array:
-        """Positions of the base, each joint and the tip, (n + 1, 2) or (n + 1, 3) [m]; for
-        drawings.
+    def skeleton(self, q: jax.Array) -> jax.Array | None:
+        """Positions of the base, each joint and the tip, (n + 1, 2) or (n + 1, 3) [m], for
+        drawings; None for a robot that is not drawn.
         """
-        ...
+        return None
+
+    def friction_torque(self, dq: jax.Array) -> jax.Array:
+        """Friction torque of the joints, (n,) [N m], opposite to q'."""
+        return jnp.zeros_like(dq)
+
+    def energy_gradient(self, q: jax.Array, v: jax.Array) -> jax.Array:
+        """dT/dq with T = 1/2 v^T M(q) v, (n,) [N m]: C(q, v)^T v = M' v - C(q, v) v."""
+        return matvec(mass_matrix_rate(self, q, v), v) - self.coriolis(q, v, v)
+
+    def momentum(self, q: jax.Array, v: jax.Array) -> jax.Array:
+        """M(q) v, (n,) [N m s]."""
+        return matvec(self.mass_matrix(q), v)
+
+    def inverse_dynamics(
+        self, q: jax.Array, v: jax.Array, u: jax.Array, acceleration: jax.Array
+    ) -> jax.Array:
+        """C(q, v) u + G + M acceleration, (n,) [N m]."""
+        coriolis, gravity = self.coriolis(q, v, u), self.gravity(q)
+        return coriolis + gravity + matvec(self.mass_matrix(q), acceleration)
 
 
-robot_member = OptionalMembers(
-    joints=(),
-    kinds=None,
-    limits=None,
-    speed=None,
-    effort=None,
-    skeleton=None,
-    geometry_fields=(),
-    friction_torque=jnp.zeros_like,
-    energy_gradient=None,
-    momentum=None,
-    inverse_dynamics=None,
-)
-"""Reads optional members of a robot: those that `Robot` describes, and the names, kinds and limits
-of joints that a robot from a file has."""
+def is_robot(part: Any) -> TypeGuard[Robot]:
+    """Whether an object has a mass matrix.  A class without the base class is adopted."""
+    if isinstance(part, type) or not has_members(part, "n", "mass_matrix"):
+        return False
+    adopt(type(part), Robot)
+    return True
 
 
-def at_time(robot: T, t: jax.Array) -> T:
-    """The robot as it is at time t [s]: itself, unless it has a method `at`."""
-    _is_robot(robot)
-    return as_at(robot, t)
+def _check_robot(robot: Any) -> None:
+    if not is_robot(robot):
+        checks.offers("robot", robot, ("n", "mass_matrix"), "a robot, as iblf_jax.robots.Robot")
+
+
+def at_time(robot: R, t: jax.Array) -> R:
+    """The robot as it is at time t [s]."""
+    _check_robot(robot)
+    return robot.at(t)
 
 
 @jax.jit
@@ -130,8 +200,9 @@ def friction_torque(robot: Robot, dq: jax.Array) -> jax.Array:
     """Friction torque of the joints, (n,) [N m], opposite to q'; zero unless the robot has a method
     of this name.
     """
+    _check_robot(robot)
     (dq,) = checks.vectors(dq=dq)
-    return robot_member(robot, "friction_torque")(dq)  # type: ignore[no-any-return]
+    return robot.friction_torque(dq)
 
 
 def coriolis_from_mass_matrix(mass_matrix, q: jax.Array, v: jax.Array, u: jax.Array) -> jax.Array:
@@ -165,64 +236,49 @@ def coriolis_from_mass_matrix(mass_matrix, q: jax.Array, v: jax.Array, u: jax.Ar
 def joint_names(robot: Any, n: int) -> tuple[str, ...]:
     """Names of the n joints of a robot: its `joints`, else "joint 0", "joint 1", ..."""
     n = checks.positive_integer("n", n, least=0, most=checks.MAX_JOINTS)
-    names = tuple(map(str, robot_member(robot, "joints")))
-    if len(names) == n:
-        return names
+    if is_robot(robot) and len(robot.joints) == n:
+        return tuple(map(str, robot.joints))
     return tuple(f"joint {i}" for i in range(n))
 
 
 def mass_matrix_rate(robot: Robot, q: jax.Array, dq: jax.Array) -> jax.Array:
     """M'(q) = dM/dq . q', (n, n) [kg m^2/s], by jvp."""
-    _is_robot(robot)
+    _check_robot(robot)
     q, dq = checks.vectors(robot.n, q=q, dq=dq)
     return jax.jvp(robot.mass_matrix, (q,), (dq,))[1]
-
-
-def _is_robot(robot: Any) -> None:
-    checks.offers("robot", robot, ("n", "mass_matrix"), "a robot, as iblf_jax.robots.Robot")
 
 
 def energy_gradient(robot: Robot, q: jax.Array, v: jax.Array) -> jax.Array:
     """dT/dq with T = 1/2 v^T M(q) v, (n,) [N m]: C(q, v)^T v = M' v - C(q, v) v, by the robot's own
     method if it has one.
     """
-    _is_robot(robot)
+    _check_robot(robot)
     q, v = checks.vectors(robot.n, q=q, v=v)
-    own_method = robot_member(robot, "energy_gradient")
-    if own_method is not None:
-        return own_method(q, v)  # type: ignore[no-any-return]
-    return matvec(mass_matrix_rate(robot, q, v), v) - robot.coriolis(q, v, v)
+    return robot.energy_gradient(q, v)
 
 
 def momentum(robot: Robot, q: jax.Array, v: jax.Array) -> jax.Array:
     """M(q) v, (n,) [N m s], by the robot's own method if it has one."""
-    _is_robot(robot)
+    _check_robot(robot)
     q, v = checks.vectors(robot.n, q=q, v=v)
-    own_method = robot_member(robot, "momentum")
-    if own_method is not None:
-        return own_method(q, v)  # type: ignore[no-any-return]
-    return matvec(robot.mass_matrix(q), v)
+    return robot.momentum(q, v)
 
 
 def inverse_dynamics(
     robot: Robot, q: jax.Array, v: jax.Array, u: jax.Array, acceleration: jax.Array
 ) -> jax.Array:
     """C(q, v) u + G + M acceleration, (n,) [N m], by the robot's own method if it has one."""
-    _is_robot(robot)
+    _check_robot(robot)
     is_velocity = u is v
     q, v, u, acceleration = checks.vectors(robot.n, q=q, v=v, u=u, acceleration=acceleration)
     if is_velocity:  # a robot may have a shorter form for one object
         u = v
-    own_method = robot_member(robot, "inverse_dynamics")
-    if own_method is not None:
-        return own_method(q, v, u, acceleration)  # type: ignore[no-any-return]
-    coriolis, gravity = robot.coriolis(q, v, u), robot.gravity(q)
-    return coriolis + gravity + matvec(robot.mass_matrix(q), acceleration)
+    return robot.inverse_dynamics(q, v, u, acceleration)
 
 
 def from_energy(cls: type[T]) -> type[T]:
     """Class decorator: adds `coriolis`, `gravity` and `jacobian` to a robot that has `mass_matrix`,
-    `potential`, `tip`.
+    `potential`, `tip`, as `Robot` does for the classes that inherit from it.
 
     Methods that the class already has are kept.  Apply it below `component`:
 
@@ -238,11 +294,8 @@ def from_energy(cls: type[T]) -> type[T]:
         raise checks.fail(
             "from_energy", cls, "a class", "Write @iblf_jax.robots.from_energy above it."
         )
-    missing = [
-        source
-        for method, source in sources.items()
-        if not has_members(cls, method) and not has_members(cls, source)
-    ]
+    derived = [method for method in sources if not has_members(cls, method)]
+    missing = [sources[method] for method in derived if not has_members(cls, sources[method])]
     if missing:
         raise checks.fail(
             "from_energy",
@@ -250,22 +303,8 @@ def from_energy(cls: type[T]) -> type[T]:
             "a class with mass_matrix(q), potential(q) and tip(q)",
             f"It lacks {', '.join(missing)}.",
         )
-
-    def coriolis(self, q, v, u):
-        """C(q, v) u, (n,) [N m], from M(q) by automatic differentiation."""
-        return coriolis_from_mass_matrix(self.mass_matrix, q, v, u)
-
-    def gravity(self, q):
-        """G(q) = dU/dq, (n,) [N m], by automatic differentiation."""
-        return jax.grad(self.potential)(q)
-
-    def jacobian(self, q):
-        """D tip / dq [m/rad], by automatic differentiation."""
-        return jax.jacfwd(self.tip)(q)
-
-    for method in (coriolis, gravity, jacobian):
-        if not has_members(cls, method.__name__):
-            setattr(cls, method.__name__, method)
+    for method in derived:
+        setattr(cls, method, vars(Robot)[method])
     return cls
 
 

@@ -38,18 +38,11 @@ from iblf_jax.core.attributes import attributes
 from iblf_jax.core.linalg import sums_from, sums_to, symmetric
 from iblf_jax.core.pytree import Leaf, component, leaf, static
 from iblf_jax.world.robots import spatial
-from iblf_jax.world.robots._base import broadcast_fields
+from iblf_jax.world.robots._base import Limits, Robot, broadcast_fields
 from iblf_jax.world.robots.payload import Payload
 
 KINDS = ("revolute", "prismatic")
 """Kinds of joints; a continuous joint is a revolute one with infinite limits."""
-
-
-class Limits(NamedTuple):
-    """Ranges of the joints, (n,) each [rad or m]; infinite where a joint has none."""
-
-    lower: jax.Array
-    upper: jax.Array
 
 
 class Pose(NamedTuple):
@@ -83,7 +76,7 @@ NUMBERS_OF_A_JOINT = (
 
 
 @component
-class Arm:
+class Arm(Robot):
     """Serial arm in space with n revolute or prismatic joints; all its parameters are leaves, one
     row a link.
 

@@ -34,7 +34,7 @@ from iblf_jax.core import checks
 from iblf_jax.core.attributes import attributes
 from iblf_jax.core.linalg import inner, sums_from, sums_to, symmetric
 from iblf_jax.core.pytree import Leaf, component, leaf
-from iblf_jax.world.robots._base import broadcast_fields, from_energy, planar_skeleton
+from iblf_jax.world.robots._base import Robot, broadcast_fields, planar_skeleton
 
 
 class Lumped(NamedTuple):
@@ -70,8 +70,7 @@ def _along_and_across(q: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 @component
-@from_energy
-class PlanarChain:
+class PlanarChain(Robot):
     """Planar arm with n revolute links; all its parameters are leaves.
 
     Args:

@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.core.pytree import Leaf, component, leaf
-from iblf_jax.world.robots._base import broadcast_fields, planar_skeleton
+from iblf_jax.world.robots._base import Robot, broadcast_fields, planar_skeleton
 
 
 class LumpedParameters(NamedTuple):
@@ -36,7 +36,7 @@ class LumpedParameters(NamedTuple):
 
 
 @component
-class TwoLink:
+class TwoLink(Robot):
     """Planar two-link arm; all its parameters are leaves.
 
     Args:

@@ -10,19 +10,12 @@ import jax.numpy as jnp
 
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf
-from iblf_jax.core.time import as_at, jump_times_of
-from iblf_jax.world.robots._base import (
-    Robot,
-    energy_gradient,
-    friction_torque,
-    inverse_dynamics,
-    momentum,
-    robot_member,
-)
+from iblf_jax.core.time import jump_times_of
+from iblf_jax.world.robots._base import Limits, Robot
 
 
 @component
-class WithMotors:
+class WithMotors(Robot):
     """(M(q) + diag(J)) q" + C(q, q') q' + G(q) = tau - D q' + friction of the robot.
 
     Each motor turns with its joint.  Gyroscopic torques of the rotors are neglected, so that C and
@@ -45,9 +38,7 @@ class WithMotors:
 
     def check(self) -> None:
         """Raises ValueError for something that is no robot."""
-        checks.conforms(
-            "WithMotors.robot", self.robot, Robot, "iblf_jax.robots has them.", ("skeleton",)
-        )
+        checks.conforms("WithMotors.robot", self.robot, Robot, "iblf_jax.robots has them.")
 
     @property
     def n(self) -> int:
@@ -62,27 +53,27 @@ class WithMotors:
     @property
     def joints(self) -> tuple[str, ...]:
         """Names of the joints of the robot."""
-        return robot_member(self.robot, "joints")  # type: ignore[no-any-return]
+        return self.robot.joints
 
     @property
-    def kinds(self) -> Any:
+    def kinds(self) -> tuple[str, ...] | None:
         """Kinds of the joints of the robot."""
-        return robot_member(self.robot, "kinds")
+        return self.robot.kinds
 
     @property
-    def limits(self) -> Any:
+    def limits(self) -> Limits | None:
         """Limits of the joints of the robot."""
-        return robot_member(self.robot, "limits")
+        return self.robot.limits
 
     @property
-    def speed(self) -> Any:
+    def speed(self) -> jax.Array | None:
         """Largest speeds of the joints of the robot."""
-        return robot_member(self.robot, "speed")
+        return self.robot.speed
 
     @property
-    def effort(self) -> Any:
+    def effort(self) -> jax.Array | None:
         """Largest torques of the joints of the robot."""
-        return robot_member(self.robot, "effort")
+        return self.robot.effort
 
     def mass_matrix(self, q: jax.Array) -> jax.Array:
         """M(q) + diag(J), (n, n) [kg m^2]."""
@@ -95,17 +86,17 @@ class WithMotors:
 
     def energy_gradient(self, q: jax.Array, v: jax.Array) -> jax.Array:
         """dT/dq of the robot, (n,) [N m]; the inertia of the motors does not depend on q."""
-        return energy_gradient(self.robot, q, v)
+        return self.robot.energy_gradient(q, v)
 
     def momentum(self, q: jax.Array, v: jax.Array) -> jax.Array:
         """M(q) v + J v, (n,) [N m s]."""
-        return momentum(self.robot, q, v) + self.inertia * v
+        return self.robot.momentum(q, v) + self.inertia * v
 
     def inverse_dynamics(
         self, q: jax.Array, v: jax.Array, u: jax.Array, acceleration: jax.Array
     ) -> jax.Array:
         """The torque on the robot, and J acceleration, (n,) [N m]."""
-        torque = inverse_dynamics(self.robot, q, v, u, acceleration)
+        torque = self.robot.inverse_dynamics(q, v, u, acceleration)
         return torque + self.inertia * acceleration
 
     def gravity(self, q: jax.Array) -> jax.Array:
@@ -124,17 +115,17 @@ class WithMotors:
         """D tip / dq of the robot, (2, n) or (3, n) [m/rad]."""
         return self.robot.jacobian(q)
 
-    def skeleton(self, q: jax.Array) -> jax.Array:
+    def skeleton(self, q: jax.Array) -> jax.Array | None:
         """Positions of the base, each joint and the tip of the robot [m]."""
         return self.robot.skeleton(q)
 
     def friction_torque(self, dq: jax.Array) -> jax.Array:
         """The friction of the robot, and -D q', (n,) [N m]."""
-        return friction_torque(self.robot, dq) - self.damping * dq
+        return self.robot.friction_torque(dq) - self.damping * dq
 
     def at(self, t: jax.Array) -> WithMotors:
         """The robot as it is at time t [s], with the motors."""
-        return dataclasses.replace(self, robot=as_at(self.robot, t))
+        return dataclasses.replace(self, robot=self.robot.at(t))
 
     def jump_times(self) -> jax.Array:
         """The times at which the robot jumps, (m,) [s]."""
