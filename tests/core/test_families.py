@@ -101,10 +101,10 @@ def test_the_default_of_a_family_replaces_that_of_all_components():
         own_joints: ClassVar[Mapping[str, int]] = {"mass": 3}
 
     own = own_class()
-    assert own.own_joints == {}
+    assert own().own_joints == {}
     for base in (Gravity, ij.barriers.Barrier):
         adopt(own, base)
-        assert own.own_joints == {"mass": 3}
+        assert own().own_joints == {"mass": 3}
 
 
 def test_a_leaf_may_have_the_name_of_a_statement_of_classes():
