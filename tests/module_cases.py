@@ -26,7 +26,7 @@ class Learned:
 class NetworkObserver:
     """f_hat = net(q') + the estimate of the rest by the inner observer."""
 
-    observer: ij.observers.Observer
+    observer: ij.observers.RobotObserver
     net: Any
 
     def init(self, q, dq, model):

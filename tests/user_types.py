@@ -37,28 +37,25 @@ class Drive(ij.actuators.Actuator):
 
 
 @ij.component
-class Wrapping(ij.controllers.Controller):
-    """A law of a user's that wraps another, and states a claim of its own."""
+class Wrapping(ij.controllers.Law):
+    """A law of a user's that wraps another."""
 
-    law: ij.controllers.Controller
+    law: ij.controllers.TrackingLaw
 
-    def init(
-        self, q: jax.Array, dq: jax.Array, context: ij.controllers.LawContext
-    ) -> ij.controllers.State:
+    def init(self, x: jax.Array, context: ij.controllers.LawContext) -> ij.controllers.State:
         """The wrapped law's state."""
-        return self.law.init(q, dq, context)
+        return ij.controllers.law_of_x(self.law).init(x, context)
 
     def command(
         self,
         t: jax.Array,
-        q: jax.Array,
-        dq: jax.Array,
-        f_hat: jax.Array,
+        x: jax.Array,
+        d_hat: jax.Array,
         context: ij.controllers.LawContext,
         state: ij.controllers.State,
     ) -> tuple[ij.controllers.Command, ij.controllers.State]:
         """The wrapped law's command."""
-        return self.law.command(t, q, dq, f_hat, context, state)
+        return ij.controllers.law_of_x(self.law).command(t, x, d_hat, context, state)
 
 
 @ij.component
@@ -102,7 +99,7 @@ class Barrier(ij.barriers.Barrier):
 
 
 @ij.component
-class Observer(ij.observers.Observer):
+class Observer(ij.observers.RobotObserver):
     """An observer of a user's."""
 
     gain: ij.Leaf = ij.leaf("1/s", sign="positive")
@@ -158,7 +155,7 @@ class Push(ij.disturbances.Disturbance):
 
 
 @ij.component
-class Sensor(ij.sensors.Sensor):
+class Sensor(ij.sensors.RobotSensor):
     """A sensor of a user's."""
 
     draws: ClassVar[int] = 0
@@ -218,11 +215,11 @@ class Largest(ij.metrics.Fold):
 def of_own_parts(scenario: ij.Scenario, sample: ij.metrics.Sample, tube: ij.bounds.Tube) -> None:
     """Parts of a user's own fit where the package's do."""
     actuator: ij.actuators.Actuator = Drive(gain=3.0)
-    law: ij.controllers.Controller = Wrapping(law=scenario.controller)
+    law: ij.controllers.Law = Wrapping(law=scenario.controller)
     barrier: ij.barriers.Barrier = Barrier()
-    observer: ij.observers.Observer = Observer(gain=2.0)
+    observer: ij.observers.RobotObserver = Observer(gain=2.0)
     disturbance: ij.disturbances.Disturbance = Push(size=1.0)
-    sensor: ij.sensors.Sensor = Sensor()
+    sensor: ij.sensors.RobotSensor = Sensor()
     plant: ij.plants.Plant = Plant()
     ij.controllers.Backstepping(k1=2.0, K2=20.0, barrier=barrier)
     ij.simulate(scenario, duration=1.0, metrics=(Largest(),))

@@ -51,11 +51,12 @@ from iblf_jax.control.actuators import Ideal
 from iblf_jax.control.controllers import (
     AdaptiveParameters,
     Backstepping,
-    Controller,
     FullState,
     LyapunovLaw,
     Saturated,
+    TrackingLaw,
 )
+from iblf_jax.control.controllers._base import contract_of
 from iblf_jax.control.observers import Momentum, Printed
 from iblf_jax.core import checks, programs
 from iblf_jax.core.pytree import layers, unwrapped
@@ -354,19 +355,18 @@ def own_claim(scenario: Scenario) -> LyapunovLaw | None:
     return law
 
 
-def stated_methods(law: Controller) -> list[str]:
+def stated_methods(law: TrackingLaw) -> list[str]:
     """The methods among `lyapunov` and `decay` that a law has."""
-    kind = type(law)
-    are_own = (
-        kind.lyapunov is not Controller.lyapunov,
-        kind.decay is not Controller.decay,
-    )
+    kind: Any = type(law)
+    base = contract_of(law)
+    are_own = (kind.lyapunov is not base.lyapunov, kind.decay is not base.decay)
     return [name for name, is_own in zip(OWN_CLAIM_METHODS, are_own, strict=True) if is_own]
 
 
-def states_disturbance_terms(law: Controller) -> bool:
+def states_disturbance_terms(law: TrackingLaw) -> bool:
     """Whether a law states the T of its own claim."""
-    return type(law).disturbance_terms is not Controller.disturbance_terms
+    kind: Any = type(law)
+    return kind.disturbance_terms is not contract_of(law).disturbance_terms
 
 
 def _why_no_own_claim(scenario: Scenario) -> str:

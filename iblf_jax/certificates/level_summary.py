@@ -151,7 +151,7 @@ def why_no_level_claim(scenario: Scenario) -> str:
         if barrier.decay_rate(k) is None:
             kind = type(barrier).__name__
             return f"the barrier {kind} of level {i + 1} states no decay rate of its V"
-    if scenario.observer.completes:
+    if scenario.loop.observer.completes:
         kind = type(scenario.observer).__name__
         return f"(S.3) is about a measured state, and the law receives levels that {kind} estimates"
     if not isinstance(scenario.actuator, Ideal):

@@ -41,18 +41,13 @@ from jax.flatten_util import ravel_pytree
 from iblf_jax.certificates.auxiliary import covers_limit, inner_context, inner_state
 from iblf_jax.certificates.claims import adaptive_law, own_claim, states_disturbance_terms
 from iblf_jax.certificates.proof_terms import TORQUE_ROUNDING, OwnTerms
-from iblf_jax.control.controllers import BarrierBackstepping
+from iblf_jax.control.controllers import BarrierBackstepping, Law
 from iblf_jax.control.controllers._base import decay_of
 from iblf_jax.control.decays._base import gain_at
 from iblf_jax.core.linalg import solve_spd
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, plant_input
-from iblf_jax.simulation.levels import (
-    estimate_as_rates,
-    law_state,
-    model_state,
-    observer_estimate,
-)
+from iblf_jax.simulation.levels import estimate
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import Sample
 from iblf_jax.world import plants
@@ -126,7 +121,7 @@ def is_about_levels(scenario: Scenario) -> bool:
     """Whether the law of a scenario receives the levels of the plant, so that (S.3), and not
     Theorem 2, is the claim to check.
     """
-    return bool(unwrapped(scenario.controller).receives_x)
+    return isinstance(unwrapped(scenario.controller), Law)
 
 
 def level_terms_at(scenario: Scenario, t: jax.Array, state: LoopState) -> LevelTerms:
@@ -148,7 +143,7 @@ def level_terms_and_sample(
     law = unwrapped(scenario.controller)
     at, tangent = _point_and_rate(scenario, t, state, state_rate)
     d = _disturbance(scenario, state, state_rate, sample)
-    d_tilde = d - estimate_as_rates(scenario, at.x, at.estimate)
+    d_tilde = d - _as_rates(scenario, at.x, at.estimate)
     sizes = _rate_sizes(scenario, at, d, d_tilde, tangent.x)
     estimate_error, estimate_size = _estimate_error(scenario, at, tangent, d_tilde, sizes)
     excluded = jnp.any(sample.guard_active)
@@ -190,16 +185,22 @@ def _point_and_rate(
     scenario: Scenario, t: jax.Array, state: LoopState, state_rate: LoopState
 ) -> tuple[_Point, _Point]:
     """The arguments of V at one state, and their rates."""
+    loop = scenario.loop
+    order = loop.model.order
 
-    def estimate(t, state):
-        levels = (state.q, state.dq, state.higher)
-        return observer_estimate(scenario, scenario.observer, t, *levels, state.observer)
+    def estimated(t, state):
+        return estimate(scenario, loop.observer, t, state.x[:order], state.observer)
 
-    found, rates = jax.jvp(estimate, (t, state), (jnp.ones_like(t), state_rate))
-    x = model_state(scenario, state.q, state.dq, state.higher)
-    dx = model_state(scenario, state_rate.q, state_rate.dq, state_rate.higher)
-    at = _Point(t, x, found, state.controller)
-    return at, _Point(jnp.ones_like(t), dx, rates, state_rate.controller)
+    found, rates = jax.jvp(estimated, (t, state), (jnp.ones_like(t), state_rate))
+    at = _Point(t, state.x[:order], found, state.controller)
+    return at, _Point(jnp.ones_like(t), state_rate.x[:order], rates, state_rate.controller)
+
+
+def _as_rates(scenario: Scenario, x: jax.Array, estimate: jax.Array) -> jax.Array:
+    """An estimate as d_hat, (r, n): M0^-1 f_hat in the second level for a torque f_hat."""
+    if estimate.ndim == 2:
+        return estimate
+    return plants.torque_as_rates(scenario.loop.model, x, estimate)
 
 
 def _disturbance(
@@ -238,9 +239,7 @@ def _input_was_limited(
         return jnp.zeros((), bool)
     own_state = inner_state(scenario, at.law_state)
     own, _ = law.command(*at[:3], scenario.context, own_state)
-    measured = law_state(scenario, state.q, state.dq, state.higher)
-    outer: Any = scenario.controller
-    limited, _ = outer.command(at.t, *measured, at.estimate, scenario.context, at.law_state)
+    limited, _ = scenario.loop.law.command(*at[:3], scenario.context, at.law_state)
     u, applied = plant_input(own), plant_input(limited)
     tolerance = TORQUE_ROUNDING * jnp.finfo(u.dtype).eps * jnp.abs(u)
     return jnp.any(jnp.abs(applied - u) > tolerance)
@@ -410,7 +409,7 @@ def _own_terms(
         state_rate, sample = evaluate(scenario, t, state)
         d = _disturbance(scenario, state, state_rate, sample)
         at, _ = _point_and_rate(scenario, t, state, state_rate)
-        return d, d - estimate_as_rates(scenario, at.x, at.estimate)
+        return d, d - _as_rates(scenario, at.x, at.estimate)
 
     along = (jnp.ones_like(t), state_rate)
     (d, d_tilde), (dd, dd_tilde) = jax.jvp(disturbances, (t, state), along)

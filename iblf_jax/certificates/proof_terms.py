@@ -49,7 +49,7 @@ from iblf_jax.certificates.claims import (
     states_disturbance_terms,
 )
 from iblf_jax.control.controllers import Backstepping, FullState
-from iblf_jax.control.controllers._base import decay_of
+from iblf_jax.control.controllers._base import decay_of, law_of_x
 from iblf_jax.control.decays._base import energy_gain, gain_at
 from iblf_jax.control.observers import Printed
 from iblf_jax.core.linalg import matvec, solve_spd
@@ -313,7 +313,7 @@ def _differs_from_command(
     before the limit is reached, which the status flags do not show.
     """
     f_hat = now["disturbance_estimate"]
-    command, _ = law.command(t, state.q, state.dq, f_hat, scenario.context, law_state)
+    command, _ = law_of_x(law).command(t, state.x, f_hat, scenario.context, law_state)
     tolerance = TORQUE_ROUNDING * jnp.finfo(command.tau.dtype).eps * jnp.abs(command.tau)
     return jnp.any(jnp.abs(now["tau"] - command.tau) > tolerance)
 
@@ -455,6 +455,7 @@ def _own_terms(
       now, rates: the `_signals` and their rates.
     """
     law: Any = own_claim(scenario)
+    of_x: Any = law_of_x(law)
     context, q, dq = scenario.context._replace(plant=scenario.plant), state.q, state.dq
     own_state = inner_state(scenario, state.controller)
     own_rate = inner_state(scenario, state_rate.controller)
@@ -465,22 +466,22 @@ def _own_terms(
         df_tilde = df_tilde - rates["disturbance_estimate"]
 
     def lyapunov(t, q, dq, f_tilde, law_state):
-        return jnp.sum(law.lyapunov(t, q, dq, f_tilde, context, law_state))
+        return jnp.sum(of_x.lyapunov(t, jnp.stack([q, dq]), f_tilde, context, law_state))
 
     point = (t, q, dq, f_tilde, own_state)
     tangent = (jnp.ones_like(t), state_rate.q, state_rate.dq, df_tilde, own_rate)
     V, dV = jax.jvp(lyapunov, point, tangent)
-    decay = jnp.sum(law.decay(t, q, dq, f_tilde, context, own_state))
+    decay = jnp.sum(of_x.decay(t, state.x, f_tilde, context, own_state))
     slopes = jax.grad(lyapunov, argnums=(0, 1, 2, 3, 4))(*point)
     M0 = scenario.model.mass_matrix(q)
     if states_disturbance_terms(law):
-        terms = jnp.sum(law.disturbance_terms(t, q, dq, f_tilde, df, context, own_state))
+        terms = jnp.sum(of_x.disturbance_terms(t, state.x, f_tilde, df, context, own_state))
     else:
         terms = slopes[2] @ solve_spd(M0, f_tilde) + slopes[3] @ df
-        if scenario.observer.completes:
+        if scenario.loop.observer.completes:
             # The law received estimates: what that changes of the torque acts like f_tilde.
             f_hat = now["disturbance_estimate"]
-            command, _ = law.command(t, q, dq, f_hat, context, state.controller)
+            command, _ = of_x.command(t, state.x, f_hat, context, state.controller)
             terms += slopes[2] @ solve_spd(M0, now["tau"] - command.tau)
     size = _own_term_sizes(M0, slopes, tangent, now) + jnp.abs(decay) + jnp.abs(terms)
     limited = jnp.zeros((), bool)

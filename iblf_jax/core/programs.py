@@ -43,7 +43,7 @@ MAPS_OF_A_PROGRAM = 300
 UNOPTIMISED = {"xla_backend_optimization_level": 0}
 """Compiler options of a program that is not optimised."""
 ZERO = np.zeros((), np.float32)
-"""The result of an operation on it is a tracer while JAX traces the code into a program."""
+"""Put on a device, it is a tracer while JAX traces the code into a program."""
 MAX_PROGRAMS = 512
 """Programs that are kept.  `simulate` uses five for a scenario, a study two, `certify` twelve."""
 
@@ -172,7 +172,7 @@ class StructuredFunction:
         """
         if self._optimised or devices.platform() != "cpu":
             return None
-        traced = any(isinstance(x, jax.core.Tracer) for x in (jax.lax.neg(ZERO), *leaves))
+        traced = any(isinstance(x, jax.core.Tracer) for x in (jax.device_put(ZERO), *leaves))
         return None if traced else UNOPTIMISED
 
     def _copy(self, options: dict[str, Any] | None) -> Any:

@@ -22,13 +22,7 @@ from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.engine import LOWERING_LIMITS
 from iblf_jax.kernels import Program, Shapes, compile_step, written_out
 from iblf_jax.simulation.closed_loop import discrete_observer, law_update, plant_input
-from iblf_jax.simulation.levels import (
-    law_state,
-    model_state,
-    observer_initial,
-    start_levels,
-    steady_input,
-)
+from iblf_jax.simulation.levels import start_levels
 from iblf_jax.simulation.sampling import nothing_sent
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.world import plants
@@ -129,27 +123,29 @@ def _with_reference(scenario: Scenario, inputs: SampleInputs) -> Scenario:
 
 def inputs_at_start(scenario: Scenario) -> SampleInputs:
     """The time 0 and the levels of the plant at the start that the law measures."""
-    x = model_state(scenario, *start_levels(scenario))
+    x = start_levels(scenario)[: scenario.loop.model.order]
     higher = x[2:] if len(x) > 2 else ()
     return SampleInputs(jnp.zeros((), x.dtype), x[0], x[1], higher)
+
+
+def _levels(inputs: SampleInputs) -> jax.Array:
+    """The levels of the model that the inputs have, (r, n)."""
+    return Measurement(inputs.q, inputs.dq, inputs.higher).x
 
 
 def start(scenario: Scenario, inputs: SampleInputs) -> tuple[LawState, jax.Array]:
     """The state before the first sample, and the input that keeps the model at rest."""
     scenario = _with_reference(scenario, inputs)
-    q, dq, higher = inputs.q, inputs.dq, inputs.higher
-    law: Any = scenario.controller
-    controller = law.init(*law_state(scenario, q, dq, higher), scenario.context)
-    observer = observer_initial(scenario, discrete_observer(scenario), q, dq, higher)
+    loop, x = scenario.loop, _levels(inputs)
+    controller = loop.law.init(x, scenario.context)
+    observer = discrete_observer(scenario).init(x, loop.model)
     period = scenario.sampling.period  # type: ignore[union-attr]
-    x = model_state(scenario, q, dq, higher)
     filtered = tuple(
         velocity.init(x[row - 1], x[row], period) for row, velocity in velocity_filters(scenario)
     )
-    if plants.is_chain(scenario.model):
-        balance = steady_input(scenario, q)
-    else:
-        balance = scenario.model.gravity(q)
+    balance = loop.model.steady_input(x[0])
+    if balance is None:
+        balance = jnp.zeros_like(x[0])
     sent: Any = ()
     if scenario.sampling.trigger is not None:  # type: ignore[union-attr]
         sent = nothing_sent(balance)
@@ -191,7 +187,7 @@ def _measurement(
     these.
     """
     period = scenario.sampling.period  # type: ignore[union-attr]
-    rows = list(model_state(scenario, inputs.q, inputs.dq, inputs.higher))
+    rows = list(_levels(inputs))
     after = []
     for (row, velocity), state in zip(velocity_filters(scenario), states, strict=True):
         normal = jnp.zeros((velocity.draws, scenario.n), inputs.q.dtype)

@@ -35,7 +35,6 @@ from iblf_jax.simulation.closed_loop import (
     sample_at,
 )
 from iblf_jax.simulation.discontinuities import JUMP_SEPARATION
-from iblf_jax.simulation.levels import Motion
 from iblf_jax.simulation.metrics import Fold, as_folds, metric_units
 from iblf_jax.simulation.noise import has_noise, noise_key
 from iblf_jax.simulation.results import Metrics, Rollout
@@ -402,9 +401,9 @@ def _observed(scenario: Scenario, folds, dt, motion: RecordedMotion, is_gap):
     weight = jnp.concatenate([zero, half]) + jnp.concatenate([half, zero])
     step = jnp.where(rows.instant & (t > 0), dt, 0.0)
     signals = jax.tree.map(lambda x: x[rows.sample], motion.states.sampled.signals)
-    moved = Motion(rows.dq, rows.ddq, ())
+    x, moved = (jnp.stack(levels, axis=1) for levels in ((rows.q, rows.dq), (rows.dq, rows.ddq)))
     samples = jax.vmap(partial(sample_at, scenario))(
-        t, weight, rows.q, rows.dq, moved, rows.tau, rows.limited, signals
+        t, weight, x, moved, rows.tau, rows.limited, signals
     )
     samples = dataclasses.replace(samples, step=step)
     raised = jax.vmap(sample_status)(samples)

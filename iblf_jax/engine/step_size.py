@@ -183,7 +183,7 @@ def start_and_along(scenario: Scenario, times: jax.Array) -> LoopState:
     """
 
     def at(t):
-        start = Initial(*levels_on_reference(scenario, t))
+        start = Initial(x=levels_on_reference(scenario, t))
         return initial_state(dataclasses.replace(scenario, initial=start))
 
     return jax.tree.map(

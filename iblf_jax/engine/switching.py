@@ -1,7 +1,7 @@
 """Derivatives of a closed loop whose command jumps at surfaces in the state.
 
 A law may declare functions g_i(t, q, q') at whose zeros its command jumps
-(`controllers.Controller`, method `switching`).  The closed loop is then a hybrid system.  Where its
+(`switching` of `controllers.RobotLaw`).  The closed loop is then a hybrid system.  Where its
 state crosses g_i = 0 at a time t*, with the rate f- before and f+ after the jump, a perturbation of
 the state jumps as well, and an integral of a signal L that jumps with the command gains a term:
 
@@ -40,10 +40,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from iblf_jax.control.controllers import Law
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.simulation.closed_loop import LoopState
 from iblf_jax.simulation.integrators import StepResult, stage_states, tableau
-from iblf_jax.simulation.levels import law_state, observer_estimate
+from iblf_jax.simulation.levels import estimate
 from iblf_jax.simulation.scenario import Scenario
 
 SURFACE_CLEARANCE = 1e-4
@@ -139,15 +140,12 @@ def surfaces(scenario: Scenario, t: jax.Array, state: LoopState) -> jax.Array | 
     """The switching functions of the scenario's law at a state, (m,), or None if its command does
     not jump.
     """
-    context = scenario.context
-    law: Any = scenario.controller
-    arguments = law_state(scenario, state.q, state.dq, state.higher)
-    if unwrapped(law).receives_x:
-        levels = (state.q, state.dq, state.higher)
-        observer = scenario.observer
-        d_hat = observer_estimate(scenario, observer, t, *levels, state.observer)
-        arguments = (*arguments, d_hat)
-    return law.switching(t, *arguments, context, state.controller)
+    loop = scenario.loop
+    x = state.x[: loop.model.order]
+    d_hat = jnp.zeros(loop.model.estimate_shape, x.dtype)
+    if isinstance(unwrapped(scenario.controller), Law):
+        d_hat = estimate(scenario, loop.observer, t, x, state.observer)
+    return loop.law.switching(t, x, d_hat, scenario.context, state.controller)
 
 
 def with_hybrid_derivative(

@@ -19,7 +19,7 @@ import numpy as np
 
 from iblf_jax.control import actuators, barriers, controllers, decays, observers, sensors
 from iblf_jax.core import checks, modules
-from iblf_jax.core.pytree import field_values, is_leaf_field
+from iblf_jax.core.pytree import field_values, is_component_class, is_leaf_field
 from iblf_jax.files.modules import ReadPart, encode_module
 from iblf_jax.files.values import (
     NONE,
@@ -64,8 +64,6 @@ def family(module: str, members: dict[str, Any]) -> Family:
     return Family(module, {"MEMBERS": members})
 
 
-_PARTS_OF_SENSORS = {"MEMBERS": sensors.MEMBERS, "LEVELS": sensors.LEVELS}
-
 FAMILIES: dict[Any, Family] = {
     robots.Robot: family("robots", robots.MEMBERS),
     plants.Plant: family("plants", plants.MEMBERS),
@@ -73,12 +71,12 @@ FAMILIES: dict[Any, Family] = {
     bounds.Side: family("bounds", bounds.MEMBERS),
     regions.Region: family("regions", regions.MEMBERS),
     disturbances.Disturbance: family("disturbances", disturbances.MEMBERS),
-    controllers.Controller: family("controllers", controllers.MEMBERS),
+    controllers.TrackingLaw: family("controllers", controllers.MEMBERS),
     barriers.Barrier: family("barriers", barriers.MEMBERS),
     decays.Decay: family("decays", decays.MEMBERS),
-    observers.Observer: family("observers", observers.MEMBERS),
-    sensors.Sensor: family("sensors", sensors.MEMBERS),
-    sensors.LevelReading: Family("sensors", _PARTS_OF_SENSORS),
+    observers.DisturbanceObserver: family("observers", observers.MEMBERS),
+    sensors.AnySensor: family("sensors", sensors.MEMBERS),
+    sensors.LevelSensor: Family("sensors", {"LEVELS": sensors.LEVELS}),
     sensors.Velocity: Family("sensors", {"VELOCITIES": sensors.VELOCITIES}),
     process_noise.ProcessNoise: family("process_noise", process_noise.MEMBERS),
     actuators.Actuator: family("actuators", actuators.MEMBERS),
@@ -103,9 +101,17 @@ def families_of(hint: Any) -> list[Any]:
     options = [without_none(hint)[0]]
     if typing.get_origin(hint) is typing.Annotated:
         options = [hint.__origin__, *hint.__metadata__]
-    if all(option in FAMILIES for option in options):
-        return options
-    return []
+    named = [_base_of(option) for option in options]
+    return [] if None in named else named
+
+
+def _base_of(option: Any) -> Any:
+    """The base class of the family that a contract belongs to, such as that of laws for a
+    `RobotLaw`; None without one.
+    """
+    if not isinstance(option, type) or is_component_class(option):
+        return None
+    return next((base for base in option.__mro__ if base in FAMILIES), None)
 
 
 def members_of(hint: Any) -> tuple[str, dict[str, Any]]:
@@ -115,7 +121,7 @@ def members_of(hint: Any) -> tuple[str, dict[str, Any]]:
     named = families_of(hint)
     if named:
         families = [FAMILIES[protocol] for protocol in named]
-        words = " or ".join(one.module for one in families)
+        words = " or ".join(dict.fromkeys(one.module for one in families))
         return words, {name: x for one in families for name, x in one.members.items()}
     seen: dict[str, list[Any]] = {}
     for one in FAMILIES.values():

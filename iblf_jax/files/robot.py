@@ -21,7 +21,7 @@ from __future__ import annotations
 import os
 from typing import Any
 
-from iblf_jax.control.controllers import Controller, within_effort
+from iblf_jax.control.controllers import TrackingLaw, within_effort
 from iblf_jax.core import checks
 from iblf_jax.files.components import construct, decode, encode_fields
 from iblf_jax.files.modules import ReadPart
@@ -65,7 +65,7 @@ def with_robots_read(tables: dict[str, Any], folder: str | os.PathLike) -> dict[
     parts |= {"robot": plant, "model": robots.get("model")}
     default = construct(arm_scenario, parts, "robot")
     if "controller" in given:
-        law = within_effort(decode(given["controller"], Controller, "controller"), plant)
+        law = within_effort(decode(given["controller"], TrackingLaw, "controller"), plant)
         if as_table(given["controller"], "controller").get("kind") != "saturated":
             given["controller"] = ReadPart(law)
     filled = encode_fields(default, "")

@@ -39,7 +39,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.control.barriers import Barrier
-from iblf_jax.control.controllers import LAWS, Controller, PDGravity, law_by_name, within_effort
+from iblf_jax.control.controllers import LAWS, PDGravity, TrackingLaw, law_by_name, within_effort
 from iblf_jax.control.controllers.systems import observer_of
 from iblf_jax.control.observers import Momentum, Printed
 from iblf_jax.core import checks
@@ -289,7 +289,7 @@ def arm_scenario(
 
 def _arm_law(
     model: Robot, reference: Reference, bounds: Bounds, law: str, reading: str
-) -> Controller:
+) -> TrackingLaw:
     """The law of `arm_scenario`, without saturation."""
     K2 = _coupled_gain(model, reference)
     if law == "pd":  # The default gains of "pd" are for one size of joint.

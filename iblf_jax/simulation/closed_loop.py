@@ -27,26 +27,17 @@ import jax.numpy as jnp
 from iblf_jax.control.actuators import Ideal
 from iblf_jax.control.controllers import Command
 from iblf_jax.control.controllers._base import state_of_levels
+from iblf_jax.control.observers import Observer
 from iblf_jax.control.sensors import Measurement
-from iblf_jax.core.linalg import inner
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.simulation.delays import initial_commands
 from iblf_jax.simulation.levels import (
-    Motion,
     completed,
-    estimate_as_rates,
-    estimate_as_torque,
+    estimate,
     estimated_levels,
-    law_state,
-    model_state,
     motion,
-    observer_arguments,
-    observer_estimate,
-    observer_initial,
-    sensor_state,
     start_levels,
     steady_input,
-    uncertain_term,
 )
 from iblf_jax.simulation.noise import normals
 from iblf_jax.simulation.sampling import Instant, SentCommand, nothing_sent
@@ -55,7 +46,6 @@ from iblf_jax.simulation.signals import Sample
 from iblf_jax.world import plants
 from iblf_jax.world.bounds import bounds_at
 from iblf_jax.world.regions import margins
-from iblf_jax.world.robots import inverse_dynamics, momentum
 
 # --- the state ---------------------------------------------------------------------------------
 
@@ -154,14 +144,15 @@ class LoopState(NamedTuple):
 @partial(jax.jit, inline=True)
 def initial_state(scenario: Scenario) -> LoopState:
     """The state at t = 0; an actuator starts with the torque that balances the model's gravity."""
-    q, dq, higher = start_levels(scenario)
-    law: Any = scenario.controller
+    x, loop = start_levels(scenario), scenario.loop
+    known = x[: loop.model.order]
+    q, dq, *higher = x
     state = LoopState(
         q,
         dq,
-        law.init(*law_state(scenario, q, dq, higher), scenario.context),
-        observer_initial(scenario, discrete_observer(scenario), q, dq, higher),
-        higher=higher,
+        loop.law.init(known, scenario.context),
+        discrete_observer(scenario).init(known, loop.model),
+        higher=jnp.stack(higher) if higher else (),
     )
     if scenario.sampling is None and isinstance(scenario.actuator, Ideal):
         return state
@@ -175,33 +166,23 @@ def initial_state(scenario: Scenario) -> LoopState:
 def _initial_sampled_state(scenario: Scenario, state: LoopState, tau: jax.Array) -> SampledState:
     """State of a sampled loop before its first sample: every command in transit is `tau`."""
     sampling: Any = scenario.sampling
-    part: Any = scenario.sensor
-    q, dq = state.q, state.dq
-    zero = jnp.zeros_like(q)
-    f_hat = jax.eval_shape(
-        partial(observer_estimate, scenario, scenario.observer),
-        *(zero[0], q, dq, state.higher, state.observer),
-    )
+    loop, x = scenario.loop, state.x
+    known, t = x[: loop.model.order], jnp.zeros_like(x[0, 0])
+    f_hat = jax.eval_shape(partial(estimate, scenario, loop.observer), t, known, state.observer)
     command, _ = jax.eval_shape(
-        scenario.controller.command,
-        zero[0],
-        *law_state(scenario, q, dq, state.higher),
-        f_hat,
-        scenario.context,
-        state.controller,
+        loop.law.command, t, known, f_hat, scenario.context, state.controller
     )
-    here = Measurement(q, dq, state.higher)
+    here = Measurement(state.q, state.dq, state.higher)
     estimated = jax.eval_shape(
-        partial(estimated_levels, scenario, scenario.observer),
-        *(zero[0], here, here, here, state.observer),
+        partial(estimated_levels, scenario, loop.observer), t, here, here, x, state.observer
     )
     sent = () if sampling.trigger is None else nothing_sent(tau)
     signals = law_signals(command, f_hat, estimated, sent)
     blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), signals)
     return SampledState(
         commands=jnp.repeat(tau[None], sampling.queue + 1, axis=0),
-        sensor=part.init(*sensor_state(scenario, q, dq, state.higher), sampling.period),
-        measured=Measurement(q, dq, state.higher),
+        sensor=loop.sensor.init(x, sampling.period),
+        measured=here,
         signals=blank,
         sent=sent,
     )
@@ -255,22 +236,20 @@ def evaluate(
       torque: command at the actuator, (n,) [N m], where the law is sampled or its command has a
         delay; the newest command if not given.
     """
-    q, dq, higher, observer = state.q, state.dq, state.higher, scenario.observer
+    loop, x = scenario.loop, state.x
+    known = x[: loop.model.order]
     controller_rate: Any = ()
     observer_rate: Any = ()
     undelayed: Any = ()
     if scenario.sampling is None:
-        f_hat = observer_estimate(scenario, observer, t, q, dq, higher, state.observer)
-        law: Any = scenario.controller
-        context = scenario.context
-        measurement = Measurement(q, dq, higher)
-        known = completed(scenario, observer, t, measurement, state.observer)
-        measured = law_state(scenario, *known)
-        answer, controller_rate = law.command(t, *measured, f_hat, context, state.controller)
-        command = plant_input(answer)
-        estimated = estimated_levels(
-            scenario, observer, t, measurement, known, measurement, state.observer
+        f_hat = estimate(scenario, loop.observer, t, known, state.observer)
+        true = Measurement(state.q, state.dq, state.higher)
+        measured = completed(scenario, loop.observer, t, true, state.observer)
+        answer, controller_rate = loop.law.command(
+            t, measured.x[: loop.model.order], f_hat, scenario.context, state.controller
         )
+        command = plant_input(answer)
+        estimated = estimated_levels(scenario, loop.observer, t, true, measured, x, state.observer)
         signals = law_signals(answer, f_hat, estimated)
         if has_delay(state):
             undelayed = command
@@ -279,25 +258,20 @@ def evaluate(
     else:
         command = state.sampled.commands[0] if torque is None else torque
         signals = state.sampled.signals
-    delivered = scenario.actuator.at(t).deliver(command, dq, state.actuator)
-    moved = motion(scenario, t, q, dq, higher, delivered.tau)
+    delivered = scenario.actuator.at(t).deliver(command, state.dq, state.actuator)
+    moved = motion(scenario, t, x, delivered.tau)
     if scenario.sampling is None:
-        arguments = observer_arguments(
-            scenario, observer, t, q, dq, higher, answer.tau, state.observer
-        )
-        observer_rate = observer.derivative(*arguments)
+        observer_rate = loop.observer.derivative(t, known, answer.tau, loop.model, state.observer)
     rate = LoopState(
-        q=moved.dq,
-        dq=moved.ddq,
+        q=moved[0],
+        dq=moved[1],
         controller=controller_rate,
         observer=observer_rate,
         actuator=delivered.rate,
-        higher=moved.higher,
+        higher=moved[2:] if len(moved) > 2 else (),
         delayed=undelayed,
     )
-    sample = sample_at(
-        scenario, t, dt, q, dq, moved, delivered.tau, delivered.limited, signals, higher
-    )
+    sample = sample_at(scenario, t, dt, x, moved, delivered.tau, delivered.limited, signals)
     return rate, sample
 
 
@@ -335,13 +309,11 @@ def sample_at(
     scenario: Scenario,
     t: jax.Array,
     dt: jax.Array | float,
-    q: jax.Array,
-    dq: jax.Array,
-    moved: Motion,
+    x: jax.Array,
+    moved: jax.Array,
     tau: jax.Array,
     limited: jax.Array,
     signals: LawSignals,
-    higher: Any = (),
 ) -> Sample:
     """The sample at time t of a loop with a given motion, torque and signals of the law.
 
@@ -349,19 +321,16 @@ def sample_at(
       scenario: its reference, bounds and model are used.
       t: time, () [s].
       dt: weight of the sample in an integral over time, () [s].
-      q, dq: the first two levels, (n,) each.
-      moved: the rate of the plant's state.
+      x: state of the plant, (r, n).
+      moved: its rate, (r, n).
       tau: input of the plant, (n,): of a robot the torque on the joints [N m].
       limited: whether the actuator delivered less than the command, (n,) bool.
       signals: of the law.
-      higher: levels from the third on, (r - 2, n); `()` for a robot.
     """
     tube = scenario.context.tube(t)
-    uncertain = _uncertain_signals
-    if not plants.is_chain(scenario.model):
-        uncertain = _robot_uncertain_signals
-    terms = uncertain(scenario, t, q, dq, moved, tau, signals, higher)
-    optional = _level_signals(scenario, t, higher, signals)
+    q, dq = x[0], x[1]
+    terms = _uncertain_signals(scenario, t, x, moved, tau, signals)
+    optional = _level_signals(scenario, t, x[2:], signals)
     if scenario.regions:
         optional["region_margin"] = margins(scenario.regions, plants.robot_of(scenario.plant), q)
     if signals.estimated != ():
@@ -404,49 +373,32 @@ class _UncertainSignals(NamedTuple):
     V: jax.Array
 
 
-def _robot_uncertain_signals(
-    scenario: Scenario,
-    t: jax.Array,
-    q: jax.Array,
-    dq: jax.Array,
-    moved: Motion,
-    tau: jax.Array,
-    signals: LawSignals,
-    higher: Any,
-) -> _UncertainSignals:
-    """The signals of a model that is a robot: f of (2.1) and V2 of (3.12)."""
-    model = scenario.model
-    balance = model.gravity(q)
-    if not isinstance(signals.torque, tuple):
-        # The plant has another input than the torque of the law.
-        tau, balance = signals.torque, steady_input(scenario, q)
-    f = inverse_dynamics(model, q, dq, dq, moved.ddq) - tau
-    f_hat = estimate_as_torque(model, q, signals.f_hat)
-    e2, f_tilde = dq - signals.alpha, f - f_hat
-    V = jnp.sum(signals.V1)
-    if unwrapped(scenario.controller).includes_e2:
-        V = V + 0.5 * inner(f_tilde, f_tilde)
-    else:
-        V = V + 0.5 * (inner(e2, momentum(model, q, e2)) + inner(f_tilde, f_tilde))
-    return _UncertainSignals(balance, f, f_hat, V)
-
-
 def _uncertain_signals(
     scenario: Scenario,
     t: jax.Array,
-    q: jax.Array,
-    dq: jax.Array,
-    moved: Motion,
+    x: jax.Array,
+    moved: jax.Array,
     tau: jax.Array,
     signals: LawSignals,
-    higher: Any,
 ) -> _UncertainSignals:
-    """The signals of a model in strict-feedback form: d_i of (S.1), and the law's sum w_i V_i."""
-    gravity = steady_input(scenario, q)
-    d = uncertain_term(scenario, t, q, dq, higher, moved, tau)
-    x = model_state(scenario, q, dq, higher)
-    d_hat = estimate_as_rates(scenario, x, signals.f_hat)
-    return _UncertainSignals(gravity, d, d_hat, jnp.sum(signals.V1))
+    """The uncertain term of the model, f of (2.1) or d of (S.1), and V: V2 of (3.12), or the law's
+    sum w_i V_i.
+    """
+    model = scenario.loop.model
+    x, rate = x[: model.order], moved[: model.order]
+    balance = model.steady_input(x[0])
+    if not isinstance(signals.torque, tuple):
+        # The plant has another input than the torque of the law.
+        tau, balance = signals.torque, None
+    if balance is None:
+        balance = steady_input(scenario, x[0])
+    found = model.uncertain(t, x, rate, tau)
+    known = model.as_uncertain(x, signals.f_hat)
+    includes_e2 = unwrapped(scenario.controller).includes_e2
+    e2 = None if includes_e2 else x[1] - signals.alpha
+    V = jnp.sum(signals.V1)
+    added = model.energy_of_errors(x, e2, found - known)
+    return _UncertainSignals(balance, found, known, V if added is None else V + added)
 
 
 def _level_signals(
@@ -462,7 +414,7 @@ def _level_signals(
         found["dq_lower"], found["dq_upper"] = context.speed_limits(t)
     elif (bounds := context.level_bounds(2)) is not None:
         found["dq_lower"], found["dq_upper"] = bounds_at(bounds, t, signals.alpha)
-    if isinstance(higher, tuple):
+    if not len(higher):
         return found
     found["higher"] = higher
     centre = jnp.zeros_like(higher)
@@ -503,13 +455,13 @@ class LawUpdate(NamedTuple):
     """The `SentCommand` of a loop with an event trigger."""
 
 
-def discrete_observer(scenario: Scenario) -> Any:
+def discrete_observer(scenario: Scenario) -> Observer:
     """The observer as the loop runs it.
 
     For `Sampling(observer="poles")` it is the observer whose Euler step has the poles that the
     continuous observer has over a period.
     """
-    sampling, observer = scenario.sampling, scenario.observer
+    sampling, observer = scenario.sampling, scenario.loop.observer
     if sampling is None or sampling.observer != "poles":
         return observer
     return observer.at_period(sampling.period)
@@ -540,20 +492,19 @@ def law_update(
     running = discrete_observer(scenario)
     reading = measured
     measured = completed(scenario, running, t, reading, observer)
-    q, dq, higher = measured
-    f_hat = observer_estimate(scenario, running, t, q, dq, higher, observer)
-    law: Any = scenario.controller
-    command, controller_rate = law.command(
-        t, *law_state(scenario, q, dq, higher), f_hat, scenario.context, controller
-    )
+    law, model = scenario.loop.law, scenario.loop.model
+    x = measured.x[: model.order]
+    f_hat = estimate(scenario, running, t, x, observer)
+    command, controller_rate = law.command(t, x, f_hat, scenario.context, controller)
     if sampling.trigger is not None:
         sent = sampling.trigger.sent(plant_input(command), command.tau, sent)
         command = _with_sent_input(command, sent)
-    torque = command.tau
-    if applied is not None:
-        torque = applied
-    arguments = observer_arguments(scenario, running, t, q, dq, higher, torque, observer)
-    next_observer = _next_observer_state(sampling, running, arguments)
+    torque = command.tau if applied is None else applied
+    if sampling.observer == "exact" and running.advances:
+        next_observer = running.advance(t, x, torque, model, observer, sampling.period)
+    else:
+        observer_rate = running.derivative(t, x, torque, model, observer)
+        next_observer = _euler(observer, observer_rate, sampling.period)
     next_controller = _euler(controller, controller_rate, sampling.period)
     return LawUpdate(measured, command, f_hat, next_controller, next_observer, reading, sent)
 
@@ -563,13 +514,6 @@ def _with_sent_input(command: Command, sent: SentCommand) -> Command:
     if isinstance(command.input, tuple):
         return command._replace(tau=sent.input)
     return command._replace(tau=sent.torque, input=sent.input)
-
-
-def _next_observer_state(sampling: Any, observer: Any, arguments: tuple) -> Any:
-    """The observer's state one period later; `arguments` are those of `Observer.derivative`."""
-    if sampling.observer == "exact" and observer.advances:
-        return observer.advance(*arguments, sampling.period)
-    return _euler(arguments[-1], observer.derivative(*arguments), sampling.period)
 
 
 def _euler(state: Any, rate: Any, period: jax.Array) -> Any:
@@ -596,15 +540,7 @@ def run_sampled_law(
     """
     before, sampling = state.sampled, scenario.sampling
     assert sampling is not None
-    part: Any = scenario.sensor
-    measured, sensor = part.measure(
-        *sensor_state(scenario, state.q, state.dq, state.higher),
-        normal,
-        sampling.period,
-        before.sensor,
-    )
-    if isinstance(measured.higher, tuple):
-        measured = measured._replace(higher=state.higher)
+    measured, sensor = scenario.loop.sensor.measure(state.x, normal, sampling.period, before.sensor)
     parts = (state.controller, state.observer, before.sent)
     update = law_update(scenario, t, measured, *parts, applied)
     commands = jnp.concatenate([plant_input(update.command)[None], before.commands[:-1]])
@@ -614,7 +550,7 @@ def run_sampled_law(
         t,
         update.reading,
         update.measured,
-        Measurement(state.q, state.dq, state.higher),
+        state.x,
         state.observer,
     )
     signals = law_signals(update.command, update.f_hat, estimated, update.sent)
@@ -673,7 +609,7 @@ def perturbed_rate(
     For a continuous loop it is the rate of the state. For a sampled loop it is the rate of the
     plant, the next command, and the next states of law, observer and sensor. Rounding of a sensor,
     limits of an actuator or of a law and an event trigger are left out (`Sensor.unrounded`,
-    `Actuator.unlimited`, `Controller.unlimited`), because their derivatives vanish and would show
+    `Actuator.unlimited`, `TrackingLaw.unlimited`), because their derivatives vanish and would show
     an open loop; so are dead zone, play and rounding of an actuator in every loop
     (`Actuator.smooth`), and the delay of the input of a continuous loop.
 

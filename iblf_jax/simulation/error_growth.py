@@ -62,7 +62,7 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
-from iblf_jax.control.controllers._base import state_of_levels
+from iblf_jax.control.sensors._base import sensor_of_x
 from iblf_jax.core import checks
 from iblf_jax.core.linalg import matmul_in_order
 from iblf_jax.simulation.closed_loop import (
@@ -73,7 +73,6 @@ from iblf_jax.simulation.closed_loop import (
     with_integrated_part,
 )
 from iblf_jax.simulation.error_estimate import RELATIVE, TOLERANCE, Accuracy
-from iblf_jax.simulation.levels import sensor_state
 from iblf_jax.simulation.noise import normals
 from iblf_jax.simulation.sampling import Instant, step_torques
 from iblf_jax.simulation.scenario import Scenario
@@ -438,11 +437,8 @@ def _difference(x: Any, y: Any) -> Any:
 def _reading(sensor: Any, scenario: Scenario, state: LoopState, normal: jax.Array) -> jax.Array:
     """The measured levels, (r, n)."""
     sampling: Any = scenario.sampling
-    x = sensor_state(scenario, state.q, state.dq, state.higher)
-    q, dq, higher = sensor.measure(*x, normal, sampling.period, state.sampled.sensor)[0]
-    if isinstance(higher, tuple):
-        higher = state.higher
-    return state_of_levels(q, dq, higher)
+    before = state.sampled.sensor
+    return sensor_of_x(sensor).measure(state.x, normal, sampling.period, before)[0].x
 
 
 def _resolution(scenario: Scenario, x: jax.Array) -> jax.Array:

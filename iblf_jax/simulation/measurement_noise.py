@@ -18,8 +18,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from iblf_jax.control.sensors import Sensor
+from iblf_jax.control.sensors._base import sensor_of_x
 from iblf_jax.core.units import of_component, per_second
-from iblf_jax.simulation.levels import model_state, sensor_state, start_levels
+from iblf_jax.simulation.levels import start_levels
 from iblf_jax.world import plants
 
 DOUBLINGS = 40
@@ -59,26 +61,22 @@ def standard_deviations(scenario: Any) -> np.ndarray:
 def _linear_sensor(scenario: Any) -> LinearSensor:
     """The matrices of the sensor at the start, for inputs of the standard deviation 1."""
     sensor, period = scenario.sensor, scenario.sampling.period
-    smooth: Any = sensor.unrounded
-    levels = start_levels(scenario)
-    given = sensor_state(scenario, *levels)
-    steps = jnp.broadcast_to(jnp.asarray(sensor.resolution), given[0].shape)
-    start, rebuild = ravel_pytree(smooth.init(*given, period))
-    dtype = given[0].dtype  # which the vector of a sensor without memory may lack
+    smooth = sensor_of_x(sensor.unrounded)
+    x = start_levels(scenario)
+    read = x if isinstance(sensor, Sensor) else x[:1]
+    steps = jnp.broadcast_to(jnp.asarray(sensor.resolution), read.shape)
+    start, rebuild = ravel_pytree(smooth.init(x, period))
+    dtype = x.dtype  # which the vector of a sensor without memory may lack
 
     def sample(z: jax.Array, normal: jax.Array, error: jax.Array) -> jax.Array:
         """The next state and the measurement, in one vector."""
-        read = (given[0] + error * steps / np.sqrt(12.0), *given[1:])
-        found, after = smooth.measure(*read, normal, period, rebuild(z.astype(start.dtype)))
-        higher = found.higher
-        if isinstance(higher, tuple):
-            # The sensor measures two levels; the others are constant, without noise.
-            higher = levels[2]
-        x = model_state(scenario, found.q, found.dq, higher)
-        return jnp.concatenate([ravel_pytree(after)[0].astype(dtype), x.reshape(-1)])
+        moved = x.at[: len(read)].add(error * steps / np.sqrt(12.0))
+        found, after = smooth.measure(moved, normal, period, rebuild(z.astype(start.dtype)))
+        known = found.x[: scenario.loop.model.order]
+        return jnp.concatenate([ravel_pytree(after)[0].astype(dtype), known.reshape(-1)])
 
     zero = jnp.zeros((sensor.draws, scenario.n), dtype)
-    arguments = (start.astype(dtype), zero, jnp.zeros_like(given[0]))
+    arguments = (start.astype(dtype), zero, jnp.zeros_like(read))
     by_z, by_normal, by_error = jax.jacfwd(sample, argnums=(0, 1, 2))(*arguments)
     by_inputs = [slopes.reshape(len(by_z), -1) for slopes in (by_normal, by_error)]
     by_w = jnp.concatenate(by_inputs, axis=1)

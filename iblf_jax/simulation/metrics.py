@@ -753,7 +753,7 @@ def has_signal(scenario: Scenario, signal: str) -> bool:
         levels = range(3, plants.order_of(scenario.plant) + 1)
         return any(context.level_bounds(level) is not None for level in levels)
     if signal == "x_hat":
-        return scenario.observer.completes
+        return scenario.loop.observer.completes
     has_regions = len(scenario.regions) > 0
     if signal == "region_margin":
         return has_regions

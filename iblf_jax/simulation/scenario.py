@@ -20,11 +20,15 @@ import numpy as np
 
 from iblf_jax.control.actuators import Actuator
 from iblf_jax.control.actuators import Ideal as IdealActuator
-from iblf_jax.control.controllers import Controller, LawContext
-from iblf_jax.control.controllers._base import adopt_layers, state_of_levels
-from iblf_jax.control.observers import NoObserver, Observer
+from iblf_jax.control.controllers import Law, LawContext, TrackingLaw
+from iblf_jax.control.controllers._base import check_law, law_of_x
+from iblf_jax.control.observers import DisturbanceObserver, NoObserver, Observer
+from iblf_jax.control.observers import _base as observers
+from iblf_jax.control.observers._base import observer_of_x
+from iblf_jax.control.sensors import AnySensor, Sensor
 from iblf_jax.control.sensors import Ideal as IdealSensor
-from iblf_jax.control.sensors import Sensor
+from iblf_jax.control.sensors import _base as sensors
+from iblf_jax.control.sensors._base import sensor_of_x
 from iblf_jax.core import checks, modules, notices, programs
 from iblf_jax.core.disk_cache import keep_programs
 from iblf_jax.core.families import is_default, statements_of
@@ -44,7 +48,7 @@ from iblf_jax.core.pytree import (
 )
 from iblf_jax.core.time import joined, jump_times_of
 from iblf_jax.core.units import HIGHER, POSITION, VELOCITY, Unit, as_text
-from iblf_jax.simulation.levels import model_state, start_levels
+from iblf_jax.simulation.levels import start_levels
 from iblf_jax.simulation.measurement_noise import noise_advice
 from iblf_jax.simulation.sampling import PERIOD_TOLERANCE, Sampling
 from iblf_jax.world import plants, process_noise, regions
@@ -107,18 +111,17 @@ def _split_levels(x: Any) -> tuple[Any, Any, Any]:
 
 ROBOTS = "iblf_jax.robots has them; write your own with from_energy."
 PLANTS = "iblf_jax.plants has them; iblf_jax.testing.check_plant checks your own."
-PROTOCOLS = {
+CONTRACTS: dict[str, tuple[Any, str]] = {
     "reference": (Reference, "iblf_jax.references has them."),
-    "controller": (
-        Controller,
-        "iblf_jax.controllers has them; iblf_jax.testing.check_law checks your own.",
-    ),
-    "observer": (Observer, "iblf_jax.observers has them; NoObserver() for none."),
+    "observer": (observers.contract_of, "iblf_jax.observers has them; NoObserver() for none."),
     "disturbance": (Disturbance, "iblf_jax.disturbances has them; Nothing() for none."),
-    "sensor": (Sensor, "iblf_jax.sensors has them; Ideal() for none."),
+    "sensor": (sensors.contract_of, "iblf_jax.sensors has them; Ideal() for none."),
     "actuator": (Actuator, "iblf_jax.actuators has them; Ideal() for none."),
 }
-"""Part of a scenario that a user may write -> its protocol, and the remedy of an error message."""
+"""Part of a scenario that a user may write -> its contract, or a function of the part that returns
+it, and the remedy of an error message.
+"""
+LAWS = "iblf_jax.controllers has them; iblf_jax.testing.check_law checks your own."
 CLASSES: dict[str, tuple[Any, str]] = {
     "initial": (Initial, "an Initial, such as Initial(q=[0.8, 0.8])"),
     "bounds": (Bounds, "a Bounds, such as Bounds(lower=Constant(0.1), upper=Constant(0.9))"),
@@ -152,6 +155,18 @@ def _of_level(level: int) -> Callable[[Mapping[str, Unit], int], Mapping[str, Un
 
 BOUNDS_OF_SECOND_LEVEL = {"part_units": _of_level(2)}
 """Metadata of the bounds of the levels from the second on."""
+
+
+class Loop(NamedTuple):
+    """The parts of a scenario of which the closed loop knows one kind only: a robot is a plant of
+    order 2, and parts of q and q' are parts of x.
+    """
+
+    plant: Plant
+    model: Plant
+    law: Law
+    observer: Observer
+    sensor: Sensor
 
 
 @component
@@ -199,13 +214,13 @@ class Scenario:
     plant: Annotated[Robot, Plant]
     reference: Reference
     bounds: Bounds
-    controller: Controller
+    controller: TrackingLaw
     initial: Initial
-    observer: Observer = NoObserver()
+    observer: DisturbanceObserver = NoObserver()
     disturbance: Disturbance = Nothing()
     model: Annotated[Robot, Plant] = None  # type: ignore[assignment]
     sampling: Sampling | None = None
-    sensor: Sensor = IdealSensor()
+    sensor: AnySensor = IdealSensor()
     actuator: Actuator = IdealActuator()
     velocity_bounds: Bounds | None = dataclasses.field(
         default=None, metadata=BOUNDS_OF_SECOND_LEVEL
@@ -226,9 +241,10 @@ class Scenario:
         for name in ("plant", "model"):
             check_plant_or_robot(f"Scenario.{name}", vars(self)[name])
         parts = field_values(self)
-        for name, (protocol, remedy) in PROTOCOLS.items():
-            checks.conforms(f"Scenario.{name}", parts[name], protocol, remedy)
-        adopt_layers(self.controller)
+        check_law("Scenario.controller", self.controller, LAWS)
+        for name, (contract, remedy) in CONTRACTS.items():
+            base = contract if isinstance(contract, type) else contract(parts[name])
+            checks.conforms(f"Scenario.{name}", parts[name], base, remedy)
         self._check_classes()
         self._fit_state_bounds()
         self._check_combination()
@@ -243,10 +259,10 @@ class Scenario:
     def _complete_law(self) -> None:
         """Gives the law what it derives from its model and the start, such as weights."""
         law = unwrapped(self.controller)
-        if type(law).completed is Controller.completed:
+        if type(law).completed is TrackingLaw.completed:
             return
         with jax.ensure_compile_time_eval():
-            new = law.completed(self.context, model_state(self, *start_levels(self)))
+            new = law.completed(self.context, start_levels(self)[: self.loop.model.order])
         if new is not law:
             object.__setattr__(self, "controller", rewrapped(self.controller, new))
 
@@ -318,6 +334,17 @@ class Scenario:
                     expected = "no regions, as this plant has no points in space"
                     raise checks.fail(name, region, expected, "Use bounds or state_bounds.")
                 _check_region(name, region, robot)
+
+    @property
+    def loop(self) -> Loop:
+        """The parts as the closed loop runs them, for a plant in strict-feedback form."""
+        return Loop(
+            plants.as_plant(self.plant),
+            plants.as_plant(self.model),
+            law_of_x(self.controller),
+            observer_of_x(self.observer),
+            sensor_of_x(self.sensor),
+        )
 
     @property
     def n(self) -> int:
@@ -422,7 +449,7 @@ def check_levels(scenario: Scenario) -> None:
         raise checks.fail("Scenario.model", f"a plant of order {known}", expected)
     law = unwrapped(scenario.controller)
     kind = type(law).__name__
-    if plants.is_chain(model) and not law.receives_x:
+    if plants.is_chain(model) and not isinstance(law, Law):
         expected = f"a robot as the model of the law {kind}"
         robot = plants.robot_of(model)
         remedy = "Take controllers.BarrierBackstepping"
@@ -447,7 +474,7 @@ def _check_observer(scenario: Scenario) -> None:
     observer, model = scenario.observer, scenario.model
     if isinstance(observer, NoObserver):
         return
-    if observer.receives_x:
+    if isinstance(observer, Observer):
         observer.check_model(plants.as_plant(model))
         return
     if plants.is_chain(model) and is_default(model.joint_torque, Plant.joint_torque):
@@ -487,14 +514,14 @@ UNKNOWN_UNIT = "1"
 def _check_measured_levels(scenario: Scenario) -> None:
     """Raises ValueError for levels that are neither measured nor estimated."""
     order = plants.order_of(scenario.plant)
-    covered = scenario.sensor.order
+    sensor, observer = scenario.loop.sensor, scenario.loop.observer
+    covered = sensor.order
     if covered not in (None, order):
         expected = f"sensors of {order} levels, as the plant has"
         remedy = "None is for a level that is not measured."
         raise checks.fail("Scenario.sensor", f"sensors of {covered} levels", expected, remedy)
     every = tuple(range(1, plants.order_of(scenario.model) + 1))
-    measured = scenario.sensor.measured or every
-    observer = scenario.observer
+    measured = sensor.measured or every
     needed = every
     if observer.completes:
         needed = observer.measured or every
@@ -502,7 +529,7 @@ def _check_measured_levels(scenario: Scenario) -> None:
     if not missing:
         return
     which = ", ".join(missing)
-    expected = f"level {which} measured, which {type(observer).__name__} reads"
+    expected = f"level {which} measured, which {type(scenario.observer).__name__} reads"
     if needed is every:
         expected = "every level of the model measured, or estimated by an observer"
     levels = tuple(level for level in every if level in measured)
@@ -852,7 +879,7 @@ def _initial_values(scenario: Scenario) -> _InitialValues:
     for name, part in parts.items():
         robot = plants.robot_of(part)
         if plants.is_chain(part):
-            x = state_of_levels(q, dq, start_levels(scenario)[2])[: part.order]
+            x = start_levels(scenario)[: part.order]
             _check_shapes_of_plant(name, part, t, x)
         if robot is not None:
             _shaped(f"{name}.mass_matrix(q)", partial(robot.mass_matrix, q), n, n)
@@ -943,7 +970,7 @@ def _check_levels_at_start(scenario: Scenario) -> None:
     """
     if not plants.is_chain(scenario.plant):
         return
-    x = state_of_levels(*start_levels(scenario))
+    x = start_levels(scenario)
     t = jnp.zeros((), x.dtype)
     if not np.all(np.isfinite(x)):
         raise checks.fail("initial.x", x, "finite levels at the start")

@@ -25,13 +25,14 @@ from iblf_jax.control.controllers import (
     KEEPERS,
     LAWS,
     BarrierBackstepping,
-    Controller,
+    Law,
     Saturated,
+    TrackingLaw,
     law_by_name,
 )
-from iblf_jax.control.controllers._base import adopt_layers
+from iblf_jax.control.controllers._base import check_law
 from iblf_jax.control.controllers.systems import observer_of
-from iblf_jax.control.observers import NoObserver
+from iblf_jax.control.observers import DisturbanceObserver, NoObserver
 from iblf_jax.core import checks, notices, programs
 from iblf_jax.core.attributes import attributes
 from iblf_jax.core.progress import announced
@@ -60,7 +61,7 @@ from iblf_jax.studies.time_step import needed_dt
 from iblf_jax.world import plants
 
 NAMES = (*LAWS, *KEEPERS)
-Laws = Sequence[str | Controller] | Mapping[str, str | Controller]
+Laws = Sequence[str | TrackingLaw] | Mapping[str, str | TrackingLaw]
 ONLY_K = (
     "the factor scales k and not the weights: if the barriers of the laws have different units,"
     " choose the weights first (BarrierBackstepping, weights)"
@@ -145,7 +146,7 @@ def compare(
     )
 
 
-def _named_laws(laws: Laws) -> dict[str, str | Controller]:
+def _named_laws(laws: Laws) -> dict[str, str | TrackingLaw]:
     """The laws by the name to show."""
     if isinstance(laws, str) or not isinstance(laws, Mapping | Sequence) or len(laws) == 0:
         raise checks.fail(
@@ -157,15 +158,14 @@ def _named_laws(laws: Laws) -> dict[str, str | Controller]:
     pairs: list[tuple[str | None, Any]] = [(None, law) for law in laws]
     if isinstance(laws, Mapping):
         pairs = [(str(name), law) for name, law in laws.items()]
-    named: dict[str, str | Controller] = {}
+    named: dict[str, str | TrackingLaw] = {}
     for name, law in pairs:
         if isinstance(law, str):
             checks.one_of("laws", law, NAMES)
             title = law
         else:
             label = type(law).__name__ if name is None else name
-            checks.conforms(f"laws[{label!r}]", law, Controller, f"Or a name: {', '.join(NAMES)}.")
-            adopt_layers(law)
+            check_law(f"laws[{label!r}]", law, f"Or a name: {', '.join(NAMES)}.")
             title = _title(law)
         first = shown = title if name is None else name
         count = 1
@@ -176,7 +176,7 @@ def _named_laws(laws: Laws) -> dict[str, str | Controller]:
     return named
 
 
-def _title(law: Controller) -> str:
+def _title(law: TrackingLaw) -> str:
     inner = unwrapped(law)
     barrier = inner.barrier
     text = type(inner).__name__
@@ -187,7 +187,7 @@ def _title(law: Controller) -> str:
     return f"{type(law).__name__}({text})"
 
 
-def _with_law(scenario: Scenario, law: str | Controller) -> Scenario:
+def _with_law(scenario: Scenario, law: str | TrackingLaw) -> Scenario:
     """The scenario under another law, with the observer that belongs to it."""
     if isinstance(law, str):
         own = unwrapped(scenario.controller)
@@ -196,15 +196,15 @@ def _with_law(scenario: Scenario, law: str | Controller) -> Scenario:
         kept = {name: value for name, value in given.items() if value is not None}
         p = getattr(own.barrier, "p", 1)
         controller = _limited_as(scenario.controller, law_by_name(law, p=p, **kept))
-        observer = observer_of(law, scenario.observer)
+        observer: DisturbanceObserver = observer_of(law, scenario.observer)
     else:
         controller = law
         observer = scenario.observer
         if not all(part.uses_observer for part in layers(law)):
             observer = NoObserver()
     model = _model_for(controller, scenario)
-    receives_x = unwrapped(controller).receives_x
-    if isinstance(law, str) and plants.is_chain(model) and not receives_x:
+    is_of_robots = not isinstance(unwrapped(controller), Law)
+    if isinstance(law, str) and plants.is_chain(model) and is_of_robots:
         raise _no_robot(law, model)
     return dataclasses.replace(scenario, controller=controller, observer=observer, model=model)
 
@@ -216,10 +216,10 @@ def _no_robot(name: str, model: Any) -> ValueError:
     return checks.fail("laws", name, expected, remedy)
 
 
-def _model_for(law: Controller, scenario: Scenario) -> Any:
+def _model_for(law: TrackingLaw, scenario: Scenario) -> Any:
     """The scenario's model; for a law of robots its rigid limit, or the robot inside it."""
     model: Any = scenario.model
-    if unwrapped(law).receives_x or not plants.is_chain(model):
+    if isinstance(unwrapped(law), Law) or not plants.is_chain(model):
         return model
     for robot in (model.rigid(), model.robot):
         if robot is not None:
@@ -239,7 +239,7 @@ def _folds(scenario: Scenario, further: Sequence[Fold]) -> tuple[Fold, ...]:
     return (*(fold for fold in usual if not isinstance(fold, replaced)), *further)
 
 
-def _limited_as(controller: Controller, law: Controller) -> Controller:
+def _limited_as(controller: TrackingLaw, law: TrackingLaw) -> TrackingLaw:
     """A law with the torque limits of another one."""
     if not isinstance(controller, Saturated):
         return law
@@ -253,7 +253,7 @@ def _run(scenario: Scenario, options: Mapping[str, Any]) -> Rollout:
         return simulate(scenario, **{**options, "metrics": folds})
 
 
-def gain_names(law: Controller) -> tuple[str, ...]:
+def gain_names(law: TrackingLaw) -> tuple[str, ...]:
     """The leaves of a law that are scaled together: those of its class attribute `gains`, or k1 and
     K2 by default.
     """
@@ -374,7 +374,7 @@ def factor_nearest_one(effort: Callable[[float], float], target: float) -> float
     return search(trials, target).factor
 
 
-def _gains_in_words(law: Controller) -> str:
+def _gains_in_words(law: TrackingLaw) -> str:
     gains = attributes(unwrapped(law), gain_names(law))
     return ", ".join(f"{name} = {_shown(gain)}" for name, gain in gains.items()) or "no gains"
 

@@ -12,7 +12,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.control.controllers._base import state_of_levels
 from iblf_jax.core import checks
 from iblf_jax.core.status import FAILED, has_flag
 from iblf_jax.engine import block_size
@@ -84,7 +83,7 @@ def _initial_margins(scenario: Scenario, samples: Mapping[str, Any]) -> dict[str
         for i, bounds in enumerate(perturbed.state_bounds):
             if bounds is None or Funnel in (type(bounds.lower), type(bounds.upper)):
                 continue
-            x = state_of_levels(*start_levels(perturbed))[i + 1]
+            x = start_levels(perturbed)[i + 1]
             low, high = bounds_at(bounds, zero, jnp.zeros_like(x))
             found[LEVELS[i + 1]] = jnp.minimum(x - low, high - x)
         if perturbed.regions:

@@ -11,12 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.simulation.levels import (
-    estimate_shape,
-    law_state,
-    levels_on_reference,
-    start_levels,
-)
+from iblf_jax.control.controllers._base import law_of_x
+from iblf_jax.simulation.levels import levels_on_reference, start_levels
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.testing._contract import Findings
 
@@ -60,11 +56,13 @@ def _command(
     scenario: Scenario, law: Any, q: jax.Array, dq: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Torque, alpha and V1 without a disturbance; further levels are those on the reference."""
-    context, t = scenario.context, jnp.asarray(TIME)
-    state = law.init(*law_state(scenario, *start_levels(scenario)), context)
-    measured = law_state(scenario, q, dq, levels_on_reference(scenario, t)[2])
-    f_hat = jnp.zeros(estimate_shape(scenario), q.dtype)
-    command = law.command(t, *measured, f_hat, context, state)[0]
+    context, t, model = scenario.context, jnp.asarray(TIME), scenario.loop.model
+    of_x = law_of_x(law)
+    state = of_x.init(start_levels(scenario)[: model.order], context)
+    higher = levels_on_reference(scenario, t)[2 : model.order]
+    x = jnp.stack([q, dq, *higher])
+    f_hat = jnp.zeros(model.estimate_shape, q.dtype)
+    command = of_x.command(t, x, f_hat, context, state)[0]
     return command.tau, command.alpha, command.V1
 
 

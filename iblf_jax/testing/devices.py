@@ -13,6 +13,7 @@ from jax.flatten_util import ravel_pytree
 
 from iblf_jax.control.actuators import Actuator, Delivered
 from iblf_jax.control.sensors import Measurement, Sensor
+from iblf_jax.control.sensors._base import contract_of
 from iblf_jax.core import checks
 from iblf_jax.core.attributes import has_members
 from iblf_jax.testing._contract import (
@@ -42,7 +43,7 @@ UNSTABLE = 1e-6
 def check_sensor(sensor: Any, *, n: int | None = None) -> None:
     """Checks a sensor: shapes, the state's structure, derivatives, float32.
 
-    A sensor with `receives_x` is checked with its `order` levels, 4 if it has no such property.
+    A `Sensor` of x is checked with its `order` levels, 4 if it has no such property.
 
     Args:
       sensor: an instance.
@@ -52,7 +53,7 @@ def check_sensor(sensor: Any, *, n: int | None = None) -> None:
       ContractError: lists what does not hold, with the remedy.
       ValueError: `n` is not a number of joints, or not that of the leaves.
     """
-    with examine_joints(sensor, Sensor, n, "sensor") as (findings, fitted, joints):
+    with examine_joints(sensor, contract_of(sensor), n, "sensor") as (findings, fitted, joints):
         rng = np.random.default_rng(3)
         given = _state_for(fitted, rng, joints)
         normal, period = jnp.asarray(rng.normal(size=(fitted.draws, joints))), jnp.asarray(1e-3)
@@ -69,7 +70,7 @@ def check_sensor(sensor: Any, *, n: int | None = None) -> None:
 
 def _state_for(sensor: Any, rng: np.random.Generator, joints: int) -> tuple[jax.Array, ...]:
     """A random state as the sensor receives it: (q, q'), or (x,)."""
-    if not sensor.receives_x:
+    if not isinstance(sensor, Sensor):
         return tuple(jnp.asarray(rng.uniform(-1, 1, (2, joints))))
     order = sensor.order or DEFAULT_LEVELS
     return (jnp.asarray(rng.uniform(-1, 1, (order, joints))),)

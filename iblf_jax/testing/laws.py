@@ -1,4 +1,4 @@
-"""The checker for tracking laws: the contract is `iblf_jax.controllers.Controller`."""
+"""The checker for tracking laws: the contracts are `iblf_jax.controllers.RobotLaw` and `Law`."""
 
 from __future__ import annotations
 
@@ -10,18 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.control.controllers import Command, Controller, WithDrive
-from iblf_jax.control.controllers._base import adopt_layers
+from iblf_jax.control.controllers import Command, Law, TrackingLaw, WithDrive
+from iblf_jax.control.controllers._base import contract_of, law_of_x
 from iblf_jax.core import notices
 from iblf_jax.core.pytree import field_values, unwrapped
 from iblf_jax.core.status import VIOLATED, Status
 from iblf_jax.engine.simulate import simulate
-from iblf_jax.simulation.levels import (
-    estimate_shape,
-    law_state,
-    levels_on_reference,
-    start_levels,
-)
+from iblf_jax.simulation.levels import levels_on_reference, start_levels
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.testing._contract import (
     Findings,
@@ -70,8 +65,7 @@ def check_law(
       ValueError: not a Scenario, or one with another number of joints than `n`.
     """
     check_scenario(scenario, n)
-    with examine(law, "Controller", Controller) as findings:
-        adopt_layers(law)
+    with examine(law, "TrackingLaw", contract_of(law)) as findings:
         base = in_dtype(scenario_for(findings, law, scenario, n), "float64")
         speeds = base.velocity_bounds
         if speeds is None and unwrapped(law).needs_velocity_bounds:
@@ -88,18 +82,19 @@ def check_law(
         in_both_types(findings, _structure, base)
         t = jnp.asarray(0.7)
         tube = base.context.tube(t)
-        _, dq, higher = levels_on_reference(base, t)
-        measured = law_state(base, tube.q_d + 0.3 * tube.k_u, dq - 0.2, higher)
-        f_hat = jnp.broadcast_to(jnp.linspace(0.1, 0.2, base.n), estimate_shape(base))
+        model = base.loop.model
+        _, dq, *higher = levels_on_reference(base, t)
+        x = jnp.stack([tube.q_d + 0.3 * tube.k_u, dq - 0.2, *higher])[: model.order]
+        f_hat = jnp.broadcast_to(jnp.linspace(0.1, 0.2, base.n), model.estimate_shape)
 
-        def outputs(law, t, measured, f_hat, context):
-            own = law.init(*measured, context)
-            command, rate = law.command(t, *measured, f_hat, context, own)
+        def outputs(law, t, x, f_hat, context):
+            of_x = law_of_x(law)
+            command, rate = of_x.command(t, x, f_hat, context, of_x.init(x, context))
             rates = leaves_by_name("its state's rate", rate)
             found = {"tau": command.tau, "alpha": command.alpha, "V1": command.V1}
             return found | leaves_by_name("input", command.input) | rates
 
-        arguments = (t, measured, f_hat, base.context)
+        arguments = (t, x, f_hat, base.context)
         check_function(findings, outputs, base.controller, arguments)
         _declarations(findings, outputs, base.controller, arguments)
         check_claims(findings, base)
@@ -120,7 +115,7 @@ def _declarations(
     """
     inner = unwrapped(law)
     gains = inner.gains
-    if gains is not Controller.gains:
+    if gains is not TrackingLaw.gains:
         names = tuple(field_values(inner))
         unknown = [name for name in gains if name not in names]
         findings.require(
@@ -130,9 +125,9 @@ def _declarations(
         )
     if law.uses_observer:
         return
-    t, measured, f_hat, context = arguments
-    with_estimate = outputs(law, t, measured, f_hat, context)
-    without = outputs(law, t, measured, jnp.zeros_like(f_hat), context)
+    t, x, f_hat, context = arguments
+    with_estimate = outputs(law, t, x, f_hat, context)
+    without = outputs(law, t, x, jnp.zeros_like(f_hat), context)
     changed = [name for name, x in with_estimate.items() if not jnp.array_equal(x, without[name])]
     findings.require(
         not changed,
@@ -142,15 +137,14 @@ def _declarations(
 
 
 def _structure(findings: Findings, scenario: Scenario) -> None:
-    law = scenario.controller
-    context = scenario.context
-    q = scenario.initial.q
-    t = jnp.zeros((), q.dtype)
-    measured = law_state(scenario, *start_levels(scenario))
-    names = "x" if unwrapped(law).receives_x else "q, dq"
+    law: Any = scenario.controller
+    context, model = scenario.context, scenario.loop.model
+    x = start_levels(scenario)[: model.order]
+    q, t = x[0], jnp.zeros((), x.dtype)
+    measured, names = ((x,), "x") if isinstance(law, Law) else ((x[0], x[1]), "q, dq")
     state = shape_of(findings, f"init({names}, context)", law.init, *measured, context)
     label = f"command(t, {names}, f_hat, context, state)"
-    f_hat = jnp.zeros(estimate_shape(scenario), q.dtype)
+    f_hat = jnp.zeros(model.estimate_shape, q.dtype)
     answer = shape_of(findings, label, law.command, t, *measured, f_hat, context, state)
     is_pair = isinstance(answer, tuple) and len(answer) == 2 and isinstance(answer[0], Command)
     findings.result_is(is_pair, label, answer, "It must be a pair (Command, rate of the state)")

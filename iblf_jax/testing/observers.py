@@ -1,4 +1,6 @@
-"""The checker for disturbance observers: the contract is `iblf_jax.observers.Observer`."""
+"""The checker for disturbance observers: the contracts are
+`iblf_jax.observers.RobotObserver` and `Observer`.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.control.observers import Observer
+from iblf_jax.control.observers._base import contract_of, observer_of_x
 from iblf_jax.core import checks
 from iblf_jax.testing._contract import (
     Findings,
@@ -41,9 +44,8 @@ def check_observer(observer: Any, *, model: Any = None, n: int | None = None) ->
 
     Args:
       observer: an instance.
-      model: the robot that it knows, or the plant in strict-feedback form for an observer with
-        `receives_x`; an arm of n joints if not given, or one with as many levels as its leaves have
-        rows.
+      model: the robot that it knows, or the plant in strict-feedback form for an `Observer` of x;
+        an arm of n joints if not given, or one with as many levels as its leaves have rows.
       n: number of joints, if no model is given; that of its leaves if not given, 2 if these are
         scalars.
 
@@ -53,14 +55,16 @@ def check_observer(observer: Any, *, model: Any = None, n: int | None = None) ->
         leaves.
     """
     check_number(n)
-    with examine(observer, "Observer", Observer) as findings:
-        receives_x = observer.receives_x
+    with examine(observer, "Observer", contract_of(observer)) as findings:
+        receives_x = isinstance(observer, Observer)
         if model is not None:
             check_model(model, receives_x)
         else:
             joints = number_of_joints(findings, observer, n)
             model = plant_of(levels_of(observer), joints) if receives_x else arm_of(joints)
         check_joints_of(n, model, "model")
+        if receives_x:
+            model = plants.as_plant(model)
         model = in_dtype(model, "float64")
         n, t = model.n, jnp.asarray(0.7)
         fitted = fitted_to(in_dtype(observer, "float64"), n, "observer")
@@ -101,7 +105,7 @@ class Case(NamedTuple):
 def _case(observer: Any, model: Any, n: int) -> Case:
     """Random arguments for an observer of robots, or of plants in strict-feedback form."""
     rng = np.random.default_rng(3)
-    if not observer.receives_x:
+    if not isinstance(observer, Observer):
         q, dq, tau = jnp.asarray(rng.uniform(-1, 1, (3, n)))
         return Case((q, 0.5 * dq), (q, dq), tau)
     observer.check_model(model)
@@ -110,22 +114,22 @@ def _case(observer: Any, model: Any, n: int) -> Case:
 
 
 def _structure(findings: Findings, observer, t, case: Case, model) -> None:
-    receives_x = observer.receives_x
+    receives_x = isinstance(observer, Observer)
     names = "x" if receives_x else "q, dq"
     state = shape_of(findings, f"init({names}, model)", observer.init, *case.start, model)
     label = f"estimate(t, {names}, model, state)"
     # The estimate has the shape of the torque of a robot, or of the state of a plant.
-    shape = case.measured[0].shape
+    shape = model.estimate_shape if receives_x else case.measured[0].shape
     call_has_shape(findings, label, observer.estimate, (t, *case.measured, model, state), shape)
     label = f"derivative(t, {names}, tau, model, state)"
     arguments = (t, *case.measured, case.tau, model, state)
     rate = shape_of(findings, label, observer.derivative, *arguments)
     same_structure(findings, label, rate, state)
-    if observer.completes:
+    if receives_x and observer.completes:
         label = f"complete(t, {names}, model, state)"
         arguments = (t, *case.measured, model, state)
         call_has_shape(findings, label, observer.complete, arguments, shape)
-    if observer.advances:
+    if observer_of_x(observer).advances:
         label = f"advance(t, {names}, tau, model, state, period)"
         arguments = (t, *case.measured, case.tau, model, state, jnp.asarray(1e-3, t.dtype))
         after = shape_of(findings, label, observer.advance, *arguments)

@@ -9,9 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.certificates.claims import OWN_CLAIM_METHODS, stated_methods, states_disturbance_terms
+from iblf_jax.control.controllers import Law
+from iblf_jax.control.controllers._base import law_of_x
 from iblf_jax.core.attributes import attributes, has_members
-from iblf_jax.core.pytree import unwrapped
-from iblf_jax.simulation.levels import estimate_shape, law_state, start_levels
+from iblf_jax.simulation.levels import start_levels
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.testing._contract import Findings, check_function, in_both_types, shape_of
 
@@ -37,23 +38,25 @@ def check_claims(findings: Findings, scenario: Scenario) -> None:
     in_both_types(findings, _shapes, scenario)
     t, q, dq, f_tilde = _near_the_reference(scenario, np.random.default_rng(5))
     context = scenario.context
-    f_tilde = jnp.broadcast_to(f_tilde, estimate_shape(scenario))
+    model = scenario.loop.model
+    f_tilde = jnp.broadcast_to(f_tilde, model.estimate_shape)
 
-    def outputs(law, t, measured, f_tilde, context):
-        own = law.init(*measured, context)
+    def outputs(law, t, x, f_tilde, context):
+        of_x = law_of_x(law)
+        own = of_x.init(x, context)
         return {
-            name: method(t, *measured, f_tilde, context, own)
-            for name, method in attributes(law, OWN_CLAIM_METHODS).items()
+            name: method(t, x, f_tilde, context, own)
+            for name, method in attributes(of_x, OWN_CLAIM_METHODS).items()
         }
 
-    *_, higher = start_levels(scenario)
-    first = law_state(scenario, q[0], dq[0], higher)
+    start = start_levels(scenario)[: model.order]
+    first = start.at[0].set(q[0]).at[1].set(dq[0])
     check_function(findings, outputs, law, (t, first, f_tilde, context))
 
     @jax.jit
     def sums(q, dq):
-        measured = law_state(scenario, q, dq, higher)
-        found = outputs(law, t, measured, jnp.zeros_like(f_tilde), context)
+        x = start.at[0].set(q).at[1].set(dq)
+        found = outputs(law, t, x, jnp.zeros_like(f_tilde), context)
         return jax.tree.map(jnp.sum, found)
 
     for name, values in jax.vmap(sums)(q, dq).items():
@@ -77,14 +80,14 @@ def _near_the_reference(
 
 def _shapes(findings: Findings, scenario: Scenario) -> None:
     law: Any = scenario.controller
-    context, q = scenario.context, scenario.initial.q
-    measured = law_state(scenario, *start_levels(scenario))
-    t, zero = jnp.zeros((), q.dtype), jnp.zeros(estimate_shape(scenario), q.dtype)
+    context, model = scenario.context, scenario.loop.model
+    x = start_levels(scenario)[: model.order]
+    q, t, zero = x[0], jnp.zeros((), x.dtype), jnp.zeros(model.estimate_shape, x.dtype)
+    measured, names = ((x[0], x[1]), "q, dq, f_tilde")
+    if isinstance(law, Law):
+        measured, names = (x,), "x, d_tilde"  # type: ignore[assignment]
     own = law.init(*measured, context)
     arguments: tuple[Any, ...] = (t, *measured, zero, context, own)
-    names = "q, dq, f_tilde"
-    if unwrapped(law).receives_x:
-        names = "x, d_tilde"
     for name, method in attributes(law, OWN_CLAIM_METHODS).items():
         label = f"{name}(t, {names}, context, state)"
         _is_summable(findings, label, shape_of(findings, label, method, *arguments), q)

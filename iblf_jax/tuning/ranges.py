@@ -51,6 +51,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.control.sensors import Sensor
 from iblf_jax.core import checks, programs
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.engine.period import radius_at
@@ -58,7 +59,7 @@ from iblf_jax.engine.step_size import fastest_along, start_and_along
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.closed_loop import LoopState, run_sampled_law
 from iblf_jax.simulation.integrators import tableau
-from iblf_jax.simulation.levels import sensor_state, start_levels
+from iblf_jax.simulation.levels import start_levels
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.sampling import commands_in_transit
 from iblf_jax.simulation.scenario import Scenario
@@ -243,9 +244,7 @@ def _is_of_chain(scenario: Scenario, path: str) -> bool:
 def _bound_at_start(scenario: Scenario, path: str, start: np.ndarray) -> End:
     """The end of the range of a constant bound of a level towards the start of the level."""
     found: Any = LEVEL_BOUND.match(path)
-    _, second, higher = start_levels(scenario)
-    levels = np.stack([second, *higher])
-    level = levels[int(found[1])]
+    level = np.asarray(start_levels(scenario))[int(found[1]) + 1]
     for entry in re.findall(r"\d+", found[3]):
         level = level[int(entry)]
     return End(level + LEAST_SHARE * (start - level), BY_LEVEL)
@@ -435,7 +434,7 @@ def _command_steps(scenario: Scenario, times: jax.Array) -> tuple[jax.Array, jax
 
     def at(t: jax.Array, state: LoopState) -> tuple[jax.Array, jax.Array]:
         normal = jnp.zeros((sensor.draws, scenario.n), times.dtype)
-        y, *_ = sensor_state(scenario, state.q, state.dq, state.higher)
+        y = state.x if isinstance(sensor, Sensor) else state.q
         by_y, by_noise = jax.jacfwd(partial(command, t, state), argnums=(0, 1))(y, normal)
         by_count = (by_y * jnp.broadcast_to(resolution, y.shape)).reshape(scenario.n, -1).T
         return by_count, jnp.sqrt(jnp.sum(by_noise**2, axis=(1, 2)))

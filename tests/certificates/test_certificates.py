@@ -901,7 +901,7 @@ def test_where_an_own_claim_is_not_made(own):
 
 def test_half_a_claim_is_refused(own):
     half = ij.component(
-        type("Half", (Passive,), {"__annotations__": {}, "decay": ij.controllers.Controller.decay})
+        type("Half", (Passive,), {"__annotations__": {}, "decay": ij.controllers.RobotLaw.decay})
     )
     with pytest.raises(ValueError, match="with lyapunov and without decay"):
         certify(dataclasses.replace(own, controller=half(slope=3.0, K=2.0)), **OWN)

@@ -227,15 +227,15 @@ def test_without_a_reached_limit_it_is_the_law_without_it(name):
 @pytest.mark.parametrize("name", ["adaptive_rbf", "adaptive_network"])
 def test_the_command_of_a_network_with_an_auxiliary_state_needs_no_model(name):
     scenario = canonical(ij.with_parts(PAPER, controller=_limited(LAWS[name], 1e4)))
-    law, q, dq = scenario.controller, jnp.array([0.5, 0.6]), jnp.array([0.1, 0.2])
-    state = law.init(q, dq, scenario.context)._replace(auxiliary=jnp.array([0.3, -0.2]))
+    law, x = scenario.controller, jnp.array([[0.5, 0.6], [0.1, 0.2]])
+    state = law.init(x, scenario.context)._replace(auxiliary=jnp.array([0.3, -0.2]))
     commands = []
     for mass in (1.0, 3.0):
         model = ij.with_parameters(scenario, {"model.mass": mass}).model
         context = scenario.context._replace(model=model)
-        commands.append(law.command(jnp.asarray(0.0), q, dq, jnp.zeros(2), context, state)[0])
+        commands.append(law.command(jnp.asarray(0.0), x, jnp.zeros(2), context, state)[0])
     np.testing.assert_array_equal(commands[0].tau, commands[1].tau)
-    np.testing.assert_array_equal(commands[0].input_slope, dq - commands[0].alpha)
+    np.testing.assert_array_equal(commands[0].input_slope, x[1] - commands[0].alpha)
 
 
 @pytest.mark.slow

@@ -91,9 +91,13 @@ def test_the_momentum_observer_finds_a_constant_torque():
 
 
 def test_no_observer_estimates_nothing():
-    q = jnp.ones(2)
-    assert np.all(np.asarray(NoObserver().estimate(0.0, q, q, None, ())) == 0)
-    assert jax.tree.leaves(NoObserver().init(q, q, None)) == []
+    robot, drive = ij.presets.zhang_yan_2024(), ij.presets.motor_driven_two_link()
+    for scenario, shape in ((robot, (2,)), (drive, (3, 2))):
+        model = scenario.loop.model
+        x = jnp.ones((model.order, 2))
+        estimate = NoObserver().estimate(0.0, x, model, ())
+        assert estimate.shape == shape and not np.any(np.asarray(estimate))
+        assert jax.tree.leaves(NoObserver().init(x, model)) == []
 
 
 def test_a_law_without_an_observer_is_not_advised_about_kf(paper):

@@ -96,8 +96,8 @@ def test_it_keeps_what_the_law_breaks(alone, options):
 
 def commands(scenario, t, q, dq):
     """Torque of the filter and of the law in it, and the slack."""
-    law, zero = scenario.controller, jnp.zeros(2)
-    found, bare = (x.command(t, q, dq, zero, scenario.context, ())[0] for x in (law, law.law))
+    law, x, zero = scenario.controller, jnp.stack([q, dq]), jnp.zeros(2)
+    found, bare = (y.command(t, x, zero, scenario.context, ())[0] for y in (law, law.inner))
     return found.tau, bare.tau, found.slack
 
 

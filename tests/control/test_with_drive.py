@@ -33,9 +33,9 @@ def test_the_voltage_is_that_of_the_steady_current():
     """u = R tau/Kt + Kb q'; tau is still the torque."""
     law = WithDrive(PD, drive=DRIVE)
     q, dq = jnp.array([0.7, 0.6]), jnp.array([0.2, -0.4])
-    arguments = (jnp.asarray(0.1), q, dq, jnp.zeros(2), PAPER.context, ())
-    torque = PD.command(*arguments)[0].tau
-    command, _ = law.command(*arguments)
+    t, zero, context = jnp.asarray(0.1), jnp.zeros(2), PAPER.context
+    torque = PD.command(t, q, dq, zero, context, ())[0].tau
+    command, _ = law.command(t, jnp.stack([q, dq]), zero, context, ())
     np.testing.assert_array_equal(command.tau, torque)
     expected = np.array([1.0, 0.5]) * torque / np.array([2.0, 1.5]) + 0.5 * dq
     np.testing.assert_allclose(command.input, expected, rtol=1e-15)

@@ -275,7 +275,7 @@ def output_of(code: str, packed: bytes, *folders: str) -> list[bytes]:
 
 def test_a_field_may_have_the_name_of_a_property_of_the_base_class():
     @ij.component
-    class Counting(ij.sensors.Sensor):
+    class Counting(ij.sensors.RobotSensor):
         draws: int = ij.static()
         resolution: ij.Leaf = ij.leaf("rad")
 

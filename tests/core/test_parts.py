@@ -110,7 +110,7 @@ def test_a_robot_of_other_joints_takes_its_surroundings_with_it(paper):
         ({"controler": LAWS["pd_gravity"]}, "got 'controler'"),
         (
             {"controller": OBSERVERS["momentum"]},
-            "Scenario.controller: got .* a component that fits .*Controller",
+            "Scenario.controller: got .* a component that fits .*RobotLaw",
         ),
         ({"observer": None}, "Scenario.observer: got None"),
         ({"observer": ij.observers.NoObserver}, "It is a class: make an instance"),

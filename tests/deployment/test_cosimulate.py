@@ -88,7 +88,8 @@ def test_on_the_nominal_arm_it_is_simulate(scenario):
         np.testing.assert_allclose(
             other.metrics[name], run.metrics[name], rtol=1e-9, atol=1e-9, err_msg=name
         )
-    assert int(other.status) == int(run.status)
+    # A co-simulation has no estimate of its error.
+    assert int(other.status) == int(run.status) & ~int(ij.Status.INACCURATE)
 
 
 @pytest.mark.slow

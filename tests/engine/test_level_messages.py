@@ -137,7 +137,8 @@ def test_a_robot_keeps_its_words():
     bounds = symmetric(0.1)
     robot = ij.with_parts(ij.presets.zhang_yan_2024(), velocity_bounds=bounds)
     text = message_of(robot, duration=0.5)
-    assert "a velocity bound was violated. Joint 1 left its velocity bounds first" in text
+    assert "a velocity bound was violated" in text
+    assert "Joint 1 left its velocity bounds first" in text
     assert "2 joints" in repr(ij.simulate(ij.presets.zhang_yan_2024(), duration=0.02, dt=1e-3))
     assert "1 component," in repr(ij.simulate(pendulum(), duration=0.02, dt=1e-3))
 

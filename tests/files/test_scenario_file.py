@@ -153,7 +153,7 @@ def test_a_preset_with_arguments_and_parameters(tmp_path):
 def test_users_classes_are_refused_until_they_have_a_name(paper, monkeypatch):
     @ij.component
     class Doubled:
-        inner: ij.controllers.Controller
+        inner: ij.controllers.RobotLaw
         factor: jax.Array = ij.leaf("1", shape="scalar", default=2.0)
         label: str = ij.static(default="twice")
 

@@ -264,7 +264,7 @@ SCENARIOS = {
         "2 (one a joint)",
     ),
     "controller-object": (with_part(controller=object()), "Scenario.controller", "check_law"),
-    "controller-gains": (with_part(controller=[2.0, 20.0]), "Scenario.controller", "Controller"),
+    "controller-gains": (with_part(controller=[2.0, 20.0]), "Scenario.controller", "RobotLaw"),
     "observer-number": (with_part(observer=20.0), "Scenario.observer", "NoObserver()"),
     "disturbance-list": (
         with_part(disturbance=[disturbances.Friction()]),

@@ -245,9 +245,9 @@ def test_an_object_of_the_reference_is_defined_for_the_general_index(path, expec
 
 
 def test_a_protocol_and_its_methods_are_defined_for_the_general_index():
-    text = reference.page_of(ij.observers.Observer, "observers.Observer", 3)
-    assert "```{py:class} Observer\n:module: iblf_jax.observers\n:no-typesetting:" in text
-    assert "```{py:method} Observer.estimate(" in text
+    text = reference.page_of(ij.observers.RobotObserver, "observers.RobotObserver", 3)
+    assert "```{py:class} RobotObserver\n:module: iblf_jax.observers\n:no-typesetting:" in text
+    assert "```{py:method} RobotObserver.estimate(" in text
 
 
 def test_the_head_of_a_module_is_on_the_page_of_what_refers_to_it():

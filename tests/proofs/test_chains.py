@@ -93,13 +93,13 @@ def derivative_along_the_loop(scenario, weights):
 
     def energy(t, state):
         x = state.x
-        motion = (state.q, state.dq, state.higher)
-        d_hat = levels.observer_estimate(scenario, scenario.observer, t, *motion, state.observer)
+        loop = scenario.loop
+        d_hat = levels.estimate(scenario, loop.observer, t, x, state.observer)
         if d_hat.ndim == 1:
             d_hat = jnp.zeros_like(x)
         command, _ = scenario.controller.command(t, x, d_hat, scenario.context, ())
-        moved = levels.motion(scenario, t, *motion, command.tau)
-        d = levels.uncertain_term(scenario, t, *motion, moved, command.tau)
+        moved = levels.motion(scenario, t, x, command.tau)
+        d = loop.model.uncertain(t, x, moved, command.tau)
         return jnp.sum(command.V1) + 0.5 * jnp.sum(weights * (d - d_hat) ** 2)
 
     state = closed_loop.initial_state(scenario)

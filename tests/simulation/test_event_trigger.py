@@ -112,7 +112,7 @@ def test_the_compensation_bounds_what_a_held_command_adds(rng):
             return command._replace(input_slope=self.z), ()
 
     law = controllers.EventCompensated(Given(v, z), delta, m_bar, epsilon)
-    u = np.asarray(law.command(*[0.0] * 6)[0].tau)
+    u = np.asarray(law.command(0.0, jnp.zeros((2, 2)), 0.0, None, ())[0].tau)
     np.testing.assert_allclose(u, other.compensated(z, v, delta, m_bar, epsilon), rtol=1e-12)
     a, b = rng.uniform(-1, 1, (2, *size))
     held = (u - b * m) / (1 + a * delta)
@@ -141,7 +141,7 @@ def test_a_command_that_is_not_finite_is_not_held():
     class Failing:
         """A law that computes NaN from a time on."""
 
-        law: controllers.Controller
+        law: controllers.TrackingLaw
 
         def init(self, *arguments):
             """The state of the law."""

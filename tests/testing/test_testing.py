@@ -407,7 +407,7 @@ def claims_of(law):
 
 
 def test_broken_claims_of_a_law():
-    half = changed(Stating, decay=ij.controllers.Controller.decay)
+    half = changed(Stating, decay=ij.controllers.RobotLaw.decay)
     with pytest.raises(ContractError, match="it has lyapunov and no decay"):
         claims_of(half(3.0))
     wide = changed(Stating, decay=lambda self, t, q, dq, *args: jnp.zeros(3))

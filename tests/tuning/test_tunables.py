@@ -197,7 +197,7 @@ def test_numbers_of_a_plant_keep_the_loop_within_the_step():
 @pytest.mark.slow
 def test_bounds_of_levels_contain_the_start():
     drive = canonical(loops_of_plants.electric_drive())
-    current = start_levels(drive)[2][0]
+    current = start_levels(drive)[2]
     low, _, reasons = ends(drive, "state_bounds[1].upper.value")
     assert reasons == (ranges.BY_LEVEL, ranges.UNLIMITED)
     np.testing.assert_allclose(low, current + ranges.LEAST_SHARE * (60.0 - current))

@@ -202,10 +202,11 @@ duration = 0.3
 method = "euler"
 [tune]
 parameters = ["controller.k1", { path = "controller.K2", low = 0.6, high = 30.0, tied = true }]
-iterations = 4
 runs = 4
 risk = "cvar"
 level = 0.75
+[tune.effort]
+iterations = 4
 [tune.report]
 runs = 64
 [[objective]]
@@ -383,7 +384,7 @@ def tuned(paper, tmp_path_factory):
 EARLIER = Path(__file__).parents[1] / "data" / "tuning_before_weights.json"
 BRIEF = {
     "duration": 0.01,
-    "iterations": 1,
+    "effort": ij.tuning.Effort(iterations=1),
     "report": ij.tuning.Report(runs=2),
     "progress": False,
 }

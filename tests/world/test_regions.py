@@ -137,7 +137,9 @@ def test_the_torque_is_that_of_every_set_of_active_rows(rng):
     q, v = rng.uniform([0.8, 0.9], [1.2, 1.6], (60, 2)), rng.uniform(-1.5, 1.5, (60, 2))
     law, zero = scenario.controller, jnp.zeros(2)
     found = jax.jit(
-        jax.vmap(lambda q, v: law.command(zero[0], q, v, zero, scenario.context, ())[0])
+        jax.vmap(
+            lambda q, v: law.command(zero[0], jnp.stack([q, v]), zero, scenario.context, ())[0]
+        )
     )(q, v)
     np.testing.assert_array_equal(found.slack, 0.0)
     np.testing.assert_array_equal(found.region_slack, 0.0)

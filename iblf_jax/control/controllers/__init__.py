@@ -1,12 +1,15 @@
-"""Tracking laws.  The contract is the base class `Controller`; `law_by_name` makes the paper's
-systems.
+"""Tracking laws.  The contract of a law of robots is the base class `RobotLaw`, that of a law of
+plants in strict-feedback form `Law`; `law_by_name` makes the paper's systems.
 """
 
 from iblf_jax.control.controllers._base import Command as Command
-from iblf_jax.control.controllers._base import Controller as Controller
+from iblf_jax.control.controllers._base import Law as Law
 from iblf_jax.control.controllers._base import LawContext as LawContext
 from iblf_jax.control.controllers._base import LyapunovLaw as LyapunovLaw
+from iblf_jax.control.controllers._base import RobotLaw as RobotLaw
 from iblf_jax.control.controllers._base import State as State
+from iblf_jax.control.controllers._base import TrackingLaw as TrackingLaw
+from iblf_jax.control.controllers._base import law_of_x as law_of_x
 from iblf_jax.control.controllers.adaptive_network import AdaptiveNetwork as AdaptiveNetwork
 from iblf_jax.control.controllers.adaptive_parameters import (
     AdaptiveParameters as AdaptiveParameters,
@@ -67,20 +70,23 @@ __all__ = [
     "BarrierBackstepping",
     "Command",
     "ComputedTorque",
-    "Controller",
     "DynamicSurface",
     "EventCompensated",
     "FullState",
+    "Law",
     "LawContext",
     "LyapunovLaw",
     "PDGravity",
     "ReferenceGovernor",
+    "RobotLaw",
     "SafetyFilter",
     "Saturated",
     "State",
     "SurfaceBarrier",
     "TerminalSlidingMode",
+    "TrackingLaw",
     "WithDrive",
     "law_by_name",
+    "law_of_x",
     "within_effort",
 ]

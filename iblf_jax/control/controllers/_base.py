@@ -18,8 +18,9 @@ import jax.numpy as jnp
 
 from iblf_jax.control.barriers import Barrier
 from iblf_jax.control.decays import Decay, Exponential
-from iblf_jax.core.families import adopt, attribute
-from iblf_jax.core.pytree import Leaf, layers, wrapped_field
+from iblf_jax.core import checks
+from iblf_jax.core.families import attribute
+from iblf_jax.core.pytree import Leaf, component, layers, wrapped_field
 from iblf_jax.core.time import Timed
 from iblf_jax.world.bounds import Bounds, Tube, speed_limits_at, tube_at
 from iblf_jax.world.references import Reference
@@ -138,15 +139,8 @@ class Command(NamedTuple):
     """The auxiliary state lambda of a limited input, (n,); `()` for laws without one."""
 
 
-class Controller(Timed):
-    """The contract of a tracking law.
-
-    A law with a proof of its own is a `LyapunovLaw`; then `certify` checks what it states.
-
-    A law of plants in strict-feedback form (`receives_x`) receives the state x, (r, n), in the
-    place of q and q': `init(x, context)`, `command(t, x, d_hat, context, state)` and
-    `switching(t, x, d_hat, context, state)`, with d_hat as the observer gives it, (r, n) or (n,).
-    """
+class TrackingLaw(Timed):
+    """What every tracking law states: a `Law` of the state x, or a `RobotLaw` of q and q'."""
 
     gains: ClassVar[tuple[str, ...]] = ("k1", "K2")
     """The names of the leaves that `compare` scales together."""
@@ -161,8 +155,6 @@ class Controller(Timed):
     """Whether its V1 contains its term of e2, so that V2 adds no 1/2 e2^T M0 e2."""
     filters: ClassVar[bool] = False
     """Whether its commands have a `slack`."""
-    receives_x: ClassVar[bool] = False
-    """Whether it is a law of plants in strict-feedback form."""
     input_unit: ClassVar[str | None] = None
     """The unit of the input that an input map such as `WithDrive` commands; None for the input of
     the model, which is the torque for a robot."""
@@ -195,7 +187,7 @@ class Controller(Timed):
         return False
 
     @attribute
-    def unlimited(self) -> Controller:
+    def unlimited(self) -> Self:
         """The same law without a limit of its own, by which a sampled loop is linearised."""
         return self
 
@@ -218,6 +210,83 @@ class Controller(Timed):
         known.
         """
         return
+
+
+class Law(TrackingLaw):
+    """The contract of a law of plants in strict-feedback form, which receives the state x.
+
+    The estimate d_hat is (r, n), what the disturbance adds to x', or the torque f_hat, (n,) [N m],
+    of an observer of torques on a plant with a robot inside.
+
+    A law may state a Lyapunov function of its own, which `certify` checks: `LyapunovLaw` with x in
+    the place of q and q' and d_tilde, (r, n), in the place of f_tilde.  T is then
+    dV/dx . d_tilde + dV/dd_tilde . d' by default.
+    """
+
+    @abc.abstractmethod
+    def init(self, x: jax.Array, context: LawContext) -> State:
+        """State at the start of a run, given x, (r, n), there; `()` for most laws."""
+
+    @abc.abstractmethod
+    def command(
+        self, t: jax.Array, x: jax.Array, d_hat: jax.Array, context: LawContext, state: State
+    ) -> tuple[Command, State]:
+        """The command, and the rate of the law's own state (same structure as the state).
+
+        Args:
+          t: time, () [s].
+          x: state of the model, (r, n).
+          d_hat: the observer's estimate, (r, n) or (n,).
+          context: model, reference and bounds.
+          state: the law's own state.
+        """
+
+    def switching(
+        self, t: jax.Array, x: jax.Array, d_hat: jax.Array, context: LawContext, state: State
+    ) -> jax.Array | None:
+        """As `RobotLaw.switching`; arguments as `command`."""
+        return None
+
+    def energy(self, t: jax.Array, x: jax.Array, context: LawContext) -> jax.Array | None:
+        """As `RobotLaw.energy`."""
+        return None
+
+    def energy_decay(self, t: jax.Array, x: jax.Array, context: LawContext) -> jax.Array | None:
+        """As `RobotLaw.energy_decay`."""
+        return None
+
+    def lyapunov(
+        self, t: jax.Array, x: jax.Array, d_tilde: jax.Array, context: LawContext, state: State
+    ) -> jax.Array | None:
+        """As `LyapunovLaw.lyapunov`."""
+        return None
+
+    def decay(
+        self, t: jax.Array, x: jax.Array, d_tilde: jax.Array, context: LawContext, state: State
+    ) -> jax.Array | None:
+        """As `LyapunovLaw.decay`."""
+        return None
+
+    def disturbance_terms(
+        self,
+        t: jax.Array,
+        x: jax.Array,
+        d_tilde: jax.Array,
+        dd: jax.Array,
+        context: LawContext,
+        state: State,
+    ) -> jax.Array | None:
+        """T, () or (n,): what d_tilde and d', (r, n) each, may add to V'; None for what they add
+        for any law.
+        """
+        return None
+
+
+class RobotLaw(TrackingLaw):
+    """The contract of a law of robots, which receives q and q'.
+
+    A law with a proof of its own is a `LyapunovLaw`; then `certify` checks what it states.
+    """
 
     @abc.abstractmethod
     def init(self, q: jax.Array, dq: jax.Array, context: LawContext) -> State:
@@ -314,33 +383,120 @@ class Controller(Timed):
         return None
 
 
-class Wrapping(Controller):
+@component
+class LawOfRobot(Law):
+    """command(t, x, ...) = law.command(t, x_1, x_2, ...): a law of q and q' in the closed loop.
+
+    It is no part of a scenario.
+
+    Args:
+      law: any law of robots.
+
+    Source: none; the state of a robot is x = (q, q').
+    """
+
+    law: RobotLaw
+
+    def init(self, x: jax.Array, context: LawContext) -> State:
+        """State of the law."""
+        return self.law.init(x[0], x[1], context)
+
+    def command(
+        self, t: jax.Array, x: jax.Array, d_hat: jax.Array, context: LawContext, state: State
+    ) -> tuple[Command, State]:
+        """Command of the law."""
+        # One array for each level: robots test whether two velocities are the same object.
+        q, dq = x[0], x[1]
+        return self.law.command(t, q, dq, d_hat, context, state)
+
+    def switching(
+        self, t: jax.Array, x: jax.Array, d_hat: jax.Array, context: LawContext, state: State
+    ) -> jax.Array | None:
+        """Switching functions of the law."""
+        return self.law.switching(t, x[0], x[1], context, state)
+
+    def energy(self, t: jax.Array, x: jax.Array, context: LawContext) -> jax.Array | None:
+        """Energy of the law."""
+        return self.law.energy(t, x[0], x[1], context)
+
+    def energy_decay(self, t: jax.Array, x: jax.Array, context: LawContext) -> jax.Array | None:
+        """Decay of the energy of the law."""
+        return self.law.energy_decay(t, x[0], x[1], context)
+
+    def lyapunov(
+        self, t: jax.Array, x: jax.Array, d_tilde: jax.Array, context: LawContext, state: State
+    ) -> jax.Array | None:
+        """V of the law."""
+        return self.law.lyapunov(t, x[0], x[1], d_tilde, context, state)
+
+    def decay(
+        self, t: jax.Array, x: jax.Array, d_tilde: jax.Array, context: LawContext, state: State
+    ) -> jax.Array | None:
+        """W of the law."""
+        return self.law.decay(t, x[0], x[1], d_tilde, context, state)
+
+    def disturbance_terms(
+        self,
+        t: jax.Array,
+        x: jax.Array,
+        d_tilde: jax.Array,
+        dd: jax.Array,
+        context: LawContext,
+        state: State,
+    ) -> jax.Array | None:
+        """T of the law."""
+        return self.law.disturbance_terms(t, x[0], x[1], d_tilde, dd, context, state)
+
+
+def law_of_x(law: TrackingLaw) -> Law:
+    """A law as the closed loop calls it."""
+    if isinstance(law, Law):
+        return law
+    assert isinstance(law, RobotLaw)
+    return LawOfRobot(law)
+
+
+class Wrapping(Law):
     """A law that wraps another one, and has no state and no jump of its own."""
 
-    law: Controller
+    law: TrackingLaw
     wraps = "law"
+
+    @property
+    def inner(self) -> Law:
+        """The wrapped law as a law of x."""
+        return law_of_x(self.law)
 
     def advice(self) -> list[str]:
         """The wrapped law's warnings."""
         return self.law.advice()
 
-    def init(self, *arguments: Any) -> State:
+    def init(self, x: jax.Array, context: LawContext) -> State:
         """The wrapped law's state."""
-        return self.law.init(*arguments)
+        return self.inner.init(x, context)
 
-    def switching(self, *arguments: Any) -> jax.Array | None:
-        """The functions at whose zeros the wrapped law's command jumps; arguments as its
-        `switching`.
-        """
-        return self.law.switching(*arguments)
+    def switching(
+        self, t: jax.Array, x: jax.Array, d_hat: jax.Array, context: LawContext, state: State
+    ) -> jax.Array | None:
+        """The functions at whose zeros the wrapped law's command jumps."""
+        return self.inner.switching(t, x, d_hat, context, state)
 
 
-def adopt_layers(law: Any) -> None:
-    """Makes laws of the classes of a law and of those that it wraps."""
-    adopt(type(law), Controller)
+def contract_of(law: Any) -> type[Law] | type[RobotLaw]:
+    """The contract that a law is meant to fit."""
+    # A user's class without a base class says by this attribute that it receives x.
+    receives_x = isinstance(law, Law) or getattr(law, "receives_x", False) is True
+    return Law if receives_x else RobotLaw
+
+
+def check_law(name: str, law: Any, remedy: str) -> None:
+    """Raises ValueError for something that is not a law; adopts its class and those of the laws
+    that it wraps.
+    """
+    checks.conforms(name, law, contract_of(law), remedy)
     field = wrapped_field(law)
     if field:
-        adopt_layers(vars(law)[field])
+        check_law(f"{name}.{field}", vars(law)[field], remedy)
 
 
 def state_of_levels(q: jax.Array, dq: jax.Array, higher: Any) -> jax.Array:
@@ -358,7 +514,7 @@ def layers_with_states(law: Any, state: Any) -> Iterator[tuple[Any, Any]]:
     """A law and the laws that it wraps, the outermost first, each with its state.
 
     Args:
-      law: any `Controller`.
+      law: any.
       state: of the law, or its rate.
     """
     for layer in layers(law):
@@ -374,7 +530,7 @@ def decay_of(law: Any, i: int) -> Decay:
     return law.decays[i]  # type: ignore[no-any-return]
 
 
-class LyapunovLaw(Controller):
+class LyapunovLaw(RobotLaw):
     """The contract of a law with a Lyapunov function V and its decay W, which `certify`
     checks.
 
@@ -384,10 +540,6 @@ class LyapunovLaw(Controller):
     step of a run.  T is the result of `disturbance_terms`, by default the contribution of the
     uncertain term to V' for any law, T = dV/dq' . M0^-1 f_tilde + dV/df_tilde
     . f'.  V, W and T are (), or (n,) and then summed; unit and scale of V are the law's choice.
-
-    A law that `receives_x` has these methods with x, (r, n), in the place of q and q', and with
-    d_tilde, (r, n), in the place of f_tilde: `lyapunov(t, x, d_tilde, context, state)`.  T is then
-    dV/dx . d_tilde + dV/dd_tilde . d' by default.
     """
 
     @abc.abstractmethod

@@ -43,7 +43,7 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.control.barriers import Barrier, Log
-from iblf_jax.control.controllers._base import Command, Controller, LawContext
+from iblf_jax.control.controllers._base import Command, LawContext, RobotLaw
 from iblf_jax.control.controllers.adaptive_rbf import scaled_input, sobol_centres
 from iblf_jax.control.controllers.backstepping import (
     alpha_and_rate,
@@ -67,7 +67,7 @@ class NetworkWeights(NamedTuple):
 
 
 @component
-class AdaptiveNetwork(Controller):
+class AdaptiveNetwork(RobotLaw):
     """tau = W_hat^T tanh(V_hat^T z) - K2 e2 - w s, with the rates (H.2) of both layers.
 
     s and alpha are the barrier's; no model is used, and f_hat is not.  The state is a

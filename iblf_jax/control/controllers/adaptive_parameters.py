@@ -42,10 +42,12 @@ import numpy as np
 
 from iblf_jax.control.controllers._base import (
     Command,
-    Controller,
+    Law,
     LawContext,
-    LyapunovLaw,
+    TrackingLaw,
     Wrapping,
+    check_law,
+    contract_of,
     decay_of,
     layers_with_states,
 )
@@ -76,7 +78,7 @@ class AdaptiveState(NamedTuple):
 
 
 @component
-class AdaptiveParameters(Wrapping, LyapunovLaw):
+class AdaptiveParameters(Wrapping):
     """theta_hat' = P(-Gamma (Y^T s + sigma (theta_hat - theta_0))),   Y = dtau/dtheta,   s = e2 for
     a robot.
 
@@ -103,7 +105,7 @@ class AdaptiveParameters(Wrapping, LyapunovLaw):
       with barriers as derived at the head of this module.
     """
 
-    law: Controller
+    law: TrackingLaw
     parameters: tuple[str, ...] = static()
     Gamma: Leaf = leaf(
         PlantUnit("theta^2/(N m rad)", "theta^2/energy"), sign="positive", shape="any"
@@ -123,7 +125,7 @@ class AdaptiveParameters(Wrapping, LyapunovLaw):
         """Raises ValueError for a law that states no slope, or numbers that do not fit the
         parameters; completes `band` and repeats single numbers.
         """
-        checks.conforms("AdaptiveParameters.law", self.law, Controller, LAWS)
+        check_law("AdaptiveParameters.law", self.law, LAWS)
         self._check_law()
         names = self.parameters
         are_paths = isinstance(names, tuple | list) and all(isinstance(x, str) for x in names)
@@ -153,8 +155,9 @@ class AdaptiveParameters(Wrapping, LyapunovLaw):
         """
         law: Any = self.law
         field = "AdaptiveParameters.law"
+        contract: Any = contract_of(law)
         kind = type(law)
-        if Controller.energy is kind.energy or Controller.energy_decay is kind.energy_decay:
+        if kind.energy is contract.energy or kind.energy_decay is contract.energy_decay:
             raise checks.fail(field, type(law).__name__, "a law with an `energy`", LAWS)
         if law.reading == "printed":
             remedy = "With C0 q' the term 1/2 e2^T M0' e2 remains. Take reading=\"corrected\"."
@@ -241,32 +244,39 @@ class AdaptiveParameters(Wrapping, LyapunovLaw):
 
     # --- the law ----------------------------------------------------------------------------------
 
-    def init(self, *arguments: Any) -> AdaptiveState:
-        """theta_hat(0) = theta_0, and the state of the wrapped law; arguments as its `init`."""
-        theta = self._nominal(arguments[-1].model)
-        return AdaptiveState(theta, self.law.init(*arguments))
+    def init(self, x: jax.Array, context: LawContext) -> AdaptiveState:
+        """theta_hat(0) = theta_0, and the state of the wrapped law."""
+        return AdaptiveState(self._nominal(context.model), self.inner.init(x, context))
 
-    def command(self, t: jax.Array, *arguments: Any) -> tuple[Command, AdaptiveState]:
-        """The wrapped law's command with theta_hat in its model, and the rates of the states.
-        Arguments as those of the wrapped law; the estimate is not used.
+    def command(
+        self,
+        t: jax.Array,
+        x: jax.Array,
+        d_hat: jax.Array,
+        context: LawContext,
+        state: AdaptiveState,
+    ) -> tuple[Command, AdaptiveState]:
+        """The wrapped law's command with theta_hat in its model, and the rates of the states.  The
+        estimate is not used.
         """
-        *measured, estimate, context, state = arguments
-        command, law_rate, gradient = self._command_and_gradient(
-            t, measured, estimate, context, state
-        )
+        command, law_rate, gradient = self._command_and_gradient(t, x, d_hat, context, state)
         rate = self.projected(state.theta, self.unprojected(state.theta, gradient, context))
         return command, AdaptiveState(rate, law_rate)
 
     def _command_and_gradient(
-        self, t: jax.Array, measured: Any, estimate: jax.Array, context: LawContext, state: Any
+        self,
+        t: jax.Array,
+        x: jax.Array,
+        d_hat: jax.Array,
+        context: LawContext,
+        state: AdaptiveState,
     ) -> tuple[Command, Any, jax.Array]:
         """The wrapped law's command and the rate of its state with theta_hat, and Y^T s, (p,)."""
-        law: Any = self.law
-        zero = jnp.zeros_like(estimate)
+        zero = jnp.zeros_like(d_hat)
 
         def torque(theta):
             changed = self._with_parameters(context, theta)
-            command, rate = law.command(t, *measured, zero, changed, state.law)
+            command, rate = self.inner.command(t, x, zero, changed, state.law)
             return command.tau, (command, rate)
 
         _, pullback, (command, rate) = jax.vjp(torque, state.theta, has_aux=True)
@@ -288,56 +298,81 @@ class AdaptiveParameters(Wrapping, LyapunovLaw):
         distance = jnp.where(rate > 0.0, self.upper - theta, theta - self.lower)
         return rate * jnp.clip(distance / self.band, 0.0, 1.0)
 
-    def switching(self, t: jax.Array, *arguments: Any) -> jax.Array | None:
-        """The functions at whose zeros the wrapped law's command jumps; arguments as its
-        `switching`.
-        """
-        *measured, context, state = arguments
+    def switching(
+        self,
+        t: jax.Array,
+        x: jax.Array,
+        d_hat: jax.Array,
+        context: LawContext,
+        state: AdaptiveState,
+    ) -> jax.Array | None:
+        """The functions at whose zeros the wrapped law's command jumps."""
         changed = self._with_parameters(context, state.theta)
-        return super().switching(t, *measured, changed, state.law)
+        return self.inner.switching(t, x, d_hat, changed, state.law)
 
     # --- the claim (R.3) --------------------------------------------------------------------------
 
-    def lyapunov(self, t: jax.Array, *arguments: Any) -> jax.Array:
+    def lyapunov(
+        self,
+        t: jax.Array,
+        x: jax.Array,
+        d_tilde: jax.Array,
+        context: LawContext,
+        state: AdaptiveState,
+    ) -> jax.Array:
         """V_a of (R.1), (), with the plant's parameters where the context has the plant, else the
-        model's; arguments as `LyapunovLaw.lyapunov`.
+        model's.
         """
-        *measured, _, context, state = arguments
-        return self._value(t, measured, self.true_parameters(t, context), context, state)
+        return self._value(t, x, self.true_parameters(t, context), context, state)
 
     def _value(
-        self, t: jax.Array, measured: Any, theta: jax.Array, context: LawContext, state: Any
+        self,
+        t: jax.Array,
+        x: jax.Array,
+        theta: jax.Array,
+        context: LawContext,
+        state: AdaptiveState,
     ) -> jax.Array:
         """V_a for parameters theta, ()."""
-        law: Any = self.law
-        energy = law.energy(t, *measured, self._with_parameters(context, theta))
+        energy: Any = self.inner.energy(t, x, self._with_parameters(context, theta))
         return energy + 0.5 * jnp.sum((state.theta - theta) ** 2 / self.Gamma)
 
-    def decay(self, t: jax.Array, *arguments: Any) -> jax.Array:
-        """W + sigma/2 |theta_tilde|^2 of (R.3), (); arguments as `lyapunov`."""
-        *measured, _, context, state = arguments
+    def decay(
+        self,
+        t: jax.Array,
+        x: jax.Array,
+        d_tilde: jax.Array,
+        context: LawContext,
+        state: AdaptiveState,
+    ) -> jax.Array:
+        """W + sigma/2 |theta_tilde|^2 of (R.3), ()."""
         theta = self.true_parameters(t, context)
-        law: Any = self.law
-        decay = law.energy_decay(t, *measured, self._with_parameters(context, theta))
+        decay: Any = self.inner.energy_decay(t, x, self._with_parameters(context, theta))
         return decay + 0.5 * jnp.sum(self.sigma * (state.theta - theta) ** 2)
 
-    def disturbance_terms(self, t: jax.Array, *arguments: Any) -> jax.Array:
+    def disturbance_terms(
+        self,
+        t: jax.Array,
+        x: jax.Array,
+        d_tilde: jax.Array,
+        dd: jax.Array,
+        context: LawContext,
+        state: AdaptiveState,
+    ) -> jax.Array:
         """The other terms of (R.3), (): those of d and of the leak, what the projection adds for
         parameters outside its inner box, and the effect of parameters that change with time.
-        Arguments as `LyapunovLaw.disturbance_terms`.
         """
-        *measured, disturbance, _, context, state = arguments
         theta = self.true_parameters(t, context)
         error = state.theta - theta
-        command, _, gradient = self._command_and_gradient(t, measured, disturbance, context, state)
-        effect = self._effect_of_rest(t, measured, command, theta, disturbance, context)
+        command, _, gradient = self._command_and_gradient(t, x, d_tilde, context, state)
+        effect = self._effect_of_rest(t, x, command, theta, d_tilde, context)
         leak = 0.5 * jnp.sum(self.sigma * (theta - self._nominal(context.model)) ** 2)
         rate = self.unprojected(state.theta, gradient, context)
         removed = self.projected(state.theta, rate) - rate
         projection = jnp.sum(jnp.maximum(error * removed / self.Gamma, 0.0))
 
         def value_at(now):
-            return self._value(t, measured, self.true_parameters(now, context), context, state)
+            return self._value(t, x, self.true_parameters(now, context), context, state)
 
         change = jax.jvp(value_at, (t,), (jnp.ones_like(t),))[1]
         return effect + leak + projection + change
@@ -345,7 +380,7 @@ class AdaptiveParameters(Wrapping, LyapunovLaw):
     def _effect_of_rest(
         self,
         t: jax.Array,
-        measured: Any,
+        x: jax.Array,
         command: Command,
         theta: jax.Array,
         disturbance: jax.Array,
@@ -354,19 +389,18 @@ class AdaptiveParameters(Wrapping, LyapunovLaw):
         """dV/dx . d, (), with d the disturbance of the model with the parameters theta.
 
         Args:
-          t, measured, context: as `command`.
+          t, x, context: as `command`.
           command: of the law at this state.
           theta: parameters, (p,).
           disturbance: of the model itself, f (n,), or d (r, n).
         """
-        true, law = self._with_parameters(context, theta), self.law
-        if law.receives_x:
-            (x,) = measured
+        true = self._with_parameters(context, theta)
+        if isinstance(self.law, Law):
             flow = plants.flow(plants.as_plant(context.model), t, x, command.tau)
             true_flow = plants.flow(plants.as_plant(true.model), t, x, command.tau)
-            slopes = jax.grad(law.energy, argnums=1)(t, x, true)  # type: ignore[attr-defined]
+            slopes = jax.grad(self.law.energy, argnums=1)(t, x, true)
             return jnp.sum(slopes * (flow + disturbance - true_flow))
-        q, dq = measured
+        q, dq = x[0], x[1]
         driving = command.tau + disturbance
         ddq = _acceleration(context.model, q, dq, driving)
         needed = inverse_dynamics(true.model, q, dq, dq, ddq)
@@ -390,7 +424,7 @@ LAWS = (
 )
 
 
-def adapting_part(law: Controller, state: Any) -> tuple[AdaptiveParameters, AdaptiveState] | None:
+def adapting_part(law: TrackingLaw, state: Any) -> tuple[AdaptiveParameters, AdaptiveState] | None:
     """The law with adapting parameters among the layers of a law, and its state; None without one.
 
     Args:
@@ -468,15 +502,14 @@ def _dependence(
     """Derivatives by the parameters at both ends of their box and in its middle: of the torque, (3,
     POINTS, n, p), and of virtual controls, V1 and the slope of V, (3, POINTS, m, p).
     """
-    inner_law: Any = law.law
+    estimate = jnp.zeros_like(x[0, 0])
+    if isinstance(law.law, Law):
+        estimate = jnp.zeros_like(x[0])
 
     def outputs(theta, t, x):
         changed = law._with_parameters(context, theta)
-        measured, estimate = (x[0], x[1]), jnp.zeros_like(x[0])
-        if inner_law.receives_x:
-            measured, estimate = (x,), jnp.zeros_like(x)  # type: ignore[assignment]
-        state = inner_law.init(*measured, changed)
-        command, _ = inner_law.command(t, *measured, estimate, changed, state)
+        state = law.inner.init(x, changed)
+        command, _ = law.inner.command(t, x, estimate, changed, state)
         others = (command.alpha, command.V1, command.input_slope, command.alpha_higher)
         return command.tau, jnp.concatenate([jnp.ravel(part) for part in jax.tree.leaves(others)])
 

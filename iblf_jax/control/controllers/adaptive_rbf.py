@@ -44,7 +44,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.control.barriers import Barrier, Log
-from iblf_jax.control.controllers._base import Command, Controller, LawContext
+from iblf_jax.control.controllers._base import Command, LawContext, RobotLaw
 from iblf_jax.control.controllers.backstepping import (
     alpha_and_rate,
     barrier_command,
@@ -59,7 +59,7 @@ from iblf_jax.core.pytree import Leaf, component, leaf, static
 
 
 @component
-class AdaptiveRBF(Controller):
+class AdaptiveRBF(RobotLaw):
     """tau = -w s - K2 e2 + W_hat^T S(Z),   W_hat' = Gamma (-S(Z) e2^T - sigma W_hat).
 
     s and alpha are the barrier's; no model is used, and f_hat is not.  The state is W_hat, (nodes,

@@ -38,7 +38,7 @@ import numpy as np
 
 from iblf_jax.control.barriers import Barrier, Integral
 from iblf_jax.control.barriers._base import guard_is_active
-from iblf_jax.control.controllers._base import Command, Controller, LawContext, decay_of, no_state
+from iblf_jax.control.controllers._base import Command, LawContext, RobotLaw, decay_of, no_state
 from iblf_jax.control.decays import Decay
 from iblf_jax.control.decays._base import (
     energy_gain,
@@ -71,7 +71,7 @@ def symbols_of_energy(law: Any, field: str, index: int, symbols: Any) -> Any:
 
 
 @component
-class Backstepping(Controller):
+class Backstepping(RobotLaw):
     """tau = C0 v + G0 + M0 alpha' - f_hat - K2 e2 - w s,   v = q' (printed) or alpha (corrected).
 
     It is (3.14) of the paper.

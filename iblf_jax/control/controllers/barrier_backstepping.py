@@ -35,8 +35,6 @@ their e_i/s_i jumps there.  Such a barrier is refused below the last level.  On 
 jumps at e_r = 0 (`switching`), as the exact cancellation requires.
 """
 
-# The methods receive x in the place of q and q'.
-# mypy: disable-error-code="override"
 from __future__ import annotations
 
 import copy
@@ -52,7 +50,7 @@ from iblf_jax.control.barriers._base import (
     guard_is_active,
     has_ratio,
 )
-from iblf_jax.control.controllers._base import Command, Controller, LawContext, decay_of
+from iblf_jax.control.controllers._base import Command, Law, LawContext, decay_of
 from iblf_jax.control.controllers._levels import Design, Level, exact_levels, surface_levels
 from iblf_jax.control.controllers.backstepping import (
     check_barrier,
@@ -69,7 +67,7 @@ from iblf_jax.world.bounds import Bounds, Funnel, Tube
 
 
 @component
-class BarrierBackstepping(Controller):
+class BarrierBackstepping(Law):
     """Backstepping with a barrier on every level, u = alpha_r, for a plant of any order r.
 
         alpha_i = G_i^-1 [ a_i - c_i s_i - (e_i/(w_i s_i)) G_{i-1}^T (w_{i-1} s_{i-1})
@@ -115,7 +113,6 @@ class BarrierBackstepping(Controller):
     filter: Leaf = leaf("s", sign="positive", shape="level", default=None)
     decays: tuple[Decay, ...] = ()
     gains: ClassVar[tuple[str, ...]] = ("k",)
-    receives_x: ClassVar[bool] = True
     takes_shift: ClassVar[bool] = True
     includes_e2: ClassVar[bool] = True
 

@@ -11,13 +11,13 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.controllers._base import Command, Controller, LawContext, no_state
+from iblf_jax.control.controllers._base import Command, LawContext, RobotLaw, no_state
 from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.world.robots import inverse_dynamics
 
 
 @component
-class ComputedTorque(Controller):
+class ComputedTorque(RobotLaw):
     """tau = M0 (q_d" - Kd e1' - Kp e1) + C0 q' + G0 - f_hat.
 
     alpha is q_d' and V1 = 1/2 Kp e1^2; it claims nothing about the bounds.

@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.control.barriers import Barrier, Integral
-from iblf_jax.control.controllers._base import Command, Controller, LawContext
+from iblf_jax.control.controllers._base import Command, LawContext, RobotLaw
 from iblf_jax.control.controllers.backstepping import (
     barrier_command,
     check_barrier,
@@ -37,7 +37,7 @@ from iblf_jax.world.robots import inverse_dynamics
 
 
 @component
-class DynamicSurface(Controller):
+class DynamicSurface(RobotLaw):
     """tau = C0 beta + G0 + M0 beta' - f_hat - K2 e2 - w s,   mu beta' + beta = alpha.
 
     With e2 = q' - beta.  The state is beta, (n,) [rad/s]; records show it as alpha.

@@ -37,7 +37,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.control.controllers._base import Command, Controller, State, Wrapping
+from iblf_jax.control.controllers._base import (
+    Command,
+    LawContext,
+    State,
+    TrackingLaw,
+    Wrapping,
+    check_law,
+)
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.core.units import INPUT
@@ -54,7 +61,7 @@ class EventCompensated(Wrapping):
     for the laws of robots.  Paths reach through: "controller.K2" is the wrapped law's K2.
 
     Args:
-      law: any `Controller` with an `input_slope`, such as `Backstepping` or `BarrierBackstepping`.
+      law: any law with an `input_slope`, such as `Backstepping` or `BarrierBackstepping`.
       relative: delta of the trigger, () or (n,) [1], >= 0 and < 1.
       absolute: m_bar, () or (n,) [N m], >= 0: more than m/(1 - delta) of the trigger.
       epsilon: width of the tanh, () or (n,) in the unit of z times that of v [N m rad/s], > 0.
@@ -63,15 +70,14 @@ class EventCompensated(Wrapping):
       2071-2076; for several inputs component by component, as derived at the head of this module.
     """
 
-    law: Controller
+    law: TrackingLaw
     relative: Leaf = leaf("1", sign="nonnegative")
     absolute: Leaf = leaf(INPUT, sign="nonnegative")
     epsilon: Leaf = leaf("N m rad/s", sign="positive")
 
     def check(self) -> None:
         """Raises ValueError for something that is not a law, or a delta of 1 or more."""
-        name = "EventCompensated.law"
-        checks.conforms(name, self.law, Controller, "iblf_jax.controllers has them.")
+        check_law("EventCompensated.law", self.law, "iblf_jax.controllers has them.")
         check_relative("EventCompensated.relative", self.relative)
 
     @property
@@ -79,19 +85,21 @@ class EventCompensated(Wrapping):
         """Whether the wrapped law takes the shift of an auxiliary state."""
         return self.law.takes_shift
 
-    def command(self, *arguments: Any) -> tuple[Command, State]:
-        """The wrapped law's command with the input (E.1).  Arguments as those of the wrapped law.
+    def command(
+        self, t: jax.Array, x: jax.Array, d_hat: jax.Array, context: LawContext, state: State
+    ) -> tuple[Command, State]:
+        """The wrapped law's command with the input (E.1).
 
         Raises:
           ValueError: a law without a Lyapunov function, or with another input than its torque.
         """
-        command, rate = self.law.command(*arguments)
+        command, rate = self.inner.command(t, x, d_hat, context, state)
         z, v = command.input_slope, command.tau
         if isinstance(z, tuple) or not isinstance(command.input, tuple):
             expected = "a law whose command has an `input_slope`, and a torque as its input"
             remedy = "Such as iblf_jax.controllers.Backstepping."
             raise checks.fail("EventCompensated.law", type(self.law).__name__, expected, remedy)
-        terms = [x * jnp.tanh(z * x / self.epsilon) for x in (v, self.absolute)]
+        terms = [y * jnp.tanh(z * y / self.epsilon) for y in (v, self.absolute)]
         return command._replace(tau=-(1.0 + self.relative) * (terms[0] + terms[1])), rate
 
 

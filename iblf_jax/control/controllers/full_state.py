@@ -63,7 +63,7 @@ from iblf_jax.control.barriers._base import (
     guard_is_active,
     has_ratio,
 )
-from iblf_jax.control.controllers._base import Command, Controller, LawContext, decay_of, no_state
+from iblf_jax.control.controllers._base import Command, LawContext, RobotLaw, decay_of, no_state
 from iblf_jax.control.controllers._levels import Design, exact_levels
 from iblf_jax.control.controllers.backstepping import (
     alpha_and_rate,
@@ -90,7 +90,7 @@ of phi."""
 
 
 @component
-class FullState(Controller):
+class FullState(RobotLaw):
     """tau = C0 q' + G0 + M0 (a2 - w s1 e2/s2 - c s2) - f_hat,   a2 = alpha' - (K2 + kappa2) e2 for
     the integral barrier.
 

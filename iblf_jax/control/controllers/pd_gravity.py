@@ -7,12 +7,12 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.controllers._base import Command, Controller, LawContext, no_state
+from iblf_jax.control.controllers._base import Command, LawContext, RobotLaw, no_state
 from iblf_jax.core.pytree import Leaf, component, leaf
 
 
 @component
-class PDGravity(Controller):
+class PDGravity(RobotLaw):
     """tau = G0(q) - Kp e1 - Kd e1' - f_hat.
 
     Classical without an observer (`NoObserver`, f_hat = 0).  alpha is q_d' and V1 = 1/2 Kp e1^2; it

@@ -26,7 +26,7 @@ from typing import Any, ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.controllers._base import Command, Controller, LawContext
+from iblf_jax.control.controllers._base import Command, LawContext, RobotLaw
 from iblf_jax.control.controllers.computed_torque import ComputedTorque
 from iblf_jax.control.controllers.pd_gravity import PDGravity
 from iblf_jax.core import checks
@@ -63,7 +63,7 @@ class _AtRest(Reference):
 
 
 @component
-class ReferenceGovernor(Controller):
+class ReferenceGovernor(RobotLaw):
     """The law's torque for a reference g at rest,  g' = eta max(Gamma(g) - V, 0) (attraction +
     repulsion).
 
@@ -83,7 +83,7 @@ class ReferenceGovernor(Controller):
     2063-2073.
     """
 
-    law: Controller
+    law: RobotLaw
     eta: Leaf = leaf("rad/(N m s)", sign="positive", default=50.0)
     margin: Leaf = leaf("rad", sign="nonnegative", default=0.02)
     width: Leaf = leaf("rad", sign="positive", default=0.02)

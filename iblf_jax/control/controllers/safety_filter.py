@@ -35,7 +35,14 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.controllers._base import Command, Controller, LawContext, State, Wrapping
+from iblf_jax.control.controllers._base import (
+    Command,
+    LawContext,
+    State,
+    TrackingLaw,
+    Wrapping,
+    check_law,
+)
 from iblf_jax.core import checks
 from iblf_jax.core.linalg import matmul, matvec, solve_spd
 from iblf_jax.core.pytree import Leaf, component, leaf, static
@@ -57,7 +64,7 @@ class SafetyFilter(Wrapping):
     "controller.K2" is the wrapped law's K2.
 
     Args:
-      law: the law whose torque is filtered, any `Controller`.
+      law: the law whose torque is filtered, any law.
       a1: first rate of the position's conditions, () or (n,) [1/s] ([rad/s] for "atan"), > 0; 10 if
         not given.
       a2: second rate of these, () or (n,) [1/s] ([s/rad^2] for "cubic"), > 0; 10 if not given.
@@ -78,7 +85,7 @@ class SafetyFilter(Wrapping):
     V. Dimarogonas, Automatica 2022, 110620.
     """
 
-    law: Controller
+    law: TrackingLaw
     a1: Leaf = leaf("1/s", sign="positive", default=10.0)
     a2: Leaf = leaf("1/s", sign="positive", default=10.0)
     a3: Leaf = leaf("1/s", sign="positive", default=20.0)
@@ -93,7 +100,7 @@ class SafetyFilter(Wrapping):
 
     def check(self) -> None:
         """Raises ValueError for something that is not a law, or an unknown measure."""
-        checks.conforms("SafetyFilter.law", self.law, Controller, "iblf_jax.controllers has them.")
+        check_law("SafetyFilter.law", self.law, "iblf_jax.controllers has them.")
         checks.one_of("SafetyFilter.nearest", self.nearest, NEAREST)
         checks.one_of("SafetyFilter.shape1", self.shape1, SHAPES1)
         checks.one_of("SafetyFilter.shape2", self.shape2, SHAPES2)
@@ -130,19 +137,14 @@ class SafetyFilter(Wrapping):
         return carried + self.a2 * B
 
     def command(
-        self,
-        t: jax.Array,
-        q: jax.Array,
-        dq: jax.Array,
-        f_hat: jax.Array,
-        context: LawContext,
-        state: State,
+        self, t: jax.Array, x: jax.Array, d_hat: jax.Array, context: LawContext, state: State
     ) -> tuple[Command, State]:
         """The wrapped law's command with its torque filtered, and the slack."""
-        command, rate = self.law.command(t, q, dq, f_hat, context, state)
+        q, dq = x[0], x[1]
+        command, rate = self.inner.command(t, x, d_hat, context, state)
         model, tau_law = context.model, command.tau
         M = model.mass_matrix(q)
-        nominal = solve_spd(M, tau_law + f_hat - model.coriolis(q, dq, dq) - model.gravity(q))
+        nominal = solve_spd(M, tau_law + d_hat - model.coriolis(q, dq, dq) - model.gravity(q))
         lowest, highest = self.box(t, q, dq, context)
         if self.nearest == "acceleration" and self.limit is None and not context.regions:
             # An empty box is violated equally on both sides.

@@ -43,8 +43,7 @@ Then V(t, y) has the rate that it has without limits, plus (dV/dx_{r-1})^T G_{r-
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -52,15 +51,16 @@ import numpy as np
 
 from iblf_jax.control.controllers._base import (
     Command,
-    Controller,
     LawContext,
     Shift,
     State,
+    TrackingLaw,
     Wrapping,
+    check_law,
 )
 from iblf_jax.core import checks
 from iblf_jax.core.input_limits import check_lower_limit, is_beyond, lower_or_opposite
-from iblf_jax.core.pytree import Leaf, component, leaf, static, unwrapped
+from iblf_jax.core.pytree import Leaf, component, leaf, static
 from iblf_jax.core.units import INPUT
 from iblf_jax.world import plants
 from iblf_jax.world.robots import Robot
@@ -95,7 +95,7 @@ class Saturated(Wrapping):
     q' - alpha - lambda.  Paths reach through: "controller.K2" is the wrapped law's K2.
 
     Args:
-      law: the law whose torque is limited, any `Controller`.
+      law: the law whose torque is limited, any law.
       limit: largest torque of each joint, () or (n,) [N m], > 0.
       edge: "hard" or "smooth"; "hard" if not given.
       auxiliary: rate k of the auxiliary state, () or (n,) [1/s], > 0; no auxiliary state if not
@@ -108,7 +108,7 @@ class Saturated(Wrapping):
       module.
     """
 
-    law: Controller
+    law: TrackingLaw
     limit: Leaf = leaf(INPUT, sign="positive")
     edge: str = static(default="hard")
     auxiliary: Leaf = leaf("1/s", sign="positive", default=None)
@@ -118,7 +118,7 @@ class Saturated(Wrapping):
         """Raises ValueError for something that is not a law, an unknown edge, or a lower limit that
         is not below the limit.
         """
-        checks.conforms("Saturated.law", self.law, Controller, "iblf_jax.controllers has them.")
+        check_law("Saturated.law", self.law, "iblf_jax.controllers has them.")
         checks.one_of("Saturated.edge", self.edge, EDGES)
         check_lower_limit("Saturated", self.lower_limit, self.limit)
 
@@ -127,40 +127,31 @@ class Saturated(Wrapping):
         """Whether there is an auxiliary state."""
         return self.auxiliary is not None
 
-    @property
-    def _receives_x(self) -> bool:
-        """Whether the wrapped law receives the levels x in the place of q and q'."""
-        return unwrapped(self.law).receives_x
-
-    def init(self, *arguments: Any) -> State:
-        """State of the wrapped law, and lambda(0) = 0.  Arguments as those of the wrapped law."""
-        state = self.law.init(*arguments)
+    def init(self, x: jax.Array, context: LawContext) -> State:
+        """State of the wrapped law, and lambda(0) = 0."""
+        state = self.inner.init(x, context)
         if self.auxiliary is None:
             return state
-        last_level = arguments[-2]
-        if self._receives_x:
-            last_level = last_level[-1]
-        return AuxiliaryState(state, jnp.zeros_like(last_level))
+        return AuxiliaryState(state, jnp.zeros_like(x[-1]))
 
-    def command(self, *arguments: Any) -> tuple[Command, State]:
+    def command(
+        self, t: jax.Array, x: jax.Array, d_hat: jax.Array, context: LawContext, state: State
+    ) -> tuple[Command, State]:
         """The wrapped law's command with its torque limited; `saturated` says where it commanded
-        more than the limit.  Arguments as those of the wrapped law.
+        more than the limit.
         """
         if self.auxiliary is None:
-            command, rate = self.law.command(*arguments)
+            command, rate = self.inner.command(t, x, d_hat, context, state)
             return self._limited(command), rate
-        *measured, context, state = arguments
-        law: Any = self.law
         shift = self.shift(state)
-        if law.takes_shift:
+        if self.law.takes_shift:
             shifted = context._replace(shift=shift)
-            command, rate = law.command(*measured, shifted, state.law)
+            command, rate = self.inner.command(t, x, d_hat, shifted, state.law)
         else:
-            command, rate = self._command_at_shifted_state(measured, context, state.law, shift)
+            command, rate = self._command_at_shifted_state(t, x, d_hat, context, state.law, shift)
         limited = self._limited(command)
         plant = plants.as_plant(context.model)
-        cut = limited.tau - command.tau
-        effect = plants.gain_times(plant, plant.order, measured[0], self._levels(measured), cut)
+        effect = plants.gain_times(plant, plant.order, t, x, limited.tau - command.tau)
         auxiliary_rate = AuxiliaryState(rate, shift.rate + effect)
         return limited._replace(auxiliary=state.auxiliary), auxiliary_rate
 
@@ -182,47 +173,40 @@ class Saturated(Wrapping):
         """The shift of the virtual control: lambda and -k lambda."""
         return Shift(state.auxiliary, -self.auxiliary * state.auxiliary)
 
-    def _levels(self, measured: Sequence[Any]) -> jax.Array:
-        """The levels x, (r, n), among the arguments t, q, q' or t, x of a law."""
-        if self._receives_x:
-            return measured[1]  # type: ignore[no-any-return]
-        return jnp.stack(measured[1:3])
-
-    def _at_shifted_state(self, arguments: Sequence[Any], value: jax.Array) -> list[Any]:
-        """The arguments t, q, q' or t, x of a law, and further ones, with x_r - lambda in the place
-        of x_r.
-        """
-        if self._receives_x:
-            t, x, *further = arguments
-            return [t, jnp.concatenate([x[:-1], (x[-1] - value)[None]]), *further]
-        t, q, dq, *further = arguments
-        return [t, q, dq - value, *further]
-
     def _command_at_shifted_state(
-        self, measured: Sequence[Any], context: LawContext, state: State, shift: Shift
+        self,
+        t: jax.Array,
+        x: jax.Array,
+        d_hat: jax.Array,
+        context: LawContext,
+        state: State,
+        shift: Shift,
     ) -> tuple[Command, State]:
         """The command of (A.4), for a law that does not take the shift."""
-        law: Any = self.law
-        moved = self._at_shifted_state(measured, shift.value)
-        command, rate = law.command(*moved, context, state)
-        plant, t = plants.as_plant(context.model), measured[0]
-        x, y = self._levels(measured), self._levels(moved)
+        y = _at_shifted_state(x, shift.value)
+        command, rate = self.inner.command(t, y, d_hat, context, state)
+        plant = plants.as_plant(context.model)
         without_limit = plants.level_rate(plant, plant.order, t, y, command.tau)
         tau = plants.level_input(plant, plant.order, t, x, without_limit + shift.rate)
         return _with_shifted_control(command._replace(tau=tau), plant.order, shift.value), rate
 
-    def switching(self, *arguments: Any) -> jax.Array | None:
-        """The wrapped law's switching functions, at which its command jumps.  Arguments as those of
-        the wrapped law.
-        """
+    def switching(
+        self, t: jax.Array, x: jax.Array, d_hat: jax.Array, context: LawContext, state: State
+    ) -> jax.Array | None:
+        """The wrapped law's switching functions, at which its command jumps."""
         if self.auxiliary is None:
-            return super().switching(*arguments)
-        *measured, context, state = arguments
+            return self.inner.switching(t, x, d_hat, context, state)
         shift = self.shift(state)
         if self.law.takes_shift:
-            return super().switching(*measured, context._replace(shift=shift), state.law)
-        moved = self._at_shifted_state(measured, shift.value)
-        return super().switching(*moved, context, state.law)
+            shifted = context._replace(shift=shift)
+            return self.inner.switching(t, x, d_hat, shifted, state.law)
+        y = _at_shifted_state(x, shift.value)
+        return self.inner.switching(t, y, d_hat, context, state.law)
+
+
+def _at_shifted_state(x: jax.Array, value: jax.Array) -> jax.Array:
+    """The state with x_r - lambda in the place of x_r."""
+    return jnp.concatenate([x[:-1], (x[-1] - value)[None]])
 
 
 def _with_shifted_control(command: Command, order: int, value: jax.Array) -> Command:
@@ -241,7 +225,7 @@ UNLIMITED = 1e6
 [N m]."""
 
 
-def within_effort(law: Controller, robot: Robot, *, edge: str = "hard") -> Controller:
+def within_effort(law: TrackingLaw, robot: Robot, *, edge: str = "hard") -> TrackingLaw:
     """A law within the largest torques of a robot: `Saturated` at its `effort`.
 
     Args:

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 
 from iblf_jax.control.barriers import Barrier, PrescribedPerformance
 from iblf_jax.control.barriers._base import guard_is_active
-from iblf_jax.control.controllers._base import Command, Controller, LawContext, no_state
+from iblf_jax.control.controllers._base import Command, LawContext, RobotLaw, no_state
 from iblf_jax.control.controllers.backstepping import check_barrier
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf
@@ -28,7 +28,7 @@ from iblf_jax.world.bounds import Bounds, Tube
 
 
 @component
-class SurfaceBarrier(Controller):
+class SurfaceBarrier(RobotLaw):
     """tau = -K s(sigma),   sigma = e1' + a e1,   s = dV1/dsigma of a barrier between the surface's
     own bounds.
 

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import Any
 
 from iblf_jax.control import barriers
-from iblf_jax.control.controllers._base import Controller
+from iblf_jax.control.controllers._base import RobotLaw, TrackingLaw
 from iblf_jax.control.controllers.adaptive_rbf import AdaptiveRBF
 from iblf_jax.control.controllers.backstepping import Backstepping
 from iblf_jax.control.controllers.computed_torque import ComputedTorque
@@ -19,7 +19,7 @@ from iblf_jax.control.controllers.full_state import FullState
 from iblf_jax.control.controllers.pd_gravity import PDGravity
 from iblf_jax.control.controllers.reference_governor import ReferenceGovernor
 from iblf_jax.control.controllers.safety_filter import SafetyFilter
-from iblf_jax.control.observers import NoObserver, Observer
+from iblf_jax.control.observers import DisturbanceObserver, NoObserver
 from iblf_jax.core import checks
 
 BARRIERS: dict[str, Callable[..., barriers.Barrier]] = {
@@ -33,7 +33,7 @@ BARRIERS: dict[str, Callable[..., barriers.Barrier]] = {
 }
 """System -> barrier of the backstepping law."""
 
-BASELINES: dict[str, Callable[[], Controller]] = {
+BASELINES: dict[str, Callable[[], RobotLaw]] = {
     "computed_torque": lambda: ComputedTorque(Kp=25.0, Kd=10.0),
     "pd": lambda: PDGravity(Kp=60.0, Kd=20.0),
 }
@@ -71,7 +71,7 @@ def law_by_name(
     reading: str = "printed",
     p: int = 1,
     weight: Any = 1.0,
-) -> Controller:
+) -> TrackingLaw:
     """The law of a system.
 
     Args:
@@ -106,7 +106,7 @@ def law_by_name(
     return Backstepping(k1=k1, K2=K2, o=o, barrier=barrier, reading=reading, weight=weight)
 
 
-def observer_of(name: str, usual: Observer) -> Observer:
+def observer_of(name: str, usual: DisturbanceObserver) -> DisturbanceObserver:
     """The observer that belongs to a system: `usual`, or none for the laws that are classical
     without one.
     """

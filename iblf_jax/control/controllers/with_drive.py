@@ -11,13 +11,20 @@ the loop tends to that of the rigid robot for a small inductance.
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 
-from iblf_jax.control.controllers._base import Command, Controller, State, Wrapping
+from iblf_jax.control.controllers._base import (
+    Command,
+    LawContext,
+    State,
+    TrackingLaw,
+    Wrapping,
+    check_law,
+)
 from iblf_jax.core import checks
-from iblf_jax.core.pytree import component, unwrapped
+from iblf_jax.core.pytree import component
 from iblf_jax.world.plants import ElectricDrive
 
 
@@ -29,36 +36,29 @@ class WithDrive(Wrapping):
     reach through: "controller.K2" is the wrapped law's K2.
 
     Args:
-      law: the law whose torque is commanded, any `Controller` for a robot as its model.
+      law: the law whose torque is commanded, any law for a robot as its model.
       drive: the motors as the law knows them, an `iblf_jax.plants.ElectricDrive`; its robot is not
         used.
 
     Source: none; the construction is common.
     """
 
-    law: Controller
+    law: TrackingLaw
     drive: ElectricDrive
     input_unit: ClassVar[str] = "V"
 
     def check(self) -> None:
         """Raises ValueError for something that is not a law, or no drive."""
-        checks.conforms("WithDrive.law", self.law, Controller, "iblf_jax.controllers has them.")
+        check_law("WithDrive.law", self.law, "iblf_jax.controllers has them.")
         if not isinstance(self.drive, ElectricDrive):
             expected = "an iblf_jax.plants.ElectricDrive"
             remedy = "Such as the plant itself: WithDrive(law, drive=plant)."
             raise checks.fail("WithDrive.drive", self.drive, expected, remedy)
 
-    def command(self, *arguments: Any) -> tuple[Command, State]:
-        """The wrapped law's command with the voltage as its input.  Arguments as those of the
-        wrapped law.
-        """
-        command, rate = self.law.command(*arguments)
+    def command(
+        self, t: jax.Array, x: jax.Array, d_hat: jax.Array, context: LawContext, state: State
+    ) -> tuple[Command, State]:
+        """The wrapped law's command with the voltage as its input."""
+        command, rate = self.inner.command(t, x, d_hat, context, state)
         current = command.tau / self.drive.torque_constant
-        voltage = self.drive.voltage(current, self._velocity(*arguments))
-        return command._replace(input=voltage), rate
-
-    def _velocity(self, t: jax.Array, *state: Any) -> jax.Array:
-        """The velocity q' among the arguments t, q, q' or t, x of a law, (n,) [rad/s]."""
-        if unwrapped(self.law).receives_x:
-            return state[0][1]  # type: ignore[no-any-return]
-        return state[1]  # type: ignore[no-any-return]
+        return command._replace(input=self.drive.voltage(current, x[1])), rate

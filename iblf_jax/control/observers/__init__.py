@@ -1,6 +1,10 @@
-"""Disturbance observers.  The contract is the base class `Observer`."""
+"""Disturbance observers.  The contract of those of robots is the base class `RobotObserver`, that
+of those of plants in strict-feedback form `Observer`.
+"""
 
+from iblf_jax.control.observers._base import DisturbanceObserver as DisturbanceObserver
 from iblf_jax.control.observers._base import Observer as Observer
+from iblf_jax.control.observers._base import RobotObserver as RobotObserver
 from iblf_jax.control.observers._base import State as State
 from iblf_jax.control.observers.extended_state import ExtendedState as ExtendedState
 from iblf_jax.control.observers.level import LevelObserver as LevelObserver
@@ -21,12 +25,14 @@ MEMBERS = {
 
 __all__ = [
     "MEMBERS",
+    "DisturbanceObserver",
     "ExtendedState",
     "LevelObserver",
     "Momentum",
     "NoObserver",
     "Observer",
     "Printed",
+    "RobotObserver",
     "State",
     "StateObserver",
 ]

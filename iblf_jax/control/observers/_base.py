@@ -1,37 +1,33 @@
 """The contract of a disturbance observer.
 
-An observer knows the model, measures q and q', receives the applied torque and returns f_hat, an
-estimate of the lumped uncertain term f of (2.1).  Its state is part of the loop's state
+An observer knows the model, measures q and q' or all levels x, receives the applied input and
+returns an estimate of what its model does not contain: of the torque f of (2.1), or of the rates d
+of (S.1).  Its state is part of the loop's state
 and is integrated with the plant; in a sampled loop it goes from one period to the next.
 """
 
 from __future__ import annotations
 
 import abc
-from typing import Any, ClassVar, Self
+from typing import Any, Self
 
 import jax
 
 from iblf_jax.core.families import attribute
-from iblf_jax.core.pytree import Leaf
+from iblf_jax.core.pytree import Leaf, component
 from iblf_jax.core.time import Timed
+from iblf_jax.world.plants import Plant
 from iblf_jax.world.robots import Robot
 
 State = Any
 """A pytree of arrays; `()` for an observer without memory."""
 
 
-class Observer(Timed):
-    """The contract of a disturbance observer.
-
-    An observer of plants in strict-feedback form has the class attribute `receives_x = True`.  Its
-    methods then receive the state x, (r, n), in the place of q and q', a `plants.Plant` as the
-    model and the input u as `tau`; its estimate is d_hat, (r, n), what the disturbance adds to x'.
-    Other observers serve the robot inside such a plant, and `tau` is the torque on its joints.
+class DisturbanceObserver(Timed):
+    """What every observer states: an `Observer` of the state x, or a `RobotObserver` of q and
+    q'.
     """
 
-    receives_x: ClassVar[bool] = False
-    """Whether it is an observer of plants in strict-feedback form."""
     kf: Leaf = None
     """Gain of an observer of the form (3.11), (n,) [1/s]; None for another one."""
 
@@ -50,6 +46,24 @@ class Observer(Timed):
         """
         return None
 
+    def check_model(self, model: Any) -> None:
+        """Raises ValueError for a plant that does not fit the fields."""
+        return
+
+    def advice(self) -> list[str]:
+        """Warnings about the values of the fields."""
+        return []
+
+    def at_period(self, period: jax.Array) -> Self:
+        """The observer with gains for which a step of Euler has the same poles as the continuous
+        observer has over one period [s].
+        """
+        return self
+
+
+class Observer(DisturbanceObserver):
+    """The contract of an observer of plants in strict-feedback form, which receives the state x."""
+
     @attribute
     def measured(self) -> tuple[int, ...] | None:
         """The levels that an observer with `complete` reads, counted from 1; None for all."""
@@ -65,13 +79,53 @@ class Observer(Timed):
         """Whether it has `complete`."""
         return type(self).complete is not Observer.complete
 
-    def check_model(self, model: Any) -> None:
-        """Raises ValueError for a plant that does not fit the fields."""
-        return
+    @abc.abstractmethod
+    def init(self, x: jax.Array, model: Plant) -> State:
+        """State at the start of a run, given x, (r, n), there."""
 
-    def advice(self) -> list[str]:
-        """Warnings about the values of the fields."""
-        return []
+    @abc.abstractmethod
+    def estimate(self, t: jax.Array, x: jax.Array, model: Plant, state: State) -> jax.Array:
+        """d_hat, (r, n), what the disturbance adds to x', in the units of the levels a second; or
+        a torque on the robot inside the plant, (n,) [N m].
+        """
+
+    @abc.abstractmethod
+    def derivative(
+        self, t: jax.Array, x: jax.Array, u: jax.Array, model: Plant, state: State
+    ) -> State:
+        """Rate of the state, given the input u, (n,), that was applied (after any saturation)."""
+
+    def advance(
+        self,
+        t: jax.Array,
+        x: jax.Array,
+        u: jax.Array,
+        model: Plant,
+        state: State,
+        period: jax.Array,
+    ) -> State | None:
+        """As `RobotObserver.advance`."""
+        return None
+
+    def complete(self, t: jax.Array, x: jax.Array, model: Any, state: State) -> jax.Array | None:
+        """The levels x, (r, n), with the estimates of an observer of levels in the place of those
+        that the sensor need not measure; None for an observer that estimates none.
+        """
+        return None
+
+    def limit_excess(self, t: jax.Array, x: jax.Array, model: Any, state: State) -> Any:
+        """Positive where a limit of the estimates that the law receives is active, () [1]; `()` for
+        an observer without limits.
+        """
+        return ()
+
+
+class RobotObserver(DisturbanceObserver):
+    """The contract of an observer of robots, which receives q and q'.
+
+    It also serves the robot inside a plant in strict-feedback form; `tau` is then the torque on its
+    joints.
+    """
 
     @abc.abstractmethod
     def init(self, q: jax.Array, dq: jax.Array, model: Robot) -> State:
@@ -106,20 +160,83 @@ class Observer(Timed):
         """
         return None
 
-    def at_period(self, period: jax.Array) -> Self:
-        """The observer with gains for which a step of Euler has the same poles as the continuous
-        observer has over one period [s].
-        """
-        return self
 
-    def complete(self, t: jax.Array, x: jax.Array, model: Any, state: State) -> jax.Array | None:
-        """The levels x, (r, n), with the estimates of an observer of levels in the place of those
-        that the sensor need not measure; None for an observer that estimates none.
-        """
-        return None
+@component
+class ObserverOfRobot(Observer):
+    """estimate(t, x, ...) = observer.estimate(t, x_1, x_2, ...): an observer of q and q' in the
+    closed loop.
 
-    def limit_excess(self, t: jax.Array, x: jax.Array, model: Any, state: State) -> Any:
-        """Positive where a limit of the estimates that the law receives is active, () [1]; `()` for
-        an observer without limits.
-        """
-        return ()
+    It is no part of a scenario.
+
+    Args:
+      observer: any observer of robots.
+
+    Source: none; the state of a robot is x = (q, q').
+    """
+
+    observer: RobotObserver
+
+    @property
+    def advances(self) -> bool:
+        """Whether the observer has `advance`."""
+        return type(self.observer).advance is not RobotObserver.advance
+
+    def at_period(self, period: jax.Array) -> ObserverOfRobot:
+        """The observer with gains for steps of Euler."""
+        return ObserverOfRobot(self.observer.at_period(period))
+
+    def init(self, x: jax.Array, model: Plant) -> State:
+        """State of the observer."""
+        return self.observer.init(x[0], x[1], _robot_in(model))
+
+    def estimate(self, t: jax.Array, x: jax.Array, model: Plant, state: State) -> jax.Array:
+        """f_hat, (n,) [N m]."""
+        return self.observer.estimate(t, x[0], x[1], _robot_in(model), state)
+
+    def derivative(
+        self, t: jax.Array, x: jax.Array, u: jax.Array, model: Plant, state: State
+    ) -> State:
+        """Rate of the observer's state under the torque on the joints."""
+        q, dq, tau = x[0], x[1], _torque_on_joints(model, x, u)
+        return self.observer.derivative(t, q, dq, tau, _robot_in(model), state)
+
+    def advance(
+        self,
+        t: jax.Array,
+        x: jax.Array,
+        u: jax.Array,
+        model: Plant,
+        state: State,
+        period: jax.Array,
+    ) -> State | None:
+        """The observer's state a period later under the torque on the joints."""
+        q, dq, tau = x[0], x[1], _torque_on_joints(model, x, u)
+        return self.observer.advance(t, q, dq, tau, _robot_in(model), state, period)
+
+
+def _robot_in(model: Plant) -> Robot:
+    """The robot inside a plant; a scenario does not accept an observer of robots without one."""
+    assert model.robot is not None
+    return model.robot
+
+
+def _torque_on_joints(model: Plant, x: jax.Array, u: jax.Array) -> jax.Array:
+    """The torque on the joints of the robot inside a plant, (n,) [N m]."""
+    torque = model.joint_torque(x, u)
+    assert torque is not None
+    return torque
+
+
+def observer_of_x(observer: DisturbanceObserver) -> Observer:
+    """An observer as the closed loop calls it."""
+    if isinstance(observer, Observer):
+        return observer
+    assert isinstance(observer, RobotObserver)
+    return ObserverOfRobot(observer)
+
+
+def contract_of(observer: Any) -> type[Observer] | type[RobotObserver]:
+    """The contract that an observer is meant to fit."""
+    # A user's class without a base class says by this attribute that it receives x.
+    receives_x = isinstance(observer, Observer) or getattr(observer, "receives_x", False) is True
+    return Observer if receives_x else RobotObserver

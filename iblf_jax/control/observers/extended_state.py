@@ -13,7 +13,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.observers._base import Observer
+from iblf_jax.control.observers._base import RobotObserver
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.world.robots import Robot, energy_gradient, momentum
@@ -29,7 +29,7 @@ class ExtendedStateValues(NamedTuple):
 
 
 @component
-class ExtendedState(Observer):
+class ExtendedState(RobotObserver):
     """p_hat' = tau + C0^T q' - G0 + f_hat + l1 (p - p_hat),   f_hat' = l2 (p - p_hat),   p = M0 q'.
 
     Give `bandwidth` w, for l1 = 2 w and l2 = w^2 (both poles at -w), or `l1` and `l2`.  Then

@@ -8,12 +8,9 @@ the others.  The observer estimates disturbances that do not act where the input
 observer of the input torque finds.
 """
 
-# The methods receive x in the place of q and q'.
-# mypy: disable-error-code="override"
 from __future__ import annotations
 
 import dataclasses
-from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -50,7 +47,6 @@ class LevelObserver(Observer):
     gain: Leaf = leaf("1/s", sign="nonnegative", shape="level")
     eta0: Leaf = leaf(RATES, shape="level", default=0.0)
     start: str = static(default="matched")
-    receives_x: ClassVar[bool] = True
 
     def check(self) -> None:
         """Raises ValueError for an unknown `start`."""

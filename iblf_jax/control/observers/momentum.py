@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import jax
 
-from iblf_jax.control.observers._base import Observer
+from iblf_jax.control.observers._base import RobotObserver
 from iblf_jax.control.observers._eta import (
     STARTS,
     advanced_eta,
@@ -19,7 +19,7 @@ from iblf_jax.world.robots import Robot, energy_gradient
 
 
 @component
-class Momentum(Observer):
+class Momentum(RobotObserver):
     """f_hat = eta + kf M0 q',   eta' = -kf eta - kf (tau - C0 q' - G0 + kf M0 q' + M0' q').
 
     It is (3.11) of the paper, corrected: f_tilde' = f' - kf f_tilde holds exactly, since

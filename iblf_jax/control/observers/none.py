@@ -7,31 +7,23 @@ import jax.numpy as jnp
 
 from iblf_jax.control.observers._base import Observer
 from iblf_jax.core.pytree import component
-from iblf_jax.world.robots import Robot
+from iblf_jax.world.plants import Plant
 
 
 @component
 class NoObserver(Observer):
-    """f_hat = 0.  Source: none; the baseline."""
+    """f_hat = 0, or d_hat = 0.  Source: none; the baseline."""
 
-    def init(self, q: jax.Array, dq: jax.Array, model: Robot) -> tuple[()]:
+    def init(self, x: jax.Array, model: Plant) -> tuple[()]:
         """No state."""
         return ()
 
-    def estimate(
-        self, t: jax.Array, q: jax.Array, dq: jax.Array, model: Robot, state: tuple[()]
-    ) -> jax.Array:
-        """Zero, (n,) [N m]."""
-        return jnp.zeros_like(q)
+    def estimate(self, t: jax.Array, x: jax.Array, model: Plant, state: tuple[()]) -> jax.Array:
+        """Zero, (n,) [N m] for a robot, (r, n) for another plant."""
+        return jnp.zeros(model.estimate_shape, x.dtype)
 
     def derivative(
-        self,
-        t: jax.Array,
-        q: jax.Array,
-        dq: jax.Array,
-        tau: jax.Array,
-        model: Robot,
-        state: tuple[()],
+        self, t: jax.Array, x: jax.Array, u: jax.Array, model: Plant, state: tuple[()]
     ) -> tuple[()]:
         """No state, no rate."""
         return ()
@@ -39,10 +31,9 @@ class NoObserver(Observer):
     def advance(
         self,
         t: jax.Array,
-        q: jax.Array,
-        dq: jax.Array,
-        tau: jax.Array,
-        model: Robot,
+        x: jax.Array,
+        u: jax.Array,
+        model: Plant,
         state: tuple[()],
         period: jax.Array,
     ) -> tuple[()]:

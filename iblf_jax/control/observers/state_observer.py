@@ -39,13 +39,11 @@ polynomial filter with fading memory, with which all poles of the chain are at
 a = exp(-bandwidth T).
 """
 
-# The methods receive x in the place of q and q'.
-# mypy: disable-error-code="override"
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from typing import Any, ClassVar, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -119,7 +117,6 @@ class StateObserver(Observer):
     offset: Leaf = leaf(LEVELS, shape="level", default=0.0)
     limit: Leaf = leaf(LEVELS, sign="positive limit", shape="level", default=None)
     disturbance_limit: Leaf = leaf(RATES, sign="positive limit", shape="level", default=None)
-    receives_x: ClassVar[bool] = True
 
     def check(self) -> None:
         """Raises ValueError for levels that are not ascending from 1, or no bool."""

@@ -1,10 +1,11 @@
 """Sensors: the measurements of q and q', or of all levels of a plant, for a sampled law.  The
-contracts are the base classes `Sensor`, `LevelSensor` and `Velocity`.
+contracts are the base classes `RobotSensor`, `Sensor`, `LevelSensor` and `Velocity`.
 """
 
-from iblf_jax.control.sensors._base import LevelReading as LevelReading
+from iblf_jax.control.sensors._base import AnySensor as AnySensor
 from iblf_jax.control.sensors._base import LevelSensor as LevelSensor
 from iblf_jax.control.sensors._base import Measurement as Measurement
+from iblf_jax.control.sensors._base import RobotSensor as RobotSensor
 from iblf_jax.control.sensors._base import Sensor as Sensor
 from iblf_jax.control.sensors._base import State as State
 from iblf_jax.control.sensors._base import Velocity as Velocity
@@ -28,15 +29,16 @@ __all__ = [
     "LEVELS",
     "MEMBERS",
     "VELOCITIES",
+    "AnySensor",
     "Direct",
     "Encoder",
     "FilteredDifference",
     "Ideal",
-    "LevelReading",
     "LevelSensor",
     "Levels",
     "Measured",
     "Measurement",
+    "RobotSensor",
     "Sensor",
     "State",
     "Tracking",

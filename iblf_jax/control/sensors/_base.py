@@ -16,6 +16,7 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.core.families import Part, attribute
+from iblf_jax.core.pytree import component
 
 State = Any
 """A pytree of arrays of floats; `()` for a sensor without memory."""
@@ -32,14 +33,18 @@ class Measurement(NamedTuple):
     """The levels from the third on of a plant in strict-feedback form, (r - 2, n); `()` for a
     robot."""
 
+    @property
+    def x(self) -> jax.Array:
+        """All levels, (r, n)."""
+        first = jnp.stack([self.q, self.dq])
+        return first if isinstance(self.higher, tuple) else jnp.concatenate([first, self.higher])
 
-class LevelReading(Part):
-    """What a part of `Levels` states: a `Sensor` of a position and its velocity, or a
-    `LevelSensor`.
+
+class AnySensor(Part):
+    """What every sensor states: a `Sensor` of the state x, a `RobotSensor` of q and q', or a
+    `LevelSensor` of one level.
     """
 
-    receives_x: ClassVar[bool] = False
-    """Whether it measures all levels of a plant in strict-feedback form."""
     levels: ClassVar[int] = 2
     """Number of levels that it measures as a part of `Levels`."""
     is_measured: ClassVar[bool] = True
@@ -60,7 +65,7 @@ class LevelReading(Part):
     @attribute
     def resolution(self) -> Any:
         """Size of a count, () or (n,) [rad], for the default ranges of gains; 0 for a sensor that
-        does not round.  (r, n) in the units of the levels for a sensor that `receives_x`.
+        does not round.  (r, n) in the units of the levels for a `Sensor`.
         """
         return 0.0
 
@@ -69,23 +74,44 @@ class LevelReading(Part):
         return []
 
 
-class Sensor(LevelReading):
-    """The contract of a sensor.
-
-    A sensor of all levels of a plant in strict-feedback form has the class attribute
-    `receives_x = True`; its methods then receive the state x, (r, n), in the place of q and q'.
-    With any other sensor the levels from the third on are measured without error.
+class Sensor(AnySensor):
+    """The contract of a sensor of all levels of a plant in strict-feedback form, which receives the
+    state x.
     """
 
     @attribute
     def order(self) -> int | None:
-        """The number of levels r of a sensor that `receives_x`; None for any number."""
+        """The number of levels r; None for any number."""
         return None
 
     @attribute
     def measured(self) -> tuple[int, ...] | None:
-        """The levels that a sensor that `receives_x` measures, counted from 1; None for all."""
+        """The levels that it measures, counted from 1; None for all."""
         return None
+
+    @abc.abstractmethod
+    def init(self, x: jax.Array, period: jax.Array) -> State:
+        """State before the first sample, given x, (r, n), there and the period, () [s]."""
+
+    @abc.abstractmethod
+    def measure(
+        self, x: jax.Array, normal: jax.Array, period: jax.Array, state: State
+    ) -> tuple[Measurement, State]:
+        """The measurement, and the next state.
+
+        Args:
+          x: true levels, (r, n), in their units.
+          normal: independent standard normal numbers, (draws, n).
+          period: () [s].
+          state: of the sample before.
+        """
+
+
+class RobotSensor(AnySensor):
+    """The contract of a sensor of a robot, which receives q and q'.
+
+    The levels from the third on of a plant with such a sensor are measured without error.
+    """
 
     @abc.abstractmethod
     def init(self, q: jax.Array, dq: jax.Array, period: jax.Array) -> State:
@@ -107,7 +133,55 @@ class Sensor(LevelReading):
         """
 
 
-class LevelSensor(LevelReading):
+@component
+class SensorOfRobot(Sensor):
+    """measure(x, ...) = sensor.measure(x_1, x_2, ...): a sensor of q and q' in the closed loop.
+
+    It is no part of a scenario.
+
+    Args:
+      sensor: any sensor of robots.
+
+    Source: none; the state of a robot is x = (q, q').
+    """
+
+    sensor: RobotSensor
+
+    @property
+    def draws(self) -> int:
+        """Those of the sensor."""
+        return self.sensor.draws
+
+    def init(self, x: jax.Array, period: jax.Array) -> State:
+        """State of the sensor."""
+        return self.sensor.init(x[0], x[1], period)
+
+    def measure(
+        self, x: jax.Array, normal: jax.Array, period: jax.Array, state: State
+    ) -> tuple[Measurement, State]:
+        """Measurement of the sensor, and the other levels without error."""
+        measured, after = self.sensor.measure(x[0], x[1], normal, period, state)
+        if len(x) > 2:
+            measured = measured._replace(higher=x[2:])
+        return measured, after
+
+
+def sensor_of_x(sensor: AnySensor) -> Sensor:
+    """A sensor as the closed loop calls it."""
+    if isinstance(sensor, Sensor):
+        return sensor
+    assert isinstance(sensor, RobotSensor)
+    return SensorOfRobot(sensor)
+
+
+def contract_of(sensor: Any) -> type[Sensor] | type[RobotSensor]:
+    """The contract that a sensor is meant to fit."""
+    # A user's class without a base class says by this attribute that it receives x.
+    receives_x = isinstance(sensor, Sensor) or getattr(sensor, "receives_x", False) is True
+    return Sensor if receives_x else RobotSensor
+
+
+class LevelSensor(AnySensor):
     """The contract of a sensor of one level of a plant in strict-feedback form, a part of `Levels`.
 
     All numbers are in the unit of the level.

@@ -9,14 +9,14 @@ import math
 
 import jax
 
-from iblf_jax.control.sensors._base import Measurement, Sensor, State, Velocity, rounded
+from iblf_jax.control.sensors._base import Measurement, RobotSensor, State, Velocity, rounded
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.core.units import POSITION
 
 
 @component
-class Encoder(Sensor):
+class Encoder(RobotSensor):
     """y = step round((q + offset + noise w) / step),   step = 2 pi / counts,   w standard normal.
 
     The derivative of y by q is defined as 1, that of the reading before rounding, because the

@@ -6,12 +6,12 @@ from typing import ClassVar
 
 import jax
 
-from iblf_jax.control.sensors._base import Measurement, Sensor
+from iblf_jax.control.sensors._base import Measurement, RobotSensor
 from iblf_jax.core.pytree import component
 
 
 @component
-class Ideal(Sensor):
+class Ideal(RobotSensor):
     """Q and q' as they are.  Source: none; the baseline."""
 
     draws: ClassVar[int] = 0

@@ -1,17 +1,22 @@
 """Sensors of all levels of a plant in strict-feedback form."""
 
-# The methods receive x in the place of q and q'.
-# mypy: disable-error-code="override"
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
-from typing import Any, ClassVar, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.sensors._base import LevelReading, LevelSensor, Measurement, Sensor, State
+from iblf_jax.control.sensors._base import (
+    LevelSensor,
+    Measurement,
+    RobotSensor,
+    Sensor,
+    State,
+    contract_of,
+)
 from iblf_jax.control.sensors.unmeasured import Unmeasured
 from iblf_jax.core import checks
 from iblf_jax.core.attributes import has_members
@@ -44,8 +49,7 @@ class Levels(Sensor):
     Source: none; the construction is common.
     """
 
-    parts: tuple[LevelReading, ...]
-    receives_x: ClassVar[bool] = True
+    parts: tuple[Annotated[LevelSensor, RobotSensor], ...]
 
     def check(self) -> None:
         """Raises ValueError for a part that is no sensor; replaces None by `Unmeasured()`."""
@@ -55,11 +59,12 @@ class Levels(Sensor):
         parts = tuple(Unmeasured() if part is None else part for part in self.parts)
         for i, part in enumerate(parts):
             is_of_level = has_members(part, "levels") and part.levels == 1
-            base = LevelSensor if is_of_level else Sensor
-            checks.conforms(f"{name}[{i}]", part, base, remedy)
-            if part.receives_x:
+            if contract_of(part) is Sensor:
                 expected = "a sensor of one or two levels"
                 raise checks.fail(f"{name}[{i}]", type(part).__name__, expected, remedy)
+            checks.conforms(
+                f"{name}[{i}]", part, LevelSensor if is_of_level else RobotSensor, remedy
+            )
         object.__setattr__(self, "parts", parts)
 
     def spans(self) -> Iterator[Span]:

@@ -64,6 +64,11 @@ class Plant(Dynamics):
         """Number of levels r, at least 2."""
 
     @attribute
+    def estimate_shape(self) -> tuple[int, ...]:
+        """The shape of an estimate of the uncertain term, (order, n)."""
+        return self.order, self.n
+
+    @attribute
     def units(self) -> tuple[Units, ...] | None:
         """The units of the levels and of the input, order + 1 of them; None if they have none."""
         return None
@@ -120,6 +125,30 @@ class Plant(Dynamics):
     def transposed_gain(self, level: int, t: jax.Array, x: jax.Array, s: jax.Array) -> jax.Array:
         """G_i^T s, (n,)."""
         return _times(_row(self.gain, t, x, level).T, s)
+
+    def uncertain(self, t: jax.Array, x: jax.Array, rate: jax.Array, u: jax.Array) -> jax.Array:
+        """The uncertain term of a model for which x' is `rate` under the input u: d, (order, n)."""
+        return rate - flow(self, t, x, u)
+
+    def as_uncertain(self, x: jax.Array, estimate: jax.Array) -> jax.Array:
+        """An estimate as one of d, (order, n): M^-1 f_hat in the second level for a torque f_hat,
+        (n,), on the robot inside.
+        """
+        if estimate.ndim == 2:
+            return estimate
+        return torque_as_rates(self, x, estimate)
+
+    def energy_of_errors(
+        self, x: jax.Array, e2: jax.Array | None, error: jax.Array
+    ) -> jax.Array | None:
+        """What V of a sample adds to the law's V, (); None for nothing.
+
+        Args:
+          x: state, (order, n).
+          e2: error of the last level, (n,); None if the law's V contains it.
+          error: of the estimate of the uncertain term.
+        """
+        return None
 
     def outline(self, x1: jax.Array) -> jax.Array | None:
         """Corners of the plant's shape in the plane at a first level, (k, 2) [m], for figures; the

@@ -9,11 +9,11 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.core import checks
-from iblf_jax.core.linalg import solve_spd
+from iblf_jax.core.linalg import inner, solve_spd
 from iblf_jax.core.pytree import component
 from iblf_jax.core.time import jump_times_of
 from iblf_jax.world.plants._base import Plant
-from iblf_jax.world.robots import Robot, inverse_dynamics
+from iblf_jax.world.robots import Robot, inverse_dynamics, momentum
 
 
 @component
@@ -75,6 +75,28 @@ class Rigid(Plant):
         if level == 1:
             return s
         return solve_spd(self.robot.mass_matrix(x[0]), s)
+
+    @property
+    def estimate_shape(self) -> tuple[int, ...]:
+        """The shape of an estimate of the torque f of (2.1), (n,)."""
+        return (self.n,)
+
+    def uncertain(self, t: jax.Array, x: jax.Array, rate: jax.Array, u: jax.Array) -> jax.Array:
+        """The torque f of (2.1), (n,) [N m]."""
+        q, dq = x[0], x[1]
+        return inverse_dynamics(self.robot, q, dq, dq, rate[1]) - u
+
+    def as_uncertain(self, x: jax.Array, estimate: jax.Array) -> jax.Array:
+        """An estimate as the torque f_hat, (n,) [N m]: M d_hat_2."""
+        if estimate.ndim == 1:
+            return estimate
+        return momentum(self.robot, x[0], estimate[1])
+
+    def energy_of_errors(self, x: jax.Array, e2: jax.Array | None, error: jax.Array) -> jax.Array:
+        """1/2 e2^T M e2 + 1/2 f_tilde^T f_tilde, ().                                      (3.12)"""
+        if e2 is None:
+            return 0.5 * inner(error, error)
+        return 0.5 * (inner(e2, momentum(self.robot, x[0], e2)) + inner(error, error))
 
     def joint_torque(self, x: jax.Array, u: jax.Array) -> jax.Array:
         """The input itself, (n,) [N m]."""
