@@ -49,7 +49,7 @@ def _why_not_with_estimates(scenario: Any, law: Any) -> str:
     The claim is about a measured state.  For a law of robots without a state of its own and with
     the general T, the error of the estimates acts through the torque alone, which T then contains.
     """
-    if not scenario.observer.completes:
+    if not scenario.loop.observer.completes:
         return ""
     kind = type(scenario.observer).__name__
     about = f"the law's own claim is about a measured state, and {kind} estimates levels"
@@ -77,7 +77,7 @@ def own_segment_lines(segment: Segment) -> list[Line]:
     states_terms = states_disturbance_terms(law)
     general = LEVEL_TERMS if is_about_levels(summary.run.scenario) else GENERAL_TERMS
     right_side = "what the law states" if states_terms else general
-    if summary.run.scenario.observer.completes:
+    if summary.run.scenario.loop.observer.completes:
         right_side += TORQUE_OF_ESTIMATES
     decay = "W >= 0: the decay that the law states"
     inequality = f"V' <= -W + T,  T: {right_side}"

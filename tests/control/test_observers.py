@@ -95,9 +95,12 @@ def test_no_observer_estimates_nothing():
     for scenario, shape in ((robot, (2,)), (drive, (3, 2))):
         model = scenario.loop.model
         x = jnp.ones((model.order, 2))
-        estimate = NoObserver().estimate(0.0, x, model, ())
+        observer = NoObserver().of_x()
+        estimate = observer.estimate(0.0, x, model, ())
         assert estimate.shape == shape and not np.any(np.asarray(estimate))
-        assert jax.tree.leaves(NoObserver().init(x, model)) == []
+        assert jax.tree.leaves(observer.init(x, model)) == []
+    q = jnp.ones(2)
+    assert not np.any(np.asarray(NoObserver().estimate(0.0, q, q, robot.model, ())))
 
 
 def test_a_law_without_an_observer_is_not_advised_about_kf(paper):

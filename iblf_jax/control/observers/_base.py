@@ -160,6 +160,10 @@ class RobotObserver(DisturbanceObserver):
         """
         return None
 
+    def of_x(self) -> Observer:
+        """The observer as the closed loop calls it."""
+        return ObserverOfRobot(self)
+
 
 @component
 class ObserverOfRobot(Observer):
@@ -232,7 +236,7 @@ def observer_of_x(observer: DisturbanceObserver) -> Observer:
     if isinstance(observer, Observer):
         return observer
     assert isinstance(observer, RobotObserver)
-    return ObserverOfRobot(observer)
+    return observer.of_x()
 
 
 def contract_of(observer: Any) -> type[Observer] | type[RobotObserver]:
