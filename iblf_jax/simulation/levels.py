@@ -80,7 +80,7 @@ def stated_steady_input(scenario: Any, q: jax.Array) -> jax.Array | None:
     plant that states none.
     """
     plant, model = scenario.loop.plant, scenario.loop.model
-    if isinstance(model, plants.Rigid) and not isinstance(plant, plants.Rigid):
+    if isinstance(model, plants.RobotPlant) and not isinstance(plant, plants.RobotPlant):
         model = plant
     return model.steady_input(q)  # type: ignore[no-any-return]
 

@@ -119,7 +119,7 @@ def _structure(findings: Findings, observer, t, case: Case, model) -> None:
     state = shape_of(findings, f"init({names}, model)", observer.init, *case.start, model)
     label = f"estimate(t, {names}, model, state)"
     # The estimate has the shape of the torque of a robot, or of the state of a plant.
-    shape = model.estimate_shape if receives_x else case.measured[0].shape
+    shape = case.measured[0].shape
     call_has_shape(findings, label, observer.estimate, (t, *case.measured, model, state), shape)
     label = f"derivative(t, {names}, tau, model, state)"
     arguments = (t, *case.measured, case.tau, model, state)

@@ -43,6 +43,7 @@ from iblf_jax.world.plants.electric_drive import ElectricDrive as ElectricDrive
 from iblf_jax.world.plants.flexible_joint import FlexibleJoint as FlexibleJoint
 from iblf_jax.world.plants.markov_switched import MarkovSwitched as MarkovSwitched
 from iblf_jax.world.plants.rigid import Rigid as Rigid
+from iblf_jax.world.plants.rigid import RobotPlant as RobotPlant
 from iblf_jax.world.plants.strict_feedback import StrictFeedback as StrictFeedback
 from iblf_jax.world.plants.switched import Switched as Switched
 from iblf_jax.world.plants.vessel import Vessel as Vessel
@@ -50,10 +51,10 @@ from iblf_jax.world.robots import Robot as Robot
 
 
 def as_plant(part: Any) -> Plant:
-    """A plant in strict-feedback form: the part itself, or a robot as a `Rigid`."""
+    """A plant in strict-feedback form: the part itself, or a robot as a `RobotPlant`."""
     if is_chain(part):
         return part  # type: ignore[no-any-return]
-    return Rigid(part)
+    return RobotPlant(part)
 
 
 MEMBERS = {

@@ -4,7 +4,7 @@
 
 A plant has r levels (`order`) of n numbers each; the state x is (r, n), and level i is x[i - 1].
 The output x_1 tracks the reference, and every gain G_i is invertible.  A robot is a plant of order
-2, x = (q, q') with f_2 = -M^-1 (C q' + G) and G_2 = M^-1: `as_plant` wraps it as a `Rigid`.
+2, x = (q, q') with f_2 = -M^-1 (C q' + G) and G_2 = M^-1: `as_plant` wraps it as a `RobotPlant`.
 
 Functions of this module take the number of a level, which counts from 1.
 """
@@ -191,7 +191,7 @@ class Plant(Dynamics):
 
 def is_chain(part: Any) -> TypeGuard[Plant]:
     """Whether a part has the methods of a plant in strict-feedback form.  A robot has them only
-    inside a `Rigid`, which `as_plant` makes of it.  A class without the base class is adopted.
+    inside a `RobotPlant`, which `as_plant` makes of it.  A class without the base class is adopted.
     """
     if isinstance(part, type) or not has_members(part, "drift", "gain", "order"):
         return False

@@ -76,6 +76,39 @@ class Rigid(Plant):
             return s
         return solve_spd(self.robot.mass_matrix(x[0]), s)
 
+    def joint_torque(self, x: jax.Array, u: jax.Array) -> jax.Array:
+        """The input itself, (n,) [N m]."""
+        return u
+
+    def steady_levels(self, q: jax.Array, dq: jax.Array) -> jax.Array:
+        """There are no levels above the second, (0, n)."""
+        return jnp.zeros((0, self.n), q.dtype)
+
+    def steady_input(self, q: jax.Array) -> jax.Array:
+        """G(q), (n,) [N m]."""
+        return self.robot.gravity(q)
+
+    def at(self, t: jax.Array) -> Rigid:
+        """The plant at time t [s], with the robot as it is then."""
+        return dataclasses.replace(self, robot=self.robot.at(t))
+
+    def jump_times(self) -> jax.Array:
+        """The times at which the robot jumps, (m,) [s]."""
+        return jump_times_of("robot", self.robot)
+
+
+@component
+class RobotPlant(Rigid):
+    """M0(q) q" + C0(q, q') q' + G0(q) = tau + f: a robot in the closed loop.
+
+    Its uncertain term is the torque f.  It is no part of a scenario, which has the robot itself.
+
+    Args:
+      robot: any of `iblf_jax.robots`.
+
+    Source: Zhang & Yan 2024, (2.1), (3.12).
+    """
+
     @property
     def estimate_shape(self) -> tuple[int, ...]:
         """The shape of an estimate of the torque f of (2.1), (n,)."""
@@ -97,26 +130,6 @@ class Rigid(Plant):
         if e2 is None:
             return 0.5 * inner(error, error)
         return 0.5 * (inner(e2, momentum(self.robot, x[0], e2)) + inner(error, error))
-
-    def joint_torque(self, x: jax.Array, u: jax.Array) -> jax.Array:
-        """The input itself, (n,) [N m]."""
-        return u
-
-    def steady_levels(self, q: jax.Array, dq: jax.Array) -> jax.Array:
-        """There are no levels above the second, (0, n)."""
-        return jnp.zeros((0, self.n), q.dtype)
-
-    def steady_input(self, q: jax.Array) -> jax.Array:
-        """G(q), (n,) [N m]."""
-        return self.robot.gravity(q)
-
-    def at(self, t: jax.Array) -> Rigid:
-        """The plant at time t [s], with the robot as it is then."""
-        return dataclasses.replace(self, robot=self.robot.at(t))
-
-    def jump_times(self) -> jax.Array:
-        """The times at which the robot jumps, (m,) [s]."""
-        return jump_times_of("robot", self.robot)
 
 
 def robot_acceleration(robot: Robot, q: jax.Array, dq: jax.Array, torque: jax.Array) -> jax.Array:
