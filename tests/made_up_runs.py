@@ -17,6 +17,9 @@ class Arm3D:
     def __init__(self, n):
         self.n = n
 
+    def mass_matrix(self, q):
+        return jnp.eye(self.n)
+
     def skeleton(self, q):
         lift = jnp.cumsum(q[1:])
         out = jnp.concatenate([jnp.zeros(1), jnp.cos(lift)])
