@@ -253,12 +253,13 @@ def test_without_an_error_the_law_is_the_wrapped_one_and_nothing_adapts():
     law, context, q = scenario.controller, scenario.context, scenario.initial.q
     t = jnp.asarray(0.4)
     alpha = MAPPED.command(t, q, q, jnp.zeros(2), context, ())[0].alpha
-    state = law.init(q, alpha, context)
-    command, rates = law.command(t, q, alpha, jnp.ones(2), context, state)
+    x = jnp.stack([q, alpha])
+    state = law.init(x, context)
+    command, rates = law.command(t, x, jnp.ones(2), context, state)
     expected, _ = MAPPED.command(t, q, alpha, jnp.zeros(2), context, ())
     np.testing.assert_array_equal(command.tau, expected.tau)
     leak_free = dataclasses.replace(law, sigma=0.0)
-    _, rates = leak_free.command(t, q, alpha, jnp.ones(2), context, state)
+    _, rates = leak_free.command(t, x, jnp.ones(2), context, state)
     np.testing.assert_array_equal(rates.theta, 0.0)
 
 

@@ -303,8 +303,7 @@ def test_smooth_limit(dtype):
         wrapped = controllers.Saturated(law=fixed, limit=jnp.ones(2, dtype), edge="smooth")
         return wrapped.command(
             jnp.zeros((), dtype),
-            Q.astype(dtype),
-            DQ.astype(dtype),
+            jnp.stack([Q, DQ]).astype(dtype),
             jnp.zeros(2, dtype),
             scenario.context,
             (),
