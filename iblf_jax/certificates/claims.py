@@ -52,13 +52,17 @@ from iblf_jax.control.controllers import (
     AdaptiveParameters,
     Backstepping,
     FullState,
+    Law,
     LyapunovLaw,
+    RobotLaw,
     Saturated,
     TrackingLaw,
 )
 from iblf_jax.control.controllers._base import contract_of
 from iblf_jax.control.observers import Momentum, Printed
 from iblf_jax.core import checks, programs
+from iblf_jax.core.attributes import attributes
+from iblf_jax.core.families import is_default
 from iblf_jax.core.pytree import layers, unwrapped
 from iblf_jax.simulation.scenario import Scenario
 
@@ -357,16 +361,15 @@ def own_claim(scenario: Scenario) -> LyapunovLaw | None:
 
 def stated_methods(law: TrackingLaw) -> list[str]:
     """The methods among `lyapunov` and `decay` that a law has."""
-    kind: Any = type(law)
-    base = contract_of(law)
-    are_own = (kind.lyapunov is not base.lyapunov, kind.decay is not base.decay)
-    return [name for name, is_own in zip(OWN_CLAIM_METHODS, are_own, strict=True) if is_own]
+    base: Any = contract_of(law)
+    methods = attributes(law, OWN_CLAIM_METHODS)
+    defaults = attributes(base, OWN_CLAIM_METHODS)
+    return [name for name, own in methods.items() if not is_default(own, defaults[name])]
 
 
-def states_disturbance_terms(law: TrackingLaw) -> bool:
+def states_disturbance_terms(law: Law | RobotLaw) -> bool:
     """Whether a law states the T of its own claim."""
-    kind: Any = type(law)
-    return kind.disturbance_terms is not contract_of(law).disturbance_terms
+    return not is_default(law.disturbance_terms, contract_of(law).disturbance_terms)
 
 
 def _why_no_own_claim(scenario: Scenario) -> str:

@@ -148,7 +148,7 @@ def level_terms_and_sample(
     estimate_error, estimate_size = _estimate_error(scenario, at, tangent, d_tilde, sizes)
     excluded = jnp.any(sample.guard_active)
     if not covers_limit(scenario):
-        excluded |= jnp.any(sample.saturated) | _input_was_limited(scenario, at, state, sample)
+        excluded |= jnp.any(sample.saturated) | _input_was_limited(scenario, at)
     V = sample.V
     claim: Any = ()
     own: Any = ()
@@ -228,9 +228,7 @@ def _distances(scenario: Scenario, sample: Sample, x: jax.Array) -> jax.Array:
     return distances.at[2:].set(jnp.minimum(x[2:] - lower, upper - x[2:]))
 
 
-def _input_was_limited(
-    scenario: Scenario, at: _Point, state: LoopState, sample: Sample
-) -> jax.Array:
+def _input_was_limited(scenario: Scenario, at: _Point) -> jax.Array:
     """Whether a wrapper around the law changed its input, () bool.  A smooth limit changes it
     before the limit is reached, which the status flags do not show.
     """

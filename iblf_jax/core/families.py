@@ -17,9 +17,12 @@ import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 from iblf_jax.core.caches import CACHE
+
+X = TypeVar("X")
+R = TypeVar("R")
 
 NO_NAMES: Mapping[str, Any] = MappingProxyType({})
 
@@ -107,6 +110,19 @@ class Default:
         if member is None:
             member = vars(self.base)[self.name]
         return member.__get__(part, cls) if hasattr(member, "__get__") else member
+
+
+def contract_of(part: Any, of_x: type[X], of_robot: type[R]) -> type[X] | type[R]:
+    """The contract that a part is meant to fit: that of parts of the state x, or that of parts of q
+    and q'.
+
+    A class without a base class says by the attribute `receives_x` that it receives x.
+    """
+    if isinstance(part, of_robot):
+        return of_robot
+    if isinstance(part, of_x) or getattr(part, "receives_x", False) is True:
+        return of_x
+    return of_robot
 
 
 def adopt(cls: type, base: type) -> None:

@@ -142,6 +142,7 @@ def surfaces(scenario: Scenario, t: jax.Array, state: LoopState) -> jax.Array | 
     """
     loop = scenario.loop
     x = state.x[: loop.model.order]
+    # Switching functions of laws of robots do not depend on the estimate.
     d_hat = jnp.zeros(loop.model.estimate_shape, x.dtype)
     if isinstance(unwrapped(scenario.controller), Law):
         d_hat = estimate(scenario, loop.observer, t, x, state.observer)

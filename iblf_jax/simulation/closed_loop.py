@@ -26,7 +26,6 @@ import jax.numpy as jnp
 
 from iblf_jax.control.actuators import Ideal
 from iblf_jax.control.controllers import Command
-from iblf_jax.control.controllers._base import state_of_levels
 from iblf_jax.control.observers import Observer
 from iblf_jax.control.sensors import Measurement
 from iblf_jax.core.pytree import unwrapped
@@ -137,7 +136,7 @@ class LoopState(NamedTuple):
     @property
     def x(self) -> jax.Array:
         """The state of the plant, (r, n)."""
-        return state_of_levels(self.q, self.dq, self.higher)
+        return plants.state_of_levels(self.q, self.dq, self.higher)
 
 
 # inline, so that JAX traces it once for all of its call sites
@@ -492,7 +491,8 @@ def law_update(
     running = discrete_observer(scenario)
     reading = measured
     measured = completed(scenario, running, t, reading, observer)
-    law, model = scenario.loop.law, scenario.loop.model
+    loop = scenario.loop
+    law, model = loop.law, loop.model
     x = measured.x[: model.order]
     f_hat = estimate(scenario, running, t, x, observer)
     command, controller_rate = law.command(t, x, f_hat, scenario.context, controller)

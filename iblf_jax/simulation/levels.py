@@ -13,7 +13,6 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.control.controllers import Law
-from iblf_jax.control.controllers._base import state_of_levels
 from iblf_jax.control.observers import Observer
 from iblf_jax.control.sensors._base import Measurement
 from iblf_jax.core import taylor
@@ -34,9 +33,11 @@ def start_levels(scenario: Any) -> jax.Array:
     """
     initial, plant = scenario.initial, scenario.loop.plant
     if plant.order == 2 or initial.higher is not None:
-        return state_of_levels(initial.q, initial.dq, () if plant.order == 2 else initial.higher)
+        return plants.state_of_levels(
+            initial.q, initial.dq, () if plant.order == 2 else initial.higher
+        )
     higher = plant.steady_levels(initial.q, initial.dq)
-    return state_of_levels(initial.q, initial.dq, higher)
+    return plants.state_of_levels(initial.q, initial.dq, higher)
 
 
 def levels_on_reference(scenario: Any, t: jax.Array) -> jax.Array:
@@ -79,7 +80,7 @@ def stated_steady_input(scenario: Any, q: jax.Array) -> jax.Array | None:
     """The `steady_input` of the model, or of the plant where only the model is a robot; None for a
     plant that states none.
     """
-    plant, model = scenario.loop.plant, scenario.loop.model
+    plant, model, *_ = scenario.loop
     if isinstance(model, plants.RobotPlant) and not isinstance(plant, plants.RobotPlant):
         model = plant
     return model.steady_input(q)  # type: ignore[no-any-return]
@@ -174,7 +175,7 @@ def motion(scenario: Any, t: jax.Array, x: jax.Array, u: jax.Array) -> jax.Array
         torque: jax.Array | float = 0.0 if friction is None else friction
         u = u + disturbance.torque(t, q, dq, given, model)
     else:
-        known = scenario.loop.model.robot
+        known = plants.robot_of(model)
         torque = disturbance.torque(t, q, dq, robot, known) + friction_torque(robot, dq)
     rate = plants.flow(plant, t, x, u, torque)
     added = disturbance.rates(t, x, given, model)

@@ -25,6 +25,7 @@ from typing import Any, ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from iblf_jax.control.observers._base import observer_of_x
 from iblf_jax.core import checks
 from iblf_jax.core.families import Part, attribute
 from iblf_jax.core.pytree import Leaf, component, layers, leaf, note_code
@@ -753,7 +754,7 @@ def has_signal(scenario: Scenario, signal: str) -> bool:
         levels = range(3, plants.order_of(scenario.plant) + 1)
         return any(context.level_bounds(level) is not None for level in levels)
     if signal == "x_hat":
-        return scenario.loop.observer.completes
+        return observer_of_x(scenario.observer).completes
     has_regions = len(scenario.regions) > 0
     if signal == "region_margin":
         return has_regions

@@ -259,7 +259,7 @@ class Scenario:
     def _complete_law(self) -> None:
         """Gives the law what it derives from its model and the start, such as weights."""
         law = unwrapped(self.controller)
-        if type(law).completed is TrackingLaw.completed:
+        if is_default(law.completed, TrackingLaw.completed):
             return
         with jax.ensure_compile_time_eval():
             new = law.completed(self.context, start_levels(self)[: self.loop.model.order])
@@ -514,7 +514,7 @@ UNKNOWN_UNIT = "1"
 def _check_measured_levels(scenario: Scenario) -> None:
     """Raises ValueError for levels that are neither measured nor estimated."""
     order = plants.order_of(scenario.plant)
-    sensor, observer = scenario.loop.sensor, scenario.loop.observer
+    sensor, observer = sensor_of_x(scenario.sensor), observer_of_x(scenario.observer)
     covered = sensor.order
     if covered not in (None, order):
         expected = f"sensors of {order} levels, as the plant has"

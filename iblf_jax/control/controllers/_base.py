@@ -14,11 +14,10 @@ from functools import partial
 from typing import Any, ClassVar, NamedTuple, Self
 
 import jax
-import jax.numpy as jnp
 
 from iblf_jax.control.barriers import Barrier
 from iblf_jax.control.decays import Decay, Exponential
-from iblf_jax.core import checks
+from iblf_jax.core import checks, families
 from iblf_jax.core.families import attribute
 from iblf_jax.core.pytree import Leaf, component, layers, wrapped_field
 from iblf_jax.core.time import Timed
@@ -484,9 +483,7 @@ class Wrapping(Law):
 
 def contract_of(law: Any) -> type[Law] | type[RobotLaw]:
     """The contract that a law is meant to fit."""
-    # A user's class without a base class says by this attribute that it receives x.
-    receives_x = isinstance(law, Law) or getattr(law, "receives_x", False) is True
-    return Law if receives_x else RobotLaw
+    return families.contract_of(law, Law, RobotLaw)
 
 
 def check_law(name: str, law: Any, remedy: str) -> None:
@@ -497,12 +494,6 @@ def check_law(name: str, law: Any, remedy: str) -> None:
     field = wrapped_field(law)
     if field:
         check_law(f"{name}.{field}", vars(law)[field], remedy)
-
-
-def state_of_levels(q: jax.Array, dq: jax.Array, higher: Any) -> jax.Array:
-    """The state x of a plant, (r, n), from its first two levels and the others."""
-    first = jnp.stack([q, dq])
-    return first if isinstance(higher, tuple) else jnp.concatenate([first, higher])
 
 
 def no_state(law: Any, q: jax.Array, dq: jax.Array, context: LawContext) -> tuple[()]:

@@ -53,6 +53,7 @@ from iblf_jax.control.controllers._base import (
 )
 from iblf_jax.core import checks
 from iblf_jax.core.component_paths import member_of, replaced, resolve
+from iblf_jax.core.families import is_default
 from iblf_jax.core.linalg import inner, solve_spd
 from iblf_jax.core.pytree import Leaf, component, leaf, static
 from iblf_jax.core.units import PlantUnit, of_entry
@@ -155,9 +156,9 @@ class AdaptiveParameters(Wrapping):
         """
         law: Any = self.law
         field = "AdaptiveParameters.law"
-        contract: Any = contract_of(law)
-        kind = type(law)
-        if kind.energy is contract.energy or kind.energy_decay is contract.energy_decay:
+        base = contract_of(law)
+        stated = ((law.energy, base.energy), (law.energy_decay, base.energy_decay))
+        if any(is_default(own, default) for own, default in stated):
             raise checks.fail(field, type(law).__name__, "a law with an `energy`", LAWS)
         if law.reading == "printed":
             remedy = "With C0 q' the term 1/2 e2^T M0' e2 remains. Take reading=\"corrected\"."

@@ -13,7 +13,8 @@ from typing import Any, Self
 
 import jax
 
-from iblf_jax.core.families import attribute
+from iblf_jax.core import families
+from iblf_jax.core.families import attribute, is_default
 from iblf_jax.core.pytree import Leaf, component
 from iblf_jax.core.time import Timed
 from iblf_jax.world.plants import Plant
@@ -72,12 +73,12 @@ class Observer(DisturbanceObserver):
     @attribute
     def advances(self) -> bool:
         """Whether it has `advance`."""
-        return type(self).advance is not Observer.advance
+        return not is_default(self.advance, Observer.advance)
 
     @attribute
     def completes(self) -> bool:
         """Whether it has `complete`."""
-        return type(self).complete is not Observer.complete
+        return not is_default(self.complete, Observer.complete)
 
     @abc.abstractmethod
     def init(self, x: jax.Array, model: Plant) -> State:
@@ -183,7 +184,7 @@ class ObserverOfRobot(Observer):
     @property
     def advances(self) -> bool:
         """Whether the observer has `advance`."""
-        return type(self.observer).advance is not RobotObserver.advance
+        return not is_default(self.observer.advance, RobotObserver.advance)
 
     def at_period(self, period: jax.Array) -> ObserverOfRobot:
         """The observer with gains for steps of Euler."""
@@ -241,6 +242,4 @@ def observer_of_x(observer: DisturbanceObserver) -> Observer:
 
 def contract_of(observer: Any) -> type[Observer] | type[RobotObserver]:
     """The contract that an observer is meant to fit."""
-    # A user's class without a base class says by this attribute that it receives x.
-    receives_x = isinstance(observer, Observer) or getattr(observer, "receives_x", False) is True
-    return Observer if receives_x else RobotObserver
+    return families.contract_of(observer, Observer, RobotObserver)

@@ -14,9 +14,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.core import checks
+from iblf_jax.core import checks, families
 from iblf_jax.core.families import Part, attribute
 from iblf_jax.core.pytree import component
+from iblf_jax.world.plants import state_of_levels
 
 State = Any
 """A pytree of arrays of floats; `()` for a sensor without memory."""
@@ -36,8 +37,7 @@ class Measurement(NamedTuple):
     @property
     def x(self) -> jax.Array:
         """All levels, (r, n)."""
-        first = jnp.stack([self.q, self.dq])
-        return first if isinstance(self.higher, tuple) else jnp.concatenate([first, self.higher])
+        return state_of_levels(self.q, self.dq, self.higher)
 
 
 class AnySensor(Part):
@@ -176,9 +176,7 @@ def sensor_of_x(sensor: AnySensor) -> Sensor:
 
 def contract_of(sensor: Any) -> type[Sensor] | type[RobotSensor]:
     """The contract that a sensor is meant to fit."""
-    # A user's class without a base class says by this attribute that it receives x.
-    receives_x = isinstance(sensor, Sensor) or getattr(sensor, "receives_x", False) is True
-    return Sensor if receives_x else RobotSensor
+    return families.contract_of(sensor, Sensor, RobotSensor)
 
 
 class LevelSensor(AnySensor):

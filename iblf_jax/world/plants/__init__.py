@@ -30,6 +30,7 @@ from iblf_jax.world.plants._base import nominal_of as nominal_of
 from iblf_jax.world.plants._base import order_of as order_of
 from iblf_jax.world.plants._base import robot_of as robot_of
 from iblf_jax.world.plants._base import speed_limit as speed_limit
+from iblf_jax.world.plants._base import state_of_levels as state_of_levels
 from iblf_jax.world.plants._base import torque_as_rates as torque_as_rates
 from iblf_jax.world.plants._base import transposed_gain as transposed_gain
 from iblf_jax.world.plants._base import unit_symbols as unit_symbols
@@ -102,6 +103,7 @@ __all__ = [
     "nominal_of",
     "order_of",
     "robot_of",
+    "state_of_levels",
     "torque_as_rates",
     "transposed_gain",
     "unit_symbols",

@@ -189,6 +189,12 @@ class Plant(Dynamics):
         return None
 
 
+def state_of_levels(q: jax.Array, dq: jax.Array, higher: Any) -> jax.Array:
+    """The state x of a plant, (r, n), from its first two levels and the others."""
+    first = jnp.stack([q, dq])
+    return first if isinstance(higher, tuple) else jnp.concatenate([first, higher])
+
+
 def is_chain(part: Any) -> TypeGuard[Plant]:
     """Whether a part has the methods of a plant in strict-feedback form.  A robot has them only
     inside a `RobotPlant`, which `as_plant` makes of it.  A class without the base class is adopted.
