@@ -43,7 +43,6 @@ from iblf_jax.simulation.metrics import as_folds
 from iblf_jax.simulation.scenario import canonical
 
 DT = 1e-3
-SIDES = (("reference", ""), ("bounds", "lower"), ("bounds", "upper"))
 
 
 def starts(scenario, runs: int) -> np.ndarray:
@@ -111,13 +110,10 @@ def with_pinocchio(runs: int, steps: int) -> tuple[float, float, float, float]:
     """
     scenario = canonical(ij.presets.iiwa14())
     n, law = scenario.n, scenario.controller.law
-    tube = [
-        getattr(scenario, part) if not side else getattr(getattr(scenario, part), side)
-        for part, side in SIDES
-    ]
+    positions = scenario.bounds[0]
     waves = [
         getattr(wave, name)
-        for wave in (*tube, scenario.disturbance)
+        for wave in (scenario.reference, positions.lower, positions.upper, scenario.disturbance)
         for name in ("offset", "amplitude", "frequency", "phase")
     ]
     rows = [law.k1, law.K2, law.o, scenario.observer.kf, scenario.controller.limit, *waves]

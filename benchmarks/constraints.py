@@ -71,9 +71,8 @@ def scenario() -> ij.Scenario:
     """What is to be kept."""
     speeds = bounds.Bounds(lower=bounds.Constant([-1.0, -0.6]), upper=bounds.Constant([0.6, 0.5]))
     wall = regions.HalfSpace(normal=[-1.0, 0.0], offset=-WALL)
-    return ij.with_parts(
-        ij.presets.zhang_yan_2024_full_state(), velocity_bounds=speeds, regions=(wall,)
-    )
+    preset = ij.presets.zhang_yan_2024_full_state()
+    return ij.with_parts(preset, bounds=(preset.bounds[0], speeds), regions=(wall,))
 
 
 def step_seconds(one: ij.Scenario) -> float:

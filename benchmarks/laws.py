@@ -88,6 +88,7 @@ def _box(limit: float) -> ij.Bounds:
 NODES = 16
 """Of the networks; the time to compile grows with them."""
 CORRECTED = controllers.Backstepping(k1=2.0, K2=K2, reading="corrected")
+POSITIONS = ij.presets.zhang_yan_2024().bounds[0]
 CHOICES = {
     "Backstepping(Integral)": Choice("integral"),
     "Backstepping(Log)": Choice("log"),
@@ -126,7 +127,7 @@ CHOICES = {
     ),
     "Backstepping, no bounds": Choice("backstepping"),
     "BarrierBackstepping(Mapping)": Choice(controllers.BarrierBackstepping(k=(2.0, 20.0))),
-    "FullState": Choice("full_state", {"velocity_bounds": _box(3.0)}),
+    "FullState": Choice("full_state", {"bounds": (POSITIONS, _box(3.0))}),
     "DynamicSurface": Choice("dynamic_surface"),
     "SurfaceBarrier": Choice(controllers.SurfaceBarrier(a=2.0, K=K2, surface=_box(9.0))),
     "SafetyFilter": Choice("safety_filter"),

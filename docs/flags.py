@@ -62,9 +62,10 @@ def _switching() -> ij.Scenario:
 def _flexible() -> ij.Scenario:
     """A flexible arm with bounds on the velocities of its motors that its law does not know."""
     narrow = ij.Bounds(lower=ij.bounds.Constant(-0.3), upper=ij.bounds.Constant(0.3))
+    preset = ij.presets.flexible_joint_two_link()
     return ij.with_parts(
-        ij.presets.flexible_joint_two_link(),
-        state_bounds=(None, None, narrow),
+        preset,
+        bounds=(preset.bounds[0], None, None, narrow),
         controller=ij.controllers.BarrierBackstepping(k=(3.0, 20.0, 60.0, 150.0)),
     )
 
@@ -99,8 +100,11 @@ def _near_the_bound() -> ij.Scenario:
     return ij.with_parameters(ij.presets.zhang_yan_2024(), {"initial.q": [1.0397, 0.8]})
 
 
-def _speeds(lower: float) -> ij.Bounds:
-    return ij.Bounds(lower=ij.bounds.Constant(lower), upper=ij.bounds.Constant(0.6))
+def _slow() -> ij.Scenario:
+    """The paper's scenario with narrow bounds on the velocities, which its law does not know."""
+    paper = _paper()
+    narrow = ij.Bounds(lower=ij.bounds.Constant(-0.4), upper=ij.bounds.Constant(0.6))
+    return ij.with_parts(paper, bounds=(paper.bounds[0], narrow))
 
 
 def _sampled(period: float, delay: float = 0.0) -> ij.Scenario:
@@ -229,14 +233,14 @@ CASES: dict[str, Case] = {
         " (`weight`), `K2`, `kf`, a filter, a lag or the delay.",
     ),
     "VELOCITY_VIOLATED": Case(
-        lambda: _run(_paper(velocity_bounds=_speeds(-0.4))),
+        lambda: _run(_slow()),
         "A joint exceeded its velocity bound. The law of this example does not use velocity"
         " bounds.",
         "Use `controllers.FullState`, which bounds positions and velocities, or reduce `k1`.",
         plotting.velocities,
     ),
     "ALPHA_INFEASIBLE": Case(
-        lambda: _run(_paper(velocity_bounds=_speeds(-0.4))),
+        lambda: _run(_slow()),
         "The virtual velocity alpha violates the velocity bounds, so that no law that follows alpha"
         " can satisfy them.",
         "Reduce `k1`, start nearer to the reference, or widen the velocity bounds.",

@@ -22,8 +22,9 @@ def _side(side):
     return kind(**vars(side))
 
 
-def _bounds(pair):
-    return None if pair is None else ij.Bounds(lower=_side(pair[0]), upper=_side(pair[1]))
+def bounds_of(case: other.Case) -> tuple:
+    """The bounds of a case of the independent program in the package's terms."""
+    return tuple(pair and ij.Bounds(*map(_side, pair)) for pair in case.bounds)
 
 
 def _table_drift(t, x):
@@ -112,12 +113,10 @@ def scenario(name: str, **parts) -> ij.Scenario:
         weights=case.w,
         filter=case.filter,
     )
-    first, *higher = [_bounds(pair) for pair in case.bounds]
     given = {
         "plant": PLANTS[name](),
         "reference": references.Sinusoid(**vars(case.reference)),
-        "bounds": first,
-        "state_bounds": tuple(higher),
+        "bounds": bounds_of(case),
         "controller": law,
         "disturbance": _disturbance(name),
         "initial": ij.Initial(x=case.x0),

@@ -45,9 +45,9 @@ def electric_drive(**parts) -> ij.Scenario:
     law = controllers.BarrierBackstepping(
         k=(3.0, 20.0, 60.0), barriers=(barriers.Mapping(),) * 3, c=(0.0, 0.1, 0.1)
     )
-    levels = (band(-4.0, 4.0), band(-60.0, 60.0))
-    defaults = {"plant": plant, "controller": law, "state_bounds": levels}
-    return ij.Scenario(**(defaults | ARM | parts))
+    levels = (band(0.1, 0.9), band(-4.0, 4.0), band(-60.0, 60.0))
+    own = {"plant": plant, "controller": law, "bounds": levels}
+    return ij.Scenario(**(ARM | own | parts))
 
 
 @ij.component

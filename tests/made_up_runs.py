@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import iblf_jax as ij
-from iblf_jax.simulation.signals import Signals
+from iblf_jax.simulation.signals import VIEWS, Signals
 
 
 class Arm3D:
@@ -32,6 +32,17 @@ ALWAYS = [
     field.name for field in dataclasses.fields(Signals) if field.default is dataclasses.MISSING
 ]
 """The signals that every run has."""
+
+
+def with_signals(run, **signals):
+    """The run with other signals, of which some are rows of those of the levels."""
+    for name, value in signals.items():
+        if name in VIEWS:
+            view = VIEWS[name]
+            levels = getattr(run, view.signal).at[:, view.row].set(value)
+            name, value = view.signal, levels
+        run = dataclasses.replace(run, **{name: value})
+    return run
 
 
 @dataclasses.dataclass(eq=False)
@@ -72,16 +83,14 @@ def made_up(plant, *, duration=4.0, dt=0.01, shift=0.0, status=0):
     f = 0.1 * np.cos(2 * t[:, None] + joints)
     arrays = {
         "t": t,
-        "q": q_d + e1,
-        "dq": np.gradient(q_d + e1, dt, axis=0),
+        "x": np.stack([q_d + e1, np.gradient(q_d + e1, dt, axis=0)], axis=1),
         "tau": 3.0 - 8 * np.exp(-9 * t[:, None]) + joints,
-        "e1": e1,
-        "e2": -3 * e1,
+        "e": np.stack([e1, -3 * e1], axis=1),
         "xi": e1 / 0.45,
         "q_d": q_d,
         "dq_d": np.gradient(q_d, dt, axis=0),
-        "lower": lower,
-        "upper": upper,
+        "level_lower": lower[:, None],
+        "level_upper": upper[:, None],
         "alpha": 0 * q_d,
         "disturbance": f,
         "disturbance_estimate": f * (1 - np.exp(-5 * t[:, None])),
@@ -110,4 +119,4 @@ def runaway(plant, at=150):
     for name in ("q", "dq", "e1", "e2", "tau", "xi", "disturbance", "disturbance_estimate"):
         arrays[name] = jnp.asarray((np.asarray(getattr(run, name)) + 1e-4 * growth)[frozen])
     arrays["tau"] = arrays["tau"].at[at:].set(jnp.nan)
-    return dataclasses.replace(run, **arrays)
+    return with_signals(run, **arrays)

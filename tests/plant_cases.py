@@ -41,6 +41,10 @@ def symmetric(size: Any) -> Bounds:
     return Bounds(lower=Constant(-jnp.asarray(size)), upper=Constant(size))
 
 
+ANGLES = symmetric(1.0)
+"""Bounds of the first level of `pendulum`."""
+
+
 def pendulum(**parts: Any) -> ij.Scenario:
     """A pendulum that follows a sinusoid, with bounds and barriers on all levels; parts replace its
     own.
@@ -49,8 +53,7 @@ def pendulum(**parts: Any) -> ij.Scenario:
     own: dict[str, Any] = {
         "plant": PENDULUM,
         "reference": ij.references.Sinusoid(offset=0.0, amplitude=0.5),
-        "bounds": symmetric(1.0),
-        "state_bounds": (symmetric(3.0), symmetric(20.0)),
+        "bounds": (ANGLES, symmetric(3.0), symmetric(20.0)),
         "controller": ij.controllers.BarrierBackstepping(
             k=(3.0, 10.0, 30.0), barriers=WITH_MAPPING
         ),

@@ -22,7 +22,7 @@ FAR = ij.Bounds(lower=ij.bounds.Constant(-20.0), upper=ij.bounds.Constant(20.0))
 
 
 def with_velocity_bounds(law: Any) -> ij.Scenario:
-    return ij.with_parts(PAPER, controller=law, velocity_bounds=WIDE)
+    return ij.with_parts(PAPER, controller=law, bounds=(PAPER.bounds[0], WIDE))
 
 
 def of_robot(robot: Any) -> ij.Scenario:

@@ -156,7 +156,7 @@ def sensor_of(scenario: ij.Scenario, sigma: np.ndarray) -> Any:
 def failure_of(run: ij.Rollout, task: Task) -> str:
     """Whether a run has left the bounds of the task, or its step is too large; "" if neither."""
     flags = ij.Status.BOUND_VIOLATED | ij.Status.NOT_FINITE | ij.Status.SINGULAR_GAIN
-    if task.scenario.velocity_bounds is not None or task.scenario.state_bounds:
+    if any(task.scenario.bounds[1:]):
         flags |= ij.Status.VELOCITY_VIOLATED | ij.Status.STATE_BOUND_VIOLATED
     if task.scenario.regions:
         flags |= ij.Status.REGION_VIOLATED
@@ -185,14 +185,11 @@ def error_and_margin(run: ij.Rollout, task: Task) -> list[Any]:
 def margin(run: ij.Rollout, task: Task) -> float:
     """The least distance to a bound of the task, as a share of half the distance of the bounds."""
     found = [float(np.min(np.asarray(run.metrics.xi_margin)))]
-    if task.scenario.velocity_bounds is not None or task.scenario.state_bounds:
-        for x, lower, upper in (
-            (run.dq, run.dq_lower, run.dq_upper),
-            (run.higher, run.higher_lower, run.higher_upper),
-        ):
-            if np.size(lower):
-                share = np.minimum(x - lower, upper - x) / (0.5 * (upper - lower))
-                found.append(float(np.nanmin(share)))
+    if any(task.scenario.bounds[1:]):
+        lower, upper = run.level_lower[:, 1:], run.level_upper[:, 1:]
+        x = run.x[:, 1 : 1 + lower.shape[1]]
+        share = np.minimum(x - lower, upper - x) / (0.5 * (upper - lower))
+        found.append(float(np.nanmin(share)))
     return min(found)
 
 

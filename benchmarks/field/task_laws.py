@@ -139,15 +139,13 @@ def level_laws(task: Task) -> dict[str, laws.Choice | str]:
     """`BarrierBackstepping` with each barrier on every level that has bounds."""
     found: dict[str, laws.Choice | str] = {}
     order = plants.order_of(task.scenario.plant)
-    bounded = [True, *(part is not None for part in task.scenario.state_bounds)]
-    bounded += [False] * (order - len(bounded))
     own = unwrapped(task.scenario.controller)
     gains: dict[str, Any] = {"k": geometric_gains(task.rate, order)}
     if isinstance(own, controllers.BarrierBackstepping):
         gains = {"k": own.k, "c": own.c, "weights": own.weights}
     filters = 0.1 / np.asarray(gains["k"])[: order - 1]
     for name, barrier in BARRIERS.items():
-        chosen = tuple(barrier if has_bounds else barriers.Quadratic() for has_bounds in bounded)
+        chosen = tuple(barrier if x else barriers.Quadratic() for x in task.scenario.bounds)
         for words, filter_times in (("", None), (", filters", filters)):
             title = f"BarrierBackstepping({name}){words}"
             try:
@@ -171,10 +169,9 @@ def robot_law(
     if isinstance(law, str):
         law = law_by_name(law, reading="corrected")
     parts = dict(choice.parts)
-    if "velocity_bounds" in parts:
-        parts["velocity_bounds"] = box(3.0 * task.levels[1])
-        if task.scenario.velocity_bounds is not None:
-            del parts["velocity_bounds"]
+    if "bounds" in parts:
+        first, second, *others = task.scenario.bounds
+        parts["bounds"] = (first, second or box(3.0 * task.levels[1]), *others)
     q = task.scenario.initial.q
     inertia = np.diag(np.asarray(robot.mass_matrix(np.broadcast_to(q, (robot.n,)))))
     if any(isinstance(part, controllers.AdaptiveParameters) for part in layers(law)):

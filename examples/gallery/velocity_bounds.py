@@ -4,7 +4,8 @@ import iblf_jax as ij
 from iblf_jax import plotting
 
 speeds = ij.Bounds(lower=ij.bounds.Constant(-0.8), upper=ij.bounds.Constant(0.6))
-bounded = ij.with_parts(ij.presets.zhang_yan_2024_full_state(), velocity_bounds=speeds)
+preset = ij.presets.zhang_yan_2024_full_state()
+bounded = ij.with_parts(preset, bounds=(preset.bounds[0], speeds))
 unbounded = ij.with_parts(bounded, controller=ij.controllers.Backstepping(k1=2.0, K2=10.0, o=0.1))
 runs = {
     name: ij.simulate(s, duration=3.0, dt=1e-3)

@@ -95,7 +95,7 @@ def _labels(scenario: Scenario) -> tuple[LevelLabel, ...]:
     named = zip(plants.level_names(plant), units, strict=True)
     labels = []
     for level, (name, unit) in enumerate(named, start=1):
-        bounded = scenario.context.level_bounds(level) is not None
+        bounded = scenario.context.bounds[level - 1] is not None
         labels.append(LevelLabel(name, as_text(unit), bounded))
     return tuple(labels)
 

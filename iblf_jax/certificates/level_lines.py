@@ -144,7 +144,7 @@ def level_units(summary: LevelSummary) -> tuple[Units, ...]:
 
 def is_bounded(summary: LevelSummary, i: int) -> bool:
     """Whether level i + 1 has bounds."""
-    return summary.run.scenario.context.level_bounds(i + 1) is not None
+    return summary.run.scenario.context.bounds[i] is not None
 
 
 def _assumptions(segment: Segment) -> list[Line]:

@@ -49,7 +49,7 @@ from iblf_jax.core.pytree import unwrapped
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, plant_input
 from iblf_jax.simulation.levels import estimate
 from iblf_jax.simulation.scenario import Scenario
-from iblf_jax.simulation.signals import Sample
+from iblf_jax.simulation.signals import Sample, margin_of
 from iblf_jax.world import plants
 from iblf_jax.world.bounds import NARROWEST, Tube
 
@@ -216,16 +216,9 @@ def _disturbance(
 
 def _distances(scenario: Scenario, sample: Sample, x: jax.Array) -> jax.Array:
     """Distances of the levels of the model to their bounds, (r, n); infinite without bounds."""
-    infinite = jnp.full_like(x, jnp.inf)
-    rows = [jnp.minimum(sample.q - sample.lower, sample.upper - sample.q)]
-    if not isinstance(sample.dq_lower, tuple):
-        rows.append(jnp.minimum(x[1] - sample.dq_lower, sample.dq_upper - x[1]))
-    distances = infinite.at[: len(rows)].set(jnp.stack(rows))
-    if isinstance(sample.higher_lower, tuple):
-        return distances
-    count = len(x) - 2
-    lower, upper = sample.higher_lower[:count], sample.higher_upper[:count]
-    return distances.at[2:].set(jnp.minimum(x[2:] - lower, upper - x[2:]))
+    bounded = len(sample.level_lower[: len(x)])
+    rows = [margin_of(sample, level, x[level - 1]) for level in range(1, bounded + 1)]
+    return jnp.full_like(x, jnp.inf).at[:bounded].set(jnp.stack(rows))
 
 
 def _input_was_limited(scenario: Scenario, at: _Point) -> jax.Array:
@@ -324,7 +317,7 @@ def _lag(scenario: Scenario, at: _Point, levels: list, tubes: list) -> jax.Array
 
 def _relative_error(scenario: Scenario, i: int, tube: Tube, x: jax.Array) -> jax.Array:
     """The relative error of level i + 1, (n,); 0 without bounds."""
-    if scenario.context.level_bounds(i + 1) is None:
+    if scenario.context.bounds[i] is None:
         return jnp.zeros_like(x)
     return tube.xi(x)
 
@@ -333,7 +326,7 @@ def _centre_distance(scenario: Scenario, i: int, tube: Tube) -> jax.Array:
     """Distance of the centre of the tube of level i + 1 to its bounds, (n,); infinite without
     bounds.
     """
-    if scenario.context.level_bounds(i + 1) is None:
+    if scenario.context.bounds[i] is None:
         return jnp.full_like(tube.q_d, jnp.inf)
     return jnp.minimum(tube.q_d - tube.lower, tube.upper - tube.q_d)
 

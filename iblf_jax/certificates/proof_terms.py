@@ -56,7 +56,7 @@ from iblf_jax.core.linalg import matvec, solve_spd
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, rate
 from iblf_jax.simulation.scenario import Scenario
-from iblf_jax.simulation.signals import Sample, has, speed_margin
+from iblf_jax.simulation.signals import Sample, has, margin_of
 from iblf_jax.world import plants
 from iblf_jax.world.bounds import NARROWEST
 from iblf_jax.world.robots import friction_torque, mass_matrix_rate
@@ -243,7 +243,7 @@ def _auxiliary_terms(sample: Sample, slope: jax.Array) -> AuxiliaryTerms:
     """The terms of (A.3) for a robot, given w s."""
     excluded = jnp.any(sample.guard_active)
     if has(sample, "dq_lower"):
-        excluded |= jnp.any(speed_margin(sample, sample.alpha - sample.auxiliary) <= NARROWEST)
+        excluded |= jnp.any(margin_of(sample, 2, sample.alpha - sample.auxiliary) <= NARROWEST)
     return AuxiliaryTerms(jnp.sum(slope * sample.auxiliary), excluded)
 
 

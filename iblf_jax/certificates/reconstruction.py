@@ -40,16 +40,16 @@ BLOCK_STEPS = 1024
 length."""
 POSITIONS, SPEEDS = ("q", "q_d", "lower", "upper"), ("dq", "alpha")
 TORQUES = ("tau", "disturbance", "disturbance_estimate")
-STATES = (
-    ("q", "q", "position"),
-    ("dq", "dq", "speed"),
-    ("controller", "controller_state", "torque"),
-    ("observer", "observer_state", "torque"),
-    ("higher", "higher", "speed"),
-)
-"""Field of `LoopState`, name of the recorded signal, and kind of its tolerance."""
-OWN_UNITS = ("controller", "observer", "higher")
-"""Fields with units of their own, hence with their own scale if it is larger."""
+STATES = {
+    "q": "position",
+    "dq": "speed",
+    "controller_state": "torque",
+    "observer_state": "torque",
+    "x[2:]": "speed",
+}
+"""Part of a state -> kind of its tolerance."""
+OWN_UNITS = ("controller_state", "observer_state", "x[2:]")
+"""Parts with units of their own, hence with their own scale if it is larger."""
 
 
 class TimeGrid(NamedTuple):
@@ -130,14 +130,7 @@ def steps_of(run: Any, grid: TimeGrid) -> Iterator[Steps]:
 
 def _recorded_states(run: Any) -> LoopState:
     """The states at the recorded samples."""
-    return LoopState(
-        run.q,
-        run.dq,
-        run.controller_state,
-        run.observer_state,
-        run.actuator_state,
-        higher=run.higher,
-    )
+    return LoopState(run.x, run.controller_state, run.observer_state, run.actuator_state)
 
 
 def _rows(tree: Any, rows: Any) -> Any:
@@ -358,17 +351,28 @@ def tolerances(run: Any) -> dict[str, float]:
     }
 
 
+def _parts_of_state(state: LoopState) -> dict[str, Any]:
+    """The parts that `STATES` names."""
+    return {
+        "q": state.q,
+        "dq": state.dq,
+        "controller_state": state.controller,
+        "observer_state": state.observer,
+        "x[2:]": state.x[:, 2:],
+    }
+
+
 def _check_arrival(
     run: Any, recorded: LoopState, reconstructed: LoopState, rows: np.ndarray
 ) -> None:
     """Raises ValueError if the reconstructed states are not those that the run recorded."""
     sizes = tolerances(run)
-    expected, reached = recorded._asdict(), reconstructed._asdict()
-    for field, label, kind in STATES:
-        leaves = (jax.tree.leaves(expected[field]), jax.tree.leaves(reached[field]))
+    expected, reached = map(_parts_of_state, (recorded, reconstructed))
+    for label, kind in STATES.items():
+        leaves = (jax.tree.leaves(expected[label]), jax.tree.leaves(reached[label]))
         for kept, made in zip(*leaves, strict=True):
             tolerance = sizes[kind]
-            if field in OWN_UNITS:
+            if label in OWN_UNITS:
                 own = np.max(np.abs(kept), initial=0.0)
                 tolerance = max(tolerance, np.sqrt(np.finfo(kept.dtype).eps) * own)
             _compare(run, label, kept, made, rows, tolerance)

@@ -40,7 +40,7 @@ from iblf_jax.simulation.noise import has_noise, noise_key
 from iblf_jax.simulation.results import Metrics, Rollout
 from iblf_jax.simulation.sampling import Instant, Sampling, commands_in_transit
 from iblf_jax.simulation.scenario import Scenario, canonical, check_step
-from iblf_jax.simulation.signals import SIGNALS
+from iblf_jax.simulation.signals import FIELDS
 from iblf_jax.world import plants
 from iblf_jax.world.disturbances import Nothing
 from iblf_jax.world.robots import at_time
@@ -322,7 +322,7 @@ class _Run:
 
     def sample_law(self, t: float) -> None:
         """One sample of the law; its command is in transit from here on."""
-        state = self.state._replace(q=jnp.asarray(self.robot.q), dq=jnp.asarray(self.robot.dq))
+        state = self.state._replace(x=jnp.stack([self.robot.q, self.robot.dq]))
         self.state = _law(self.scenario, t, state, len(self.commands), self.noise)
         self.states.append(self.state)
         command = np.asarray(self.state.sampled.commands[0])
@@ -454,5 +454,5 @@ def rollout_of(
         measured=states.sampled.measured,
         method=method,
         steps=int(np.sum(rows.instant)) - 1,
-        **attributes(recorded, SIGNALS),
+        **attributes(recorded, FIELDS),
     )

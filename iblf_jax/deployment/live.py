@@ -148,7 +148,7 @@ def _slider(scenario: Scenario, row: dict[str, Any]) -> dict[str, Any]:
         first = float(values[0])
         ends = [[first / GAIN_RANGE, first * GAIN_RANGE]]
         return {"slider": ends, "positive": True, "each": False}
-    if re.fullmatch(r"initial\.q|bounds\.(lower|upper)\.(offset|value)", path):
+    if re.fullmatch(r"initial\.q|bounds\[\d+\]\.(lower|upper)\.(offset|value)", path):
         ends = [[float(x) - START_RANGE, float(x) + START_RANGE] for x in values]
         return {"slider": ends, "positive": False, "each": True}
     return {}

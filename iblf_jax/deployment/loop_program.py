@@ -47,7 +47,7 @@ def loop_outputs(scenario: Scenario) -> tuple[LoopOutput, ...]:
         LoopOutput("lower", units[0], "lower"),
         LoopOutput("upper", units[0], "upper"),
     ]
-    found += [LoopOutput(f"x_{i + 1}", units[i], "higher", i - 2) for i in range(2, len(units) - 1)]
+    found += [LoopOutput(f"x_{i + 1}", units[i], "x", i) for i in range(2, len(units) - 1)]
     if not plants.is_chain(model):
         found.append(LoopOutput("f", "N m", "disturbance"))
         found.append(LoopOutput("f_hat", "N m", "disturbance_estimate"))

@@ -164,7 +164,7 @@ def _level_name(scenario: Scenario, level: int) -> str:
 def _level_remedy(scenario: Scenario, level: int) -> str:
     """How the bounds of a level above the first can be kept, in words."""
     law = unwrapped(scenario.controller)
-    field = f"state_bounds[{level - 2}]"
+    field = f"bounds[{level - 1}]"
     if not isinstance(law, Law):
         return (
             f"{type(law).__name__} knows no bounds of that level; controllers.BarrierBackstepping"
@@ -355,7 +355,7 @@ def _fast_reference(result: Rollout) -> str:
         f"The reference of {plants.component_names(result.scenario.plant)[joint]} reaches"
         f" {reached:.4g} {unit} at t = {float(result.t[sample]):.4g} s, its limit is"
         f" {limit:.4g} {unit}: no law can follow it inside the velocity bounds. Slow it down, or"
-        " widen scenario.velocity_bounds."
+        " widen scenario.bounds[1]."
     )
 
 
@@ -394,8 +394,8 @@ def _alphas_infeasible(result: Rollout) -> str:
         found.append("A virtual control left the bounds of the level that it is for.")
     found.append(
         "As for a reference outside its bounds (Assumption 2), nothing is claimed there. Start"
-        " nearer to the reference, slow it down, widen state_bounds or lower controller.k of the"
-        " levels below."
+        " nearer to the reference, slow it down, widen the bounds of the level or lower"
+        " controller.k of the levels below."
     )
     return " ".join(found)
 
@@ -406,20 +406,17 @@ def _alpha_margin(result: Rollout, level: int) -> np.ndarray | None:
     """
     if level == 2 and "alpha_margin" in result.metrics:
         return np.asarray(result.metrics["alpha_margin"])
-    if level > 2 and "level_alpha_margin" in result.metrics:
-        return np.asarray(result.metrics["level_alpha_margin"])[level - 3]
-    return None
+    margins = np.asarray(result.metrics.get("level_alpha_margin", ()))
+    return margins[level - 3] if 2 < level < len(margins) + 3 else None
 
 
 def _first_time_outside(result: Rollout, level: int) -> str:
     """When a virtual control is outside the bounds of its level first, among the recorded
     samples, in words; empty if it is inside at all of them.
     """
-    alpha, lower, upper = result.alpha, result.dq_lower, result.dq_upper
-    if level > 2:
-        i = level - 3
-        alpha = result.higher[:, i] - result.e_higher[:, i]
-        lower, upper = result.higher_lower[:, i], result.higher_upper[:, i]
+    i = level - 1
+    alpha = result.alpha if level == 2 else result.x[:, i] - result.e[:, i]
+    lower, upper = result.level_lower[:, i], result.level_upper[:, i]
     outside = np.any(np.minimum(alpha - lower, upper - alpha) <= 0, axis=-1)
     if not outside.any():
         return ""
@@ -541,7 +538,7 @@ def _joint_in_words(result: Rollout, joint: int) -> str:
 def _infeasible(result: Rollout, steps: int) -> ValueError:
     """The error for a reference that touches a bound (Assumption 2), with joint and time."""
     times = jnp.arange(steps + 1).astype(result.dt.dtype) * result.dt
-    tube_of_run = partial(tube_at, result.scenario.reference, result.scenario.bounds)
+    tube_of_run = partial(tube_at, result.scenario.reference, result.scenario.bounds[0])
     tube = jax.jit(jax.vmap(tube_of_run))(times)
     q_d, lower, upper = (np.asarray(x) for x in (tube.q_d, tube.lower, tube.upper))
     sample, joint = np.unravel_index(np.argmin(np.minimum(q_d - lower, upper - q_d)), q_d.shape)

@@ -196,6 +196,8 @@ def fastest_along(scenario: Scenario, times: np.ndarray) -> float:
     loop has no finite derivative.
     """
     states = start_and_along(scenario, jnp.asarray(times, scenario.initial.q.dtype))
+    # On the host, where the rows of an array need no programs.
+    states = jax.device_get(states)
     return max(
         _mode(scenario, t, jax.tree.map(lambda x, i=i: x[i], states))
         for i, t in enumerate([0.0, *times])

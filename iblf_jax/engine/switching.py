@@ -397,17 +397,15 @@ def _on_its_side(
     """The state, moved to the given side of every surface, at least as far as the clearance."""
     fixed: Any = jax.lax.stop_gradient((scenario, t, state))
 
-    def functions(q, dq, higher):
-        return surfaces(fixed[0], fixed[1], fixed[2]._replace(q=q, dq=dq, higher=higher))
+    def functions(x):
+        return surfaces(fixed[0], fixed[1], fixed[2]._replace(x=x))
 
-    g, pull = jax.vjp(functions, fixed[2].q, fixed[2].dq, fixed[2].higher)
+    g, pull = jax.vjp(functions, fixed[2].x)
     missing = jnp.where(above, jnp.maximum(clearance - g, 0.0), jnp.minimum(-clearance - g, 0.0))
-    levels = state.q, state.dq, state.higher
+    x = state.x
     for i, unit in enumerate(jnp.eye(g.size, dtype=g.dtype)):
-        slopes = pull(unit)
-        squares = [jnp.sum(x**2) for x in jax.tree.leaves(slopes)]
-        square = sum(squares[1:], squares[0])
+        [slope] = pull(unit)
+        square = jnp.sum(slope**2)
         step = jnp.where(square > 0, missing[i], 0.0) / jnp.where(square > 0, square, 1.0)
-        levels = jax.tree.map(lambda x, slope, step=step: x + step * slope, levels, slopes)
-    q, dq, higher = levels
-    return state._replace(q=q, dq=dq, higher=higher)
+        x = x + step * slope
+    return state._replace(x=x)

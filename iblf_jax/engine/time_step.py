@@ -54,7 +54,7 @@ from iblf_jax.simulation.closed_loop import (
 )
 from iblf_jax.simulation.noise import distances, with_extremes
 from iblf_jax.simulation.scenario import Scenario
-from iblf_jax.simulation.signals import SIGNALS, Sample
+from iblf_jax.simulation.signals import FIELDS, Sample
 from iblf_jax.world import plants
 
 
@@ -296,7 +296,7 @@ def recorded(folds: Any, found: Advanced):
     if state.sampled:
         measured = state.sampled.measured
     states = state.controller, state.observer, state.actuator, measured
-    return attributes(found.sample, SIGNALS), *states
+    return attributes(found.sample, FIELDS), *states
 
 
 POSITIONS = ("t", "q", "e1", "lower", "upper", "q_d")

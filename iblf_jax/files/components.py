@@ -232,6 +232,8 @@ def decode(value: Any, hint: Any, path: str) -> Any:
     is_tuple = typing.get_origin(hint) is tuple
     if isinstance(value, list) and (is_tuple or any(isinstance(x, dict) for x in value)):
         return tuple(decode(x, entry_hint(hint, i), f"{path}[{i}]") for i, x in enumerate(value))
+    if is_tuple and isinstance(value, dict):
+        return (decode(value, entry_hint(hint, 0), path),)
     if is_tuple:
         raise checks.fail(path, value, "a list")
     if isinstance(value, dict):

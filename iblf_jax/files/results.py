@@ -44,6 +44,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from functools import cached_property
 from importlib.metadata import version
+from operator import itemgetter
 from pathlib import Path, PurePath
 from typing import Any, NamedTuple
 
@@ -56,7 +57,7 @@ from iblf_jax.core.attributes import attributes
 from iblf_jax.core.pytree import field_values
 from iblf_jax.core.whole_files import written_whole
 from iblf_jax.engine import RunRequest
-from iblf_jax.files import components, tuning
+from iblf_jax.files import components, earlier, tuning
 from iblf_jax.files.modules import tables_of_modules
 from iblf_jax.files.rollouts import ARRAY_OF_ATTRIBUTES, load_rollouts
 from iblf_jax.files.scenario import from_dict, load_scenario, scenario_to_dict
@@ -520,6 +521,8 @@ class _Reader:
         ]
         if len(stored) != len(expected):
             raise checks.fail(f"{key}.leaves", len(stored), f"{len(expected)} arrays")
+        numbers = earlier.order_of_leaves(tables, first)
+        stored = [x for _, x in sorted(zip(numbers, stored, strict=True), key=itemgetter(0))]
         for i, (x, leaf) in enumerate(zip(stored, expected, strict=True)):
             shape = np.shape(x)[np.ndim(x) - np.ndim(leaf) :]
             if shape != np.shape(leaf) or not np.issubdtype(np.asarray(x).dtype, np.floating):
@@ -681,6 +684,7 @@ def _stored_rollout(run: Rollout) -> dict[str, Any]:
 
 
 def _restored_rollout(stored: dict[str, Any]) -> dict[str, Any]:
+    stored = earlier.fields_of_run(stored)
     scenario = stored["scenario"]
     axes = np.ndim(scenario.initial.q) - 1
     start = jax.eval_shape(initial_state, jax.tree.map(lambda x: x[(0,) * axes], scenario))

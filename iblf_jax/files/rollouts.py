@@ -35,14 +35,15 @@ from iblf_jax.core import checks
 from iblf_jax.core.attributes import attributes
 from iblf_jax.core.pytree import astype
 from iblf_jax.core.status import Status, describe
-from iblf_jax.files import digest
+from iblf_jax.files import digest, earlier
+from iblf_jax.files.earlier import LEVEL_SIGNALS
 from iblf_jax.files.scenario import from_dict, scenario_to_toml
 from iblf_jax.files.values import Words, toml_tables
 from iblf_jax.simulation.closed_loop import initial_state
-from iblf_jax.simulation.paths import parameters, with_parameters
+from iblf_jax.simulation.paths import full_path, parameters, with_parameters
 from iblf_jax.simulation.results import Metrics, Rollout
 from iblf_jax.simulation.scenario import Scenario
-from iblf_jax.simulation.signals import SIGNALS, dimension_names
+from iblf_jax.simulation.signals import FIELDS, SIGNALS, dimension_names
 from iblf_jax.simulation.units import signal_meanings, signal_unit, status_words
 from iblf_jax.world import plants
 
@@ -219,14 +220,17 @@ def _rollout_of(
             "actuator_state": start.actuator,
             "measured": start.sampled.measured if scenario.sampling is not None else (),
         }
+        arrays = {str(name): variable.values for name, variable in data.data_vars.items()}
+        levels = {name: jnp.asarray(earlier.levels(arrays, name)) for name in LEVEL_SIGNALS}
         signals = {
             signal: jnp.asarray(data[signal].values)
-            for signal in SIGNALS
-            if signal in data and signal != "t"
+            for signal in FIELDS
+            if signal in data and signal not in ("t", *levels)
         }
         times = data["t" if "t" in data.data_vars else "time"].values
         return Rollout(
             **signals,
+            **levels,
             t=jnp.asarray(np.broadcast_to(times, (*data["status"].shape, times.shape[-1]))),
             **{state: _state_of(data, state, tree) for state, tree in states.items()},
             scenario=scenario,
@@ -255,10 +259,14 @@ def _scenario_of(
     scenario = astype(from_dict(tables, modules=modules).scenario, data["q"].dtype)
     if not batch:
         return scenario
-    paths = [p.path for p in parameters(scenario, named=False) if p.path in data]
-    if not paths:
+    known = {p.path for p in parameters(scenario, named=False)}
+    given = {
+        str(name): jnp.asarray(variable.values)
+        for name, variable in data.data_vars.items()
+        if full_path(str(name)) in known
+    }
+    if not given:
         return scenario
-    given = {path: jnp.asarray(data[path].values) for path in paths}
     make = partial(with_parameters, scenario)
     for _ in batch:
         make = jax.vmap(make)
@@ -311,10 +319,12 @@ def _components_and_levels(run: Rollout, variables: Mapping[str, Any]) -> dict[s
     names = ", ".join(plants.component_names(plant))
     found["joint"][2]["description"] = f"component of a level, from 0: {names}"
     levels = plants.level_names(plant)
-    used = {dimension for dims, *_ in variables.values() for dimension in dims}
+    sizes: dict[str, int] = {}
+    for dims, values, *_ in variables.values():
+        sizes |= dict(zip(dims, np.shape(values), strict=True))
     for dimension, first in (("level", 1), ("higher_level", 3)):
-        if dimension in used:
-            numbers = np.arange(first, len(levels) + 1, dtype=np.int32)
+        if dimension in sizes:
+            numbers = np.arange(first, first + sizes[dimension], dtype=np.int32)
             text = f"level of the plant, from {first}: {', '.join(levels[first - 1 :])}"
             found[dimension] = (dimension, numbers, _attrs("1", text))
     return found
@@ -337,12 +347,23 @@ def _trajectories(run: Rollout, batch: tuple[str, ...]) -> dict[str, Any]:
 
     meanings = signal_meanings(run.scenario)
     for name, value in attributes(run, SIGNALS).items():
-        if name != "t" and not isinstance(value, tuple):  # The scenario has such a signal.
+        # The views show all rows of the signals of a robot.
+        is_shown = name in LEVEL_SIGNALS and np.shape(value)[-2] <= len(LEVEL_SIGNALS[name])
+        if name != "t" and not isinstance(value, tuple) and not is_shown:
+            if name in ("level_lower", "level_upper"):
+                value = _of_all_levels(value, run.x, np.inf if name == "level_upper" else -np.inf)
             add(name, value, signal_unit(run.scenario, name), meanings[name])
     for state, tree in attributes(run, STATES).items():
         for keys, value in jax.tree_util.tree_leaves_with_path(tree):
             add(_state_name(state, keys), value, "1", STATES[state])
     return variables
+
+
+def _of_all_levels(rows: Any, x: Any, value: float) -> np.ndarray:
+    """Rows of the first levels, with a value for the others."""
+    found = np.full_like(x, value)
+    found[..., : np.shape(rows)[-2], :] = rows
+    return found
 
 
 def _state_name(state: str, keys: tuple[Any, ...]) -> str:

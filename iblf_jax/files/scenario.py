@@ -10,6 +10,7 @@ A complete file has one table per component, and `kind` names the member of the 
     [reference]  [bounds.lower]  [bounds.upper]  [disturbance]  [controller]  [controller.barrier]
     [observer]  [initial]
 
+[bounds] is a list of tables, [[bounds]], where levels above the first have bounds too.
 The robot may be read from a URDF or MJCF, `robot.file = "arm.urdf"` (see `files.robot`).  A file
 may also start from a preset and change some of its parameters:
 
@@ -41,6 +42,7 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import astype
+from iblf_jax.files import earlier
 from iblf_jax.files.components import construct, decode_fields, encode_fields, field_hints
 from iblf_jax.files.modules import (
     needs_a_module,
@@ -50,6 +52,7 @@ from iblf_jax.files.modules import (
 )
 from iblf_jax.files.robot import names_a_file, with_robots_read
 from iblf_jax.files.values import (
+    NONE,
     Words,
     as_table,
     by_path,
@@ -63,7 +66,7 @@ from iblf_jax.files.values import (
 )
 from iblf_jax.presets import PRESETS
 from iblf_jax.simulation.integrators import METHODS
-from iblf_jax.simulation.paths import parameters, parse, with_parameters
+from iblf_jax.simulation.paths import full_path, parameters, parse, with_parameters
 from iblf_jax.simulation.scenario import Scenario, check_leaves
 from iblf_jax.world import plants
 
@@ -175,6 +178,10 @@ def scenario_to_dict(scenario: Scenario) -> dict[str, Any]:
     dtype = dtypes.pop() if len(dtypes) == 1 else jnp.result_type(float)
     scenario = astype(scenario, dtype)
     tables = encode_fields(scenario, "")
+    while tables["bounds"][-1] == NONE:
+        tables["bounds"].pop()
+    if len(tables["bounds"]) == 1:
+        [tables["bounds"]] = tables["bounds"]
     robots = {name: tables.pop(name) for name in ("plant", "model")}
     if _equal(scenario.plant, scenario.model):
         name = "plant" if plants.is_chain(scenario.plant) else "robot"
@@ -247,7 +254,7 @@ def _with_units(text: str, units: Mapping[str, str]) -> str:
             prefix = _path_of_table(header[2].split("."), counts, is_entry=header[1] == "[[")
         key = re.match(r"(\w+) = [-+\d\[]", line)
         if key and not line.endswith("["):
-            unit = units.get(f"{prefix}.{key[1]}")
+            unit = units.get(full_path(f"{prefix}.{key[1]}"))
             if unit:
                 line = f"{line}  # {unit}"
         lines.append(line)
@@ -331,6 +338,7 @@ def from_dict(
 def _from_components(
     data: dict[str, Any], folder: str | os.PathLike, modules: Mapping[str, Any] | None
 ) -> Scenario:
+    data = earlier.with_bounds_of_levels(data)
     known_keys(data, "", (*COMPONENTS, "preset", "parameters", "run", "dtype"))
     tables = {key: value for key, value in data.items() if key in COMPONENTS}
     for present, absent in (("plant", "model"), ("model", "plant")):

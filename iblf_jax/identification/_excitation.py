@@ -186,8 +186,8 @@ def _basis(times: tuple[float, ...], count: int) -> Basis:
 
 def _bounds(scenario: Scenario, t: jax.Array, q: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Bounds of positions at times t (K,), for a reference q (K, n), and the arm's limits."""
-    lower = jax.vmap(scenario.bounds.lower.at)(t, q)
-    upper = jax.vmap(scenario.bounds.upper.at)(t, q)
+    lower = jax.vmap(scenario.bounds[0].lower.at)(t, q)
+    upper = jax.vmap(scenario.bounds[0].upper.at)(t, q)
     limits = scenario.plant.limits
     if limits is None:
         return lower, upper
@@ -251,8 +251,8 @@ def _violations(
         jnp.where(jnp.isfinite(limit), jnp.abs(x) / limit - 1.0, -1.0)
         for x, limit in ((dq, drive.speed), (torque, drive.torque))
     ]
-    if scenario.velocity_bounds is not None:
-        bounds = scenario.velocity_bounds
+    bounds = scenario.bounds[1]
+    if bounds is not None:
         slow, fast = jax.vmap(bounds.lower.at)(basis.t, dq), jax.vmap(bounds.upper.at)(basis.t, dq)
         found += [
             (slow - dq) / (fast - slow) + BOUND_MARGIN,

@@ -99,21 +99,21 @@ LEVEL_SIGNAL = re.compile(r"level_(\d+)(?:_(\w+))?")
 
 LEVEL_PARTS: dict[str | None, Callable[[Rollout, int], Any]] = {
     None: lambda run, i: run.x[:, i],
-    "lower": lambda run, i: _row(run.higher_lower, i - 2),
-    "upper": lambda run, i: _row(run.higher_upper, i - 2),
-    "alpha": lambda run, i: _row(run.higher, i - 2) - _row(run.e_higher, i - 2),
+    "lower": lambda run, i: _row_if_any(run.level_lower, i),
+    "upper": lambda run, i: _row_if_any(run.level_upper, i),
+    "alpha": lambda run, i: _row(run.x, i) - _row_if_any(run.e, i),
     "received": lambda run, i: _row_if_any(run.x_hat, i),
     "d": lambda run, i: _row(run.disturbance, i),
     "estimate": lambda run, i: _row(run.disturbance_estimate, i),
     "estimate_error": (lambda run, i: _row(run.disturbance, i) - _row(run.disturbance_estimate, i)),
 }
 """Part of the name of a signal of a level -> the signal, (T, n), given the index of the level from
-0: the level, its bounds (from the third level on), the virtual control that it follows, its
+0: the level, its bounds, the virtual control that it follows, its
 estimate that the law received, and its disturbance with estimate and error."""
 
 
 def _row_if_any(values: Any, i: int) -> np.ndarray:
-    """As `_row`; NaN for a level that the model does not have."""
+    """As `_row`; NaN for a level that the signal does not have."""
     if isinstance(values, tuple) or i < values.shape[1]:
         return _row(values, i)
     return np.full((1, 1), np.nan)
@@ -235,7 +235,7 @@ class Curve:
     @property
     def has_speed_limits(self) -> bool:
         """Whether the velocities have bounds."""
-        return not isinstance(self.run.dq_lower, tuple)
+        return bool(np.isfinite(_row_if_any(self.run.level_lower, 1)).any())
 
     @property
     def has_regions(self) -> bool:

@@ -322,7 +322,7 @@ def velocity_errors(runs: Runs, *, zoom: float | None = None) -> Figure:
 
 
 def velocities(runs: Runs, *, zoom: float | None = None) -> Figure:
-    """Velocity q' [rad/s] of every joint, with its bounds if the scenario has `velocity_bounds`.
+    """Velocity q' [rad/s] of every joint, with its bounds if the scenario has them.
 
     Args:
       runs: one run, or a dict of runs by name.

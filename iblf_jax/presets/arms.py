@@ -243,7 +243,7 @@ def arm_scenario(
     that move against each other would have modes of M^-1 K2 above 200 1/s along the reference; and
     kf = 20.  The weight of the barrier is w_i = min(1, M_ii 12.5^2 / s_i') with the largest slope
     s_i' of the barrier at the reference, which is that at the nearest bound.  The torque is limited
-    to the arm's `effort`; its `speed` is not checked (`velocity_bounds` of `Scenario`).
+    to the arm's `effort`; its `speed` is not checked (`bounds[1]` of `Scenario`).
 
     Args:
       robot: the plant, with `limits` and `effort`, as `iblf_jax.robots.load` returns it.

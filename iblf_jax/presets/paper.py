@@ -187,9 +187,10 @@ def zhang_yan_2024_full_state(*, kf: float = 100.0, c: float = 8.0) -> Scenario:
     """
     lower = SinusoidalBound(offset=[-1.6, -1.4], amplitude=[-0.1, 0.0])
     upper = SinusoidalBound(offset=[0.6, 0.5], amplitude=[0.1, 0.0], phase=0.5 * math.pi)
+    paper = zhang_yan_2024(reading="corrected")
     return dataclasses.replace(
-        zhang_yan_2024(reading="corrected"),
+        paper,
         controller=FullState(k1=2.0, K2=20.0, c=c, o=0.1),
         observer=Momentum(kf=kf),
-        velocity_bounds=Bounds(lower=lower, upper=upper),
+        bounds=(paper.bounds[0], Bounds(lower=lower, upper=upper)),
     )

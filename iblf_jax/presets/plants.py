@@ -107,11 +107,13 @@ def vessel(*, current: float = 0.05, waves: float = 0.5) -> Scenario:
     return Scenario(
         plant=plant,
         reference=Ellipse(axes=(5.0, 3.0), frequency=0.08),
-        bounds=Bounds(
-            lower=Funnel(initial=-widest, final=-narrowest, rate=0.05),
-            upper=Funnel(initial=widest, final=narrowest, rate=0.05),
+        bounds=(
+            Bounds(
+                lower=Funnel(initial=-widest, final=-narrowest, rate=0.05),
+                upper=Funnel(initial=widest, final=narrowest, rate=0.05),
+            ),
+            Bounds(lower=Constant([-0.2, -0.3, -0.5]), upper=Constant([0.8, 0.3, 0.5])),
         ),
-        state_bounds=(Bounds(lower=Constant([-0.2, -0.3, -0.5]), upper=Constant([0.8, 0.3, 0.5])),),
         disturbance=Sum((Levels((drift,)), force)),
         controller=_law((0.2, 1.0), Mapping(), Mapping()),
         observer=_observer(0.5, 2.0),
@@ -148,11 +150,14 @@ def motor_driven_pendulum() -> Scenario:
     return Scenario(
         plant=plant,
         reference=Sinusoid(offset=0.0, amplitude=1.0, frequency=1.5),
-        bounds=Bounds(
-            lower=Constant(-1.15),
-            upper=SinusoidalBound(offset=1.2, amplitude=0.05, frequency=0.5),
+        bounds=(
+            Bounds(
+                lower=Constant(-1.15),
+                upper=SinusoidalBound(offset=1.2, amplitude=0.05, frequency=0.5),
+            ),
+            _within(2.2),
+            _within(2.6),
         ),
-        state_bounds=(_within(2.2), _within(2.6)),
         disturbance=Levels((None, Sinusoids(amplitude=1.5, frequency=3.0))),
         controller=_law((2.0, 15.0, 60.0), Mapping(), Mapping(), Mapping()),
         observer=_observer(0.0, 20.0, 0.0),
@@ -186,7 +191,7 @@ def motor_driven_two_link() -> Scenario:
         paper,
         plant=plant,
         model=plant,
-        state_bounds=(_within(1.5), _within([16.0, 6.0])),
+        bounds=(paper.bounds[0], _within(1.5), _within([16.0, 6.0])),
         controller=_law((2.0, 10.0, 40.0), Mapping(), Mapping(), Mapping()),
         observer=Momentum(kf=20.0),
     )
@@ -216,7 +221,7 @@ def flexible_joint_two_link(*, stiffness: float = 300.0) -> Scenario:
         paper,
         plant=plant,
         model=plant,
-        state_bounds=(_within(1.0), None, _within(2.0)),
+        bounds=(paper.bounds[0], _within(1.0), None, _within(2.0)),
         controller=_law((2.0, 10.0, 30.0, 60.0), Mapping(), Mapping(), Quadratic(), Mapping()),
         observer=Momentum(kf=20.0),
     )
@@ -251,7 +256,7 @@ def flexible_joint_iiwa14() -> Scenario:
         rigid,
         plant=plant,
         model=plant,
-        state_bounds=(from_speed_limits(arm),),
+        bounds=(rigid.bounds[0], from_speed_limits(arm)),
         controller=_law((2.0, 8.0, 20.0, 50.0), Mapping()),
         observer=Momentum(kf=40.0),
         initial=Initial(q=np.asarray(rigid.initial.q) + 0.07),

@@ -212,7 +212,7 @@ class _Arm:
             scenario,
             initial=initial,
             observer=observer,
-            bounds=shifted(scenario.bounds, state.t),
+            bounds=tuple(shifted(bounds, state.t) for bounds in scenario.bounds),
             reference=shifted(scenario.reference, state.t),
             disturbance=shifted(scenario.disturbance, state.t),
         )
@@ -259,7 +259,7 @@ def arm_problem(
         uncertain = uncertain_coordinates(scenario, parameters, disturbance_rate)
         varying = {
             "reference": scenario.reference,
-            "bounds": scenario.bounds,
+            "bounds": scenario.bounds[0],
             "disturbance": scenario.disturbance,
         }
         length, is_period = time_interval(varying, duration, uncertain)
@@ -330,7 +330,7 @@ def check_supported(scenario: Any) -> None:
         reason = "The piece of a spline depends on the time, which is an interval here."
         expected = "a reference without pieces, such as references.Quintic"
         raise unsupported("reference", "WaypointSpline", expected, reason)
-    smooth = arm_motion.smoothness(scenario.reference, scenario.bounds)
+    smooth = arm_motion.smoothness(scenario.reference, scenario.bounds[0])
     if smooth < 2:
         reason = "f contains alpha', and with it two derivatives of reference and bounds."
         expected = "two continuous derivatives in time"
@@ -379,10 +379,12 @@ def _check_absent(scenario: Scenario) -> None:
     """Raises ValueError for parts that the bound does not contain."""
     reasons = {
         "sampling": CONTINUOUS,
-        "velocity_bounds": "The level set bounds positions only.",
         "process_noise": "V_w' of a stochastic loop has further terms.",
     }
     check_absent(scenario, reasons, input="torque", rate="f'")
+    if scenario.bounds[1] is not None:
+        reason = "The level set bounds positions only."
+        raise unsupported("bounds[1]", "Bounds", "None", reason)
     if scenario.regions:
         names = ", ".join(type(region).__name__ for region in scenario.regions)
         reason = "The level set bounds positions of joints only."
@@ -407,7 +409,7 @@ def _parts_of(scenario: Scenario) -> ArmParts:
         law,
         jnp.broadcast_to(observer.kf, (scenario.n,)),
         scenario.reference,
-        scenario.bounds,
+        scenario.bounds[0],
         jnp.asarray(scenario.controller.barrier.guard),  # type: ignore[union-attr]
     )
 
@@ -419,7 +421,7 @@ def _examined(scenario: Scenario, parts: ArmParts, uncertain: Uncertain) -> Exam
       ValueError: a part that may jump, or one that contradicts its contract.
     """
     digests = [_check_operations(parts, uncertain, scenario.n).digest]
-    sides = {f"bounds.{name}": vars(scenario.bounds)[name] for name in ("lower", "upper")}
+    sides = {f"bounds[0].{name}": vars(scenario.bounds[0])[name] for name in ("lower", "upper")}
     in_time = check_time_functions(scenario.reference, sides, scenario.n)
     if type(parts.law.barrier) not in BARRIERS:
         name = "scenario.controller.barrier"
@@ -458,7 +460,7 @@ def _check_tube(scenario: Scenario, duration: float) -> None:
     times = jnp.linspace(0.0, duration, INSTANTS)
 
     def distances(t):
-        tube = tube_at(scenario.reference, scenario.bounds, t, acceleration=False)
+        tube = tube_at(scenario.reference, scenario.bounds[0], t, acceleration=False)
         return jnp.minimum(tube.q_d - tube.lower, tube.upper - tube.q_d)
 
     least = np.asarray(jax.vmap(distances)(times))
@@ -466,7 +468,7 @@ def _check_tube(scenario: Scenario, duration: float) -> None:
         return
     i, joint = np.unravel_index(least.argmin(), least.shape)
     raise checks.fail(
-        "prove: scenario.bounds",
+        "prove: scenario.bounds[0]",
         f"a distance of {least.min():g} rad at t = {float(times[i]):g} s of joint {joint}",
         "bounds with the reference strictly inside at all times",
     )

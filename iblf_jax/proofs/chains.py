@@ -194,7 +194,7 @@ class _Chain:
         value = level / self.parts.law.weights[0] * jnp.ones(1)
 
         def xi_bound(t: jax.Array) -> jax.Array:
-            tube = tube_at(self.parts.reference, self.scenario.bounds, t, acceleration=False)
+            tube = tube_at(self.parts.reference, self.scenario.bounds[0], t, acceleration=False)
             return barrier.xi_bound(value, tube)  # type: ignore[no-any-return]
 
         check_level(level, xi_bound, barrier.guard, self.duration, "first barrier")
@@ -247,8 +247,7 @@ class _Chain:
             scenario,
             initial=Initial(x=state.x),
             observer=observer,
-            bounds=shifted(scenario.bounds, state.t),
-            state_bounds=tuple(shifted(side, state.t) for side in scenario.state_bounds),
+            bounds=tuple(shifted(bounds, state.t) for bounds in scenario.bounds),
             reference=shifted(scenario.reference, state.t),
             disturbance=shifted(scenario.disturbance, state.t),
         )
@@ -330,10 +329,9 @@ def chain_problem(
 def _without_claim(scenario: Scenario) -> list[str]:
     """A sentence on the bounds about which a proof claims nothing; none where it claims all."""
     law: Any = scenario.controller
-    bounds = (scenario.bounds, *scenario.state_bounds)
     levels = [
         f"x_{i + 1}"
-        for i, (barrier, side) in enumerate(zip(law.barriers, bounds, strict=False))
+        for i, (barrier, side) in enumerate(zip(law.barriers, scenario.bounds, strict=False))
         if isinstance(barrier, Quadratic) and side is not None
     ]
     if not levels:
@@ -380,8 +378,7 @@ def _parts_of(scenario: Scenario) -> ChainParts:
     gain: Any = jnp.zeros(())
     if isinstance(scenario.observer, observers.LevelObserver):
         gain = scenario.observer.gain
-    context = scenario.context
-    bounds = tuple(context.level_bounds(i + 1) for i in range(order))
+    bounds = scenario.bounds[:order]
     model = scenario.model.at(jnp.zeros(()))
     return ChainParts(
         model, law, _rows(gain, order), scenario.reference, bounds, jnp.asarray(guards)
@@ -395,22 +392,15 @@ def _rows(value: jax.Array, order: int) -> jax.Array:
 
 def _varying(scenario: Scenario) -> dict[str, Any]:
     """The parts that may depend on time, by name."""
-    sides = {f"state_bounds[{i}]": side for i, side in enumerate(scenario.state_bounds)}
-    return {
-        "reference": scenario.reference,
-        "disturbance": scenario.disturbance,
-        "bounds": scenario.bounds,
-        **sides,
-    }
+    given = {f"bounds[{i}]": bounds for i, bounds in enumerate(scenario.bounds)}
+    return {"reference": scenario.reference, "disturbance": scenario.disturbance, **given}
 
 
 def _sides_of(scenario: Scenario) -> dict[str, Any]:
     """The sides of all bounds, by name."""
-    given: dict[str, Any] = {"bounds": scenario.bounds}
-    given |= {f"state_bounds[{i}]": bounds for i, bounds in enumerate(scenario.state_bounds)}
     return {
-        f"{name}.{side}": vars(bounds)[side]
-        for name, bounds in given.items()
+        f"bounds[{i}].{side}": vars(bounds)[side]
+        for i, bounds in enumerate(scenario.bounds)
         if bounds is not None
         for side in ("lower", "upper")
     }

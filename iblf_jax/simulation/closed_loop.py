@@ -28,12 +28,14 @@ from iblf_jax.control.actuators import Ideal
 from iblf_jax.control.controllers import Command
 from iblf_jax.control.observers import Observer
 from iblf_jax.control.sensors import Measurement
+from iblf_jax.control.sensors._base import measurement_of
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.simulation.delays import initial_commands
 from iblf_jax.simulation.levels import (
     completed,
     estimate,
     estimated_levels,
+    has_speed_limits,
     motion,
     start_levels,
     steady_input,
@@ -43,7 +45,7 @@ from iblf_jax.simulation.sampling import Instant, SentCommand, nothing_sent
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import Sample
 from iblf_jax.world import plants
-from iblf_jax.world.bounds import bounds_at
+from iblf_jax.world.bounds import Tube, bounds_at
 from iblf_jax.world.regions import margins
 
 # --- the state ---------------------------------------------------------------------------------
@@ -119,24 +121,27 @@ class SampledState(NamedTuple):
 class LoopState(NamedTuple):
     """State of the closed loop; its rate has the structure of the `integrated_part`."""
 
-    q: jax.Array
-    dq: jax.Array
+    x: jax.Array
+    """State of the plant, (r, n): of a robot q and q'."""
     controller: Any
     observer: Any
     actuator: Any = ()
     sampled: Any = ()
     """A `SampledState` where the law is sampled."""
-    higher: Any = ()
-    """Levels of the plant from the third on, (r - 2, n); `()` for a robot, which has q and q'."""
     delayed: Any = ()
     """Commands of the last steps, newest first, (history, stages, n) [N m], where the input of a
     continuous loop has a delay; `()` without one.  In the rate of the state it is the command of
     the law, (n,)."""
 
     @property
-    def x(self) -> jax.Array:
-        """The state of the plant, (r, n)."""
-        return plants.state_of_levels(self.q, self.dq, self.higher)
+    def q(self) -> jax.Array:
+        """The first level, (n,); after leading axes of many states, as in `dq`."""
+        return self.x[..., 0, :]
+
+    @property
+    def dq(self) -> jax.Array:
+        """The second level, (n,)."""
+        return self.x[..., 1, :]
 
 
 # inline, so that JAX traces it once for all of its call sites
@@ -145,17 +150,14 @@ def initial_state(scenario: Scenario) -> LoopState:
     """The state at t = 0; an actuator starts with the torque that balances the model's gravity."""
     x, loop = start_levels(scenario), scenario.loop
     known = x[: loop.model.order]
-    q, dq, *higher = x
     state = LoopState(
-        q,
-        dq,
+        x,
         loop.law.init(known, scenario.context),
         discrete_observer(scenario).init(known, loop.model),
-        higher=jnp.stack(higher) if higher else (),
     )
     if scenario.sampling is None and isinstance(scenario.actuator, Ideal):
         return state
-    balance = steady_input(scenario, q)
+    balance = steady_input(scenario, x[0])
     state = state._replace(actuator=scenario.actuator.init(balance))
     if scenario.sampling is None:
         return state._replace(delayed=initial_commands(scenario, balance))
@@ -171,7 +173,7 @@ def _initial_sampled_state(scenario: Scenario, state: LoopState, tau: jax.Array)
     command, _ = jax.eval_shape(
         loop.law.command, t, known, f_hat, scenario.context, state.controller
     )
-    here = Measurement(state.q, state.dq, state.higher)
+    here = measurement_of(x)
     estimated = jax.eval_shape(
         partial(estimated_levels, scenario, loop.observer), t, here, here, x, state.observer
     )
@@ -200,7 +202,7 @@ def integrated_part(state: LoopState) -> LoopState:
     and the actuator; law, observer and sensor change at samples only.
     """
     if has_delay(state):
-        return state._replace(delayed=jnp.zeros_like(state.q))
+        return state._replace(delayed=jnp.zeros_like(state.x[0]))
     if state.sampled == ():
         return state
     return state._replace(controller=(), observer=(), sampled=())
@@ -210,7 +212,7 @@ def with_integrated_part(state: LoopState, part: LoopState) -> LoopState:
     """The state with its `integrated_part` replaced."""
     if state.sampled == ():
         return part._replace(delayed=state.delayed)
-    return state._replace(q=part.q, dq=part.dq, higher=part.higher, actuator=part.actuator)
+    return state._replace(x=part.x, actuator=part.actuator)
 
 
 # --- continuous time: the rate of the state ------------------------------------------------------
@@ -242,7 +244,7 @@ def evaluate(
     undelayed: Any = ()
     if scenario.sampling is None:
         f_hat = estimate(scenario, loop.observer, t, known, state.observer)
-        true = Measurement(state.q, state.dq, state.higher)
+        true = measurement_of(x)
         measured = completed(scenario, loop.observer, t, true, state.observer)
         answer, controller_rate = loop.law.command(
             t, measured.x[: loop.model.order], f_hat, scenario.context, state.controller
@@ -257,17 +259,15 @@ def evaluate(
     else:
         command = state.sampled.commands[0] if torque is None else torque
         signals = state.sampled.signals
-    delivered = scenario.actuator.at(t).deliver(command, state.dq, state.actuator)
+    delivered = scenario.actuator.at(t).deliver(command, x[1], state.actuator)
     moved = motion(scenario, t, x, delivered.tau)
     if scenario.sampling is None:
         observer_rate = loop.observer.derivative(t, known, answer.tau, loop.model, state.observer)
     rate = LoopState(
-        q=moved[0],
-        dq=moved[1],
+        moved,
         controller=controller_rate,
         observer=observer_rate,
         actuator=delivered.rate,
-        higher=moved[2:] if len(moved) > 2 else (),
         delayed=undelayed,
     )
     sample = sample_at(scenario, t, dt, x, moved, delivered.tau, delivered.limited, signals)
@@ -298,10 +298,7 @@ def with_process_noise(
     rows = list(rate.x)
     for row, level in zip(added, noise.levels, strict=True):
         rows[level - 1] = rows[level - 1] + row
-    q, dq, *higher = rows
-    if not higher:
-        return rate._replace(q=q, dq=dq)
-    return rate._replace(q=q, dq=dq, higher=jnp.stack(higher))
+    return rate._replace(x=jnp.stack(rows))
 
 
 def sample_at(
@@ -327,27 +324,29 @@ def sample_at(
       signals: of the law.
     """
     tube = scenario.context.tube(t)
-    q, dq = x[0], x[1]
     terms = _uncertain_signals(scenario, t, x, moved, tau, signals)
-    optional = _level_signals(scenario, t, x[2:], signals)
+    lower, upper = _bounds_of_levels(scenario, t, tube, x, signals)
+    errors = [x[0] - tube.q_d, x[1] - signals.alpha]
+    if not isinstance(signals.alpha_higher, tuple):
+        errors += list(x[2:] - signals.alpha_higher)
+    optional: dict[str, Any] = {}
     if scenario.regions:
-        optional["region_margin"] = margins(scenario.regions, plants.robot_of(scenario.plant), q)
+        robot = plants.robot_of(scenario.plant)
+        optional["region_margin"] = margins(scenario.regions, robot, x[0])
     if signals.estimated != ():
         optional |= signals.estimated._asdict()
     return Sample(
         t=t,
         dt=jnp.asarray(dt, t.dtype),
         step=jnp.zeros_like(t),
-        q=q,
-        dq=dq,
+        x=x,
         tau=tau,
-        e1=q - tube.q_d,
-        e2=dq - signals.alpha,
-        xi=tube.xi(q),
+        e=jnp.stack(errors),
+        xi=tube.xi(x[0]),
         q_d=tube.q_d,
         dq_d=tube.dq_d,
-        lower=tube.lower,
-        upper=tube.upper,
+        level_lower=lower,
+        level_upper=upper,
         alpha=signals.alpha,
         gravity=terms.gravity,
         disturbance=terms.disturbance,
@@ -400,37 +399,30 @@ def _uncertain_signals(
     return _UncertainSignals(balance, found, known, V if added is None else V + added)
 
 
-def _level_signals(
-    scenario: Scenario, t: jax.Array, higher: Any, signals: LawSignals
-) -> dict[str, Any]:
-    """The optional signals of the levels from the second on.
+def _bounds_of_levels(
+    scenario: Scenario, t: jax.Array, tube: Tube, x: jax.Array, signals: LawSignals
+) -> tuple[jax.Array, jax.Array]:
+    """Lower and upper bounds of the levels up to the last one that has some, (m, n) each.
 
     The bounds of the velocities of a robot may follow q_d'; those of the levels of another plant
     may follow the virtual control alpha_{i-1} of the law.
     """
-    context, found = scenario.context, {}
-    if scenario.velocity_bounds is not None:
-        found["dq_lower"], found["dq_upper"] = context.speed_limits(t)
-    elif (bounds := context.level_bounds(2)) is not None:
-        found["dq_lower"], found["dq_upper"] = bounds_at(bounds, t, signals.alpha)
-    if not len(higher):
-        return found
-    found["higher"] = higher
-    centre = jnp.zeros_like(higher)
+    sides = [(tube.lower, tube.upper)]
+    last = max(i for i, bounds in enumerate(scenario.bounds) if bounds is not None)
+    centres = [signals.alpha, *jnp.zeros_like(x[2:])]
     if not isinstance(signals.alpha_higher, tuple):
-        centre = signals.alpha_higher
-        found["e_higher"] = higher - centre
-    bounds_of_levels = [context.level_bounds(i + 3) for i in range(len(higher))]
-    if all(bounds is None for bounds in bounds_of_levels):
-        return found
-    infinite = jnp.full_like(higher[0], jnp.inf)
-    sides = [
-        (-infinite, infinite) if bounds is None else bounds_at(bounds, t, middle)
-        for bounds, middle in zip(bounds_of_levels, centre, strict=True)
-    ]
-    found["higher_lower"] = jnp.stack([lower for lower, _ in sides])
-    found["higher_upper"] = jnp.stack([upper for _, upper in sides])
-    return found
+        centres[1:] = signals.alpha_higher
+    infinite = jnp.full_like(x[0], jnp.inf)
+    above = zip(scenario.bounds[1 : last + 1], centres, strict=False)
+    for level, (bounds, centre) in enumerate(above, start=2):
+        if bounds is None:
+            sides.append((-infinite, infinite))
+        elif level == 2 and has_speed_limits(scenario):
+            sides.append(scenario.context.speed_limits(t))
+        else:
+            sides.append(bounds_at(bounds, t, centre))
+    lower, upper = zip(*sides, strict=True)
+    return jnp.stack(lower), jnp.stack(upper)
 
 
 # --- discrete time: a sampled law ----------------------------------------------------------------
@@ -565,7 +557,7 @@ def run_sampled_law_if_due(
     scenario: Scenario, t: jax.Array, state: LoopState, now: Instant, noise: jax.Array
 ) -> LoopState:
     """The state after `run_sampled_law` if the instant is the start of a period, else the state."""
-    normal = normals(noise, now.sample, scenario.sensor.draws, scenario.n).astype(state.q.dtype)
+    normal = normals(noise, now.sample, scenario.sensor.draws, scenario.n).astype(state.x.dtype)
     return jax.lax.cond(
         now.phase == 0,
         lambda state: run_sampled_law(scenario, t, state, normal),

@@ -100,11 +100,11 @@ class Accuracy(NamedTuple):
 
 
 def _watched(state: LoopState, values: LoopState) -> list:
-    """The leaves of `values` at the positions, velocities, floating-point observer and actuator
-    states and further levels of `state`. The state of the law is not watched.
+    """The leaves of `values` at the levels of the plant and at the floating-point states of
+    observer and actuator of `state`. The state of the law is not watched.
     """
-    kinds = jax.tree.leaves((state.q, state.dq, state.observer, state.actuator, state.higher))
-    found = jax.tree.leaves((values.q, values.dq, values.observer, values.actuator, values.higher))
+    kinds = jax.tree.leaves((state.x, state.observer, state.actuator))
+    found = jax.tree.leaves((values.x, values.observer, values.actuator))
     pairs = zip(kinds, found, strict=True)
     return [x for kind, x in pairs if jnp.issubdtype(kind.dtype, jnp.floating)]
 
@@ -133,19 +133,14 @@ def response(jacobian: jax.Array, n: int) -> jax.Array:
 
 def _of_levels(response: jax.Array, state: LoopState) -> jax.Array:
     """The columns of the response of a sampled loop that belong to the plant's levels from the
-    second on, between which the state of the actuator lies.
+    second on.
     """
-    n = state.dq.size
-    if isinstance(state.higher, tuple):
-        return response[:, :n]
-    first = n + sum(x.size for x in jax.tree.leaves(state.actuator))
-    higher = response[:, first : first + state.higher.size]
-    return jnp.concatenate([response[:, :n], higher], axis=1)
+    return response[:, : state.x[1:].size]
 
 
 def _rate(accuracy: Accuracy, slope: LoopState) -> jax.Array:
     """The rate of the positions and of their final displacement, (2 n,)."""
-    n = slope.q.size
+    n = slope.x.shape[-1]
     flat = jnp.concatenate([jnp.ravel(x) for x in _watched(slope, slope)])
     flat = jax.lax.stop_gradient(flat)
     return jnp.concatenate([flat[:n], flat[:n] + matvec(accuracy.response, flat[n:])])
@@ -175,7 +170,7 @@ def begin(method: str, jacobian: jax.Array, state: LoopState) -> Accuracy:
       jacobian: of the closed loop at the start by the watched numbers, (m, m) [1/s].
       state: state at the start.
     """
-    n = state.q.size
+    n = state.x.shape[-1]
     R = response(jacobian, n)
     none = jnp.zeros((2 * n,), jacobian.dtype)
     pending = (none,) * steps_back(method)
@@ -364,10 +359,10 @@ def _ratio_by_levels(later: LoopState, early: LoopState, tiny: jax.Array) -> jax
         return _size(of(later)) / jnp.maximum(_size(of(early)), tiny)  # type: ignore[no-any-return]
 
     def others(slope: LoopState) -> tuple:
-        return slope.controller, slope.observer, slope.actuator, slope.higher
+        return slope.controller, slope.observer, slope.actuator, slope.x[2:]
 
-    levels = jnp.sqrt(ratio(lambda slope: slope.q) * ratio(lambda slope: slope.dq))
-    if not jax.tree.leaves(others(later)):
+    levels = jnp.sqrt(ratio(lambda slope: slope.x[0]) * ratio(lambda slope: slope.x[1]))
+    if not any(x.size for x in jax.tree.leaves(others(later))):
         return levels
     return jnp.maximum(levels, ratio(others))
 

@@ -162,7 +162,7 @@ def begin(scenario: Scenario, state: LoopState, derivative: jax.Array) -> Any:
     """
     if not is_interrupted(scenario):
         return ()
-    zero = jnp.zeros_like(state.q)
+    zero = jnp.zeros(scenario.n, state.x.dtype)
     peak: Any = ()
     jumped = zero[0]
     if scenario.sampling is not None and scenario.sampling.trigger is not None:
@@ -197,13 +197,9 @@ def _reads_without_rounding(
 
 
 def _rows_of_levels(state: LoopState) -> list[slice]:
-    """Where each level lies in the flat `integrated_part`: the states of the actuator follow the
-    second one.
-    """
-    n = state.q.size
-    after = sum(x.size for x in jax.tree.leaves(state.actuator))
-    starts = [k * n + (after if k > 1 else 0) for k in range(len(state.x))]
-    return [slice(start, start + n) for start in starts]
+    """Where each level lies in the flat `integrated_part`."""
+    order, n = state.x.shape
+    return [slice(k * n, (k + 1) * n) for k in range(order)]
 
 
 # --- a step --------------------------------------------------------------------------------------
@@ -345,7 +341,7 @@ def _at_sample(
     state: LoopState,
 ) -> ErrorGrowth:
     """The errors after the law has run, and whether a code may differ (A.3)."""
-    normal = normals(noise, now.sample, scenario.sensor.draws, scenario.n).astype(state.q.dtype)
+    normal = normals(noise, now.sample, scenario.sensor.draws, scenario.n).astype(state.x.dtype)
     if _rounds_readings(scenario):
         reaches = _reaches_code(growth.error[0].x, scenario, before, normal)
         return growth._replace(jumped=jnp.where(reaches, 1.0, growth.jumped))
@@ -382,14 +378,12 @@ def _after_law(
     part, memory, commands, sent = growth.error
     sampled = before.sampled
     states = (before.controller, before.observer, sampled.sensor)
-    small, back = _scales((part.q, part.dq, part.higher, memory))
+    small, back = _scales((part.x, memory))
 
     def law(scale: Any) -> tuple[jax.Array, Any]:
-        q, dq, higher = _moved(
-            (before.q, before.dq, before.higher), (part.q, part.dq, part.higher), scale
-        )
+        x = _moved(before.x, part.x, scale)
         controller, observer, sensor = _moved(states, memory, scale)
-        at = before._replace(q=q, dq=dq, higher=higher, controller=controller, observer=observer)
+        at = before._replace(x=x, controller=controller, observer=observer)
         at = at._replace(sampled=sampled._replace(sensor=sensor, sent=()))
         after = run_sampled_law(always, t, at, normal)
         after_memory = (after.controller, after.observer, after.sampled.sensor)
@@ -416,7 +410,7 @@ def _after_law(
         sent = sent._replace(input=command_error, torque=command_error)
     if _rounds_torque(scenario):
         actuator: Any = scenario.actuator.at(t)
-        distance = actuator.distance_to_jump(state.sampled.commands[0], state.dq, state.actuator)
+        distance = actuator.distance_to_jump(state.sampled.commands[0], state.x[1], state.actuator)
         reaches = reaches | jnp.any(jnp.abs(command_error) + blur >= distance)
     jumped = jnp.where(reaches, 1.0, growth.jumped)
     commands = jnp.concatenate([command_error[None], commands[:-1]])

@@ -86,6 +86,13 @@ def stated_steady_input(scenario: Any, q: jax.Array) -> jax.Array | None:
     return model.steady_input(q)  # type: ignore[no-any-return]
 
 
+def has_speed_limits(scenario: Any) -> bool:
+    """Whether the bounds of the second level are those of a robot's velocities, which may follow
+    q_d'.
+    """
+    return scenario.bounds[1] is not None and scenario.loop.plant.reference_levels == 2
+
+
 # --- law and observer -----------------------------------------------------------------------------
 
 
@@ -119,7 +126,8 @@ def completed(
     model = scenario.loop.model
     x: Any = observer.complete(t, measured.x[: model.order], model, state)
     # The plant may have more levels than the model; they remain those of the sensor.
-    return Measurement(x[0], x[1], measured.higher if len(x) == 2 else x[2:])
+    higher = measured.higher if len(x) == 2 else x[2:]
+    return Measurement(x[0], x[1], higher)
 
 
 class EstimatedLevels(NamedTuple):

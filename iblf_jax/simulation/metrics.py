@@ -44,13 +44,12 @@ from iblf_jax.simulation.error_estimate import ACCURACY_UNITS
 from iblf_jax.simulation.scenario import Scenario, fit_joints
 from iblf_jax.simulation.signals import Sample as Sample
 from iblf_jax.simulation.signals import (
+    alpha_margins_above,
     has,
-    least_level_margin,
-    least_position_margin,
-    least_speed_margin,
+    least_margin,
+    least_margins_above,
     least_xi_margin,
-    level_margin,
-    speed_margin,
+    margin_of,
 )
 from iblf_jax.simulation.units import unit_text
 from iblf_jax.world import plants
@@ -240,7 +239,7 @@ class Margin(Fold):
 
     def update(self, acc: _MarginState, sample: Sample) -> _MarginState:
         """Adds one sample."""
-        margin, xi_margin = least_position_margin(sample), least_xi_margin(sample)
+        margin, xi_margin = least_margin(sample, 1), least_xi_margin(sample)
         return _with_margins(acc, sample.t, margin, xi_margin)
 
     def finish(self, acc: _MarginState) -> dict[str, jax.Array]:
@@ -270,7 +269,7 @@ class FirstExit(Fold):
 
     def update(self, acc: jax.Array, sample: Sample) -> jax.Array:
         """Adds one sample."""
-        margin = least_position_margin(sample)
+        margin = least_margin(sample, 1)
         return jnp.where(margin > 0, acc, jnp.minimum(acc, sample.t))
 
     def finish(self, acc: jax.Array) -> dict[str, jax.Array]:
@@ -319,8 +318,8 @@ class VelocityMargin(Fold):
     velocity_margin = min(q' - v_l, v_u - q') and alpha_margin = min(alpha - v_l, v_u - alpha), both
     continuous through zero; a law that follows an alpha outside the bounds cannot keep them.
     first_velocity_violation_time is infinite and first_velocity_violation_joint -1 on a run that
-    keeps them.  Only for scenarios with bounds of the second level (`velocity_bounds`, or
-    `state_bounds[0]` of a plant), whose runs carry it by default.
+    keeps them.  Only for scenarios with bounds of the second level (`bounds[1]`), whose runs
+    carry it by default.
     """
 
     units: ClassVar[dict[str, str]] = {
@@ -337,8 +336,8 @@ class VelocityMargin(Fold):
 
     def update(self, acc: _MarginState, sample: Sample) -> _MarginState:
         """Adds one sample."""
-        of_alpha = speed_margin(sample, sample.alpha)
-        return _with_margins(acc, sample.t, least_speed_margin(sample), of_alpha)
+        of_alpha = margin_of(sample, 2, sample.alpha)
+        return _with_margins(acc, sample.t, least_margin(sample, 2), of_alpha)
 
     def finish(self, acc: _MarginState) -> dict[str, jax.Array]:
         """velocity_margin and alpha_margin, each (n,); first_velocity_violation_time and
@@ -362,7 +361,7 @@ class LevelMargin(Fold):
     bounds; a law that follows an alpha_{i-1} outside the bounds cannot keep them.
     first_level_violation_time is infinite, first_level_violation_level (counted from 1) and
     first_level_violation_component (from 0) are -1 on a run that keeps them.  Only for scenarios
-    with `state_bounds` of such levels, whose runs carry it by default.
+    with bounds of such levels, whose runs carry it by default.
     """
 
     units: ClassVar[dict[str, str]] = {
@@ -372,7 +371,7 @@ class LevelMargin(Fold):
         "first_level_violation_level": "1",
         "first_level_violation_component": "1",
     }
-    needs: ClassVar[str] = "higher_lower"
+    needs: ClassVar[str] = "level_lower"
 
     def init(self, sample: Sample) -> _MarginState:
         """Infinitely far from the bounds."""
@@ -401,10 +400,9 @@ def _level_margins(sample: Sample) -> list[jax.Array]:
     """The margins of the levels from the third on, and of the virtual controls for them, (r - 2, n)
     each; the latter only under a law that has them.
     """
-    found = [least_level_margin(sample)]
-    if has(sample, "e_higher"):
-        found.append(level_margin(sample, sample.higher - sample.e_higher))
-    return found
+    of_alphas = alpha_margins_above(sample)
+    found = [least_margins_above(sample)]
+    return found if of_alphas is None else [*found, of_alphas]
 
 
 @component
@@ -734,8 +732,8 @@ class Events(Fold):
 
 SIGNAL_SOURCES = {
     "x_hat": "an observer of levels, such as ij.observers.StateObserver(bandwidth=100.0)",
-    "dq_lower": "velocity_bounds, such as Bounds(lower=Constant(-1.0), upper=Constant(1.0))",
-    "higher_lower": "state_bounds of a level from the third on",
+    "dq_lower": "bounds of the second level, such as bounds=(positions, velocities)",
+    "level_lower": "bounds of a level from the third on",
     "region_margin": "regions, such as (ij.regions.HalfSpace(normal=[0, 1], offset=0.1),)",
     "slack": "a law with a filter, such as ij.controllers.SafetyFilter(law)",
     "region_slack": "regions and a law with a filter, such as ij.controllers.SafetyFilter(law)",
@@ -747,12 +745,10 @@ SIGNAL_SOURCES = {
 
 def has_signal(scenario: Scenario, signal: str) -> bool:
     """Whether runs of a scenario have an optional signal, one of `SIGNAL_SOURCES`."""
-    context = scenario.context
     if signal == "dq_lower":
-        return context.level_bounds(2) is not None
-    if signal == "higher_lower":
-        levels = range(3, plants.order_of(scenario.plant) + 1)
-        return any(context.level_bounds(level) is not None for level in levels)
+        return scenario.bounds[1] is not None
+    if signal == "level_lower":
+        return any(bounds is not None for bounds in scenario.bounds[2:])
     if signal == "x_hat":
         return observer_of_x(scenario.observer).completes
     has_regions = len(scenario.regions) > 0

@@ -19,7 +19,7 @@ from iblf_jax.core import checks
 from iblf_jax.simulation.discontinuities import Piece
 from iblf_jax.simulation.integrators import STOCHASTIC, TABLEAUS, tableau
 from iblf_jax.simulation.scenario import Scenario
-from iblf_jax.simulation.signals import Sample, has
+from iblf_jax.simulation.signals import Sample
 
 NOISE_NAME = "noise"
 """Name of the noise key among the replaced values of a run; no leaf of a scenario has this name."""
@@ -284,23 +284,14 @@ def least_distances(
     return jnp.where(is_wall, 0.5 * (first + last - root), now)
 
 
-def distances(scenario: Scenario, sample: Sample) -> dict[str, jax.Array]:
-    """Of each level with process noise and bounds, the distances to the lower and the upper ones:
-    field of `Sample` -> (2, n), or (2, r - 2, n) for the levels from the third on; empty without
-    process noise.
+def distances(scenario: Scenario, sample: Sample) -> Any:
+    """The distances of the levels to their lower and upper bounds, (2, m, n), up to the last level
+    with bounds; `()` without process noise.
     """
-    noise = scenario.process_noise
-    if noise is None:
-        return {}
-    found = {}
-    if 1 in noise.levels:
-        found["q_sides"] = jnp.stack([sample.q - sample.lower, sample.upper - sample.q])
-    if 2 in noise.levels and has(sample, "dq_lower"):
-        found["dq_sides"] = jnp.stack([sample.dq - sample.dq_lower, sample.dq_upper - sample.dq])
-    if max(noise.levels) > 2 and has(sample, "higher_lower"):
-        below, above = sample.higher - sample.higher_lower, sample.higher_upper - sample.higher
-        found["higher_sides"] = jnp.stack([below, above])
-    return found
+    if scenario.process_noise is None:
+        return ()
+    x = sample.x[: len(sample.level_lower)]
+    return jnp.stack([x - sample.level_lower, sample.level_upper - x])
 
 
 def with_extremes(
@@ -310,8 +301,8 @@ def with_extremes(
     dt: jax.Array,
     sample: Sample,
     x: jax.Array,
-    before: dict[str, jax.Array],
-    now: dict[str, jax.Array],
+    before: Any,
+    now: Any,
 ) -> Sample:
     """A sample with the smallest distances since the instant before, on levels with process noise.
 
@@ -325,32 +316,23 @@ def with_extremes(
       x: state of the plant there, (r, n), at which the intensity of the noise is taken.
       before, now: `distances` at the instant before and at this one.
     """
-    if not now:
+    noise = scenario.process_noise
+    if noise is None:
         return sample
-    noise: Any = scenario.process_noise
     n = scenario.n
     words = _words(key, EXTREME_STREAM)
     instant = instant.astype(jnp.int32)
-    rows = noise.diffusion(sample.t, x) ** 2 * dt
-    variance = dict(zip(noise.levels, rows, strict=True))
-
-    def least(level: int, first: jax.Array, last: jax.Array) -> jax.Array:
-        if level not in variance:
-            return last
+    variances = noise.diffusion(sample.t, x) ** 2 * dt
+    rows = list(jnp.moveaxis(now, 1, 0))
+    for level, variance in zip(noise.levels, variances, strict=True):
+        if level > len(rows) or scenario.bounds[level - 1] is None:
+            continue
         pairs = range((level - 1) * n, level * n)
         numbers = [jnp.stack(_uniforms(words, instant, pair, dt.dtype)) for pair in pairs]
-        found = least_distances(first, last, variance[level], jnp.stack(numbers, axis=1))
-        return jnp.where(instant > 0, found, last)
-
-    sides: dict[str, Any] = {}
-    for level, name in ((1, "q_sides"), (2, "dq_sides")):
-        if name in now:
-            sides[name] = least(level, before[name], now[name])
-    if "higher_sides" in now:
-        first, last = before["higher_sides"], now["higher_sides"]
-        found = [least(3 + i, first[:, i], last[:, i]) for i in range(last.shape[1])]
-        sides["higher_sides"] = jnp.stack(found, axis=1)
-    return dataclasses.replace(sample, **sides)
+        last = rows[level - 1]
+        least = least_distances(before[:, level - 1], last, variance, jnp.stack(numbers, axis=1))
+        rows[level - 1] = jnp.where(instant > 0, least, last)
+    return dataclasses.replace(sample, sides=jnp.stack(rows, axis=1))
 
 
 # --- switching times ------------------------------------------------------------------------------

@@ -10,6 +10,8 @@ Sweeps, perturbations, tuning and scenario files address leaves by these paths.
   as well. A name without a letter, or with a bracket, a line break or the like, is written as a
   JSON string: 'plant.link["a]b"].mass'.
 - `robot.` stands for `plant.` and `model.` together and changes both robots alike.
+- `bounds.lower` and `bounds.upper` without an index are those of the first level:
+  "bounds.upper.value" is "bounds[0].upper.value".
 - Several leaves may be addressed as the rows of one array (class attribute `stacked`):
   "initial.x[2]" is the third level of the start of a plant, "initial.x[0]" its initial.q.
 - The arrays of a module of another library have the paths that its classes give them, with the
@@ -185,10 +187,11 @@ def _walk(part: Any, path: str, named: bool, symbols: Symbols) -> Iterator[Param
             yield Parameter(name, jnp.shape(value), unit, value)
         elif isinstance(value, tuple | list) and not modules.is_module(value):
             for i, x in enumerate(value):
-                below = _symbols_below(part, field, symbols, i)
+                below = statements_of(part).symbols_of_part(field.name, i, symbols)
                 yield from _walk(x, f"{name}[{i}]", named, below)
         else:
-            yield from _walk(value, name, named, _symbols_below(part, field, symbols))
+            below = statements_of(part).symbols_of_part(field.name, 0, symbols)
+            yield from _walk(value, name, named, below)
     if named:
         yield from _named_rows(part, path)
         yield from _stacked_rows(part, path, symbols)
@@ -197,15 +200,6 @@ def _walk(part: Any, path: str, named: bool, symbols: Symbols) -> Iterator[Param
 def arrays_of_module(module: Any) -> dict[str, Any]:
     """Path in the module -> array, of every leaf of a module, in the order of its leaves."""
     return {p.path.lstrip("."): p.value for p in _walk(module, "", False, {})}
-
-
-def _symbols_below(
-    part: Any, field: dataclasses.Field, symbols: Symbols, index: int = 0
-) -> Symbols:
-    """The unit of each symbol in the part that a field holds, or in one of its parts."""
-    symbols = statements_of(part).symbols_of_part(field.name, index, symbols)
-    change = field.metadata.get("part_units")
-    return symbols if change is None else change(symbols, index)  # type: ignore[no-any-return]
 
 
 def _walk_wrapped(
@@ -261,11 +255,31 @@ def _quoted(name: str) -> str:
     return name if needs_no_quotes else json.dumps(name)
 
 
+def _next_level(match: re.Match) -> str:
+    """The bounds of a level that earlier versions counted from the second one."""
+    return f"bounds[{int(match[1]) + 1}]"
+
+
+SHORT_PATHS: tuple[tuple[re.Pattern, Any], ...] = (
+    (re.compile(r"^bounds(?=\.(lower|upper)\b)"), "bounds[0]"),
+    (re.compile(r"^velocity_bounds\b"), "bounds[1]"),
+    (re.compile(r"^state_bounds\[(\d+)\]"), _next_level),
+)
+"""Beginnings of paths -> the full ones.  Files of earlier versions have `velocity_bounds` and
+`state_bounds`."""
+
+
+def full_path(path: str) -> str:
+    """A path without the shorthands of `SHORT_PATHS`."""
+    for pattern, full in SHORT_PATHS:
+        path = pattern.sub(full, path)
+    return path
+
+
 def expand(path: str) -> list[str]:
-    """The full paths of a path: two for `robot.`, else the path itself.  ValueError if it is not a
-    path.
-    """
+    """The full paths of a path: two for `robot.`, else one.  ValueError if it is not a path."""
     parse(path)
+    path = full_path(path)
     if path == "robot" or path.startswith(("robot.", "robot[")):
         return ["plant" + path[5:], "model" + path[5:]]
     return [path]
@@ -274,7 +288,7 @@ def expand(path: str) -> list[str]:
 def _unknown(scenario: Scenario, path: str) -> ValueError:
     """The error about a path that leads to no leaf."""
     known = [p.path for p in parameters(scenario)]
-    remedy = checks.nearest(path, known) or "ij.parameters(scenario) lists them."
+    remedy = checks.nearest(full_path(path), known) or "ij.parameters(scenario) lists them."
     return checks.fail("path", path, "the path of a leaf of this scenario", remedy)
 
 
@@ -337,7 +351,7 @@ def _metadata(scenario: Scenario, path: str) -> Mapping[str, Any]:
         if isinstance(value, NUMBERS):
             unit = of_entry(_unit(part, field, symbols), index, jnp.ndim(value))
             return {**field.metadata, "unit": unit}
-        symbols = _symbols_below(part, field, symbols, *index[:1])
+        symbols = statements_of(part).symbols_of_part(name, index[0] if index else 0, symbols)
         part = value
         for i in () if modules.is_module(value) else index:
             part = part[i]

@@ -11,7 +11,6 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
@@ -126,25 +125,7 @@ class Rollout(Result, Signals):
     @property
     def n(self) -> int:
         """Number of joints."""
-        return self.q.shape[-1]
-
-    @property
-    def x(self) -> jax.Array:
-        """State of the plant, (T, r, n): q, q' and the levels from the third on."""
-        levels = jnp.stack([self.q, self.dq], axis=-2)
-        if isinstance(self.higher, tuple):
-            return levels
-        return jnp.concatenate([levels, self.higher], axis=-2)
-
-    @property
-    def e(self) -> jax.Array:
-        """Errors e_i = x_i - alpha_{i-1} of the levels for which the law has virtual controls,
-        (T, r, n), or (T, 2, n) under a law of robots.
-        """
-        levels = jnp.stack([self.e1, self.e2], axis=-2)
-        if isinstance(self.e_higher, tuple):
-            return levels
-        return jnp.concatenate([levels, self.e_higher], axis=-2)
+        return self.x.shape[-1]
 
     @property
     def is_batch(self) -> bool:
@@ -174,7 +155,7 @@ class Rollout(Result, Signals):
             return "Rollout(being traced)"
         components = plants.counted_components(self.scenario.plant, self.n)
         shape = (
-            f"{self.q.shape[-2]} samples, {components}, dt = {float(np.ravel(self.dt)[0]):g} s,"
+            f"{self.x.shape[-3]} samples, {components}, dt = {float(np.ravel(self.dt)[0]):g} s,"
             f" {self.method}"
         )
         if self.is_batch:

@@ -10,9 +10,9 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Annotated, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -47,8 +47,8 @@ from iblf_jax.core.pytree import (
     unwrapped,
 )
 from iblf_jax.core.time import joined, jump_times_of
-from iblf_jax.core.units import HIGHER, POSITION, VELOCITY, Unit, as_text
-from iblf_jax.simulation.levels import start_levels
+from iblf_jax.core.units import HIGHER, POSITION, VELOCITY, as_text
+from iblf_jax.simulation.levels import has_speed_limits, start_levels
 from iblf_jax.simulation.measurement_noise import noise_advice
 from iblf_jax.simulation.sampling import PERIOD_TOLERANCE, Sampling
 from iblf_jax.world import plants, process_noise, regions
@@ -124,14 +124,10 @@ it, and the remedy of an error message.
 LAWS = "iblf_jax.controllers has them; iblf_jax.testing.check_law checks your own."
 CLASSES: dict[str, tuple[Any, str]] = {
     "initial": (Initial, "an Initial, such as Initial(q=[0.8, 0.8])"),
-    "bounds": (Bounds, "a Bounds, such as Bounds(lower=Constant(0.1), upper=Constant(0.9))"),
-    "velocity_bounds": (
-        Bounds | None,
-        "a Bounds, or None, such as Bounds(lower=Constant(-1.0), upper=Constant(1.0))",
-    ),
-    "state_bounds": (
-        tuple | list,
-        "a tuple of Bounds or None, one for each level from the second on",
+    "bounds": (
+        Bounds | tuple | list,
+        "a Bounds, such as Bounds(lower=Constant(0.1), upper=Constant(0.9)), or a tuple of one for"
+        " each level",
     ),
     "sampling": (Sampling | None, "a Sampling, or None, such as ij.Sampling(period=2e-3)"),
     "regions": (
@@ -144,17 +140,22 @@ CLASSES: dict[str, tuple[Any, str]] = {
 HOW_TO_MAKE = "Make one with ij.presets or ij.Scenario."
 
 
-def _of_level(level: int) -> Callable[[Mapping[str, Unit], int], Mapping[str, Unit]]:
-    """The units of the parameters of bounds, of which part 0 bounds this level."""
+if TYPE_CHECKING:
 
-    def units_of_part(units: Mapping[str, Unit], part: int) -> Mapping[str, Unit]:
-        return {**units, "x1": units[f"x{level + part}"]}
+    class BoundsOfLevels:
+        """The type of `Scenario.bounds`: a tuple, for which the constructor takes one `Bounds`,
+        too.
+        """
 
-    return units_of_part
+        def __get__(
+            self, scenario: Any, owner: Any
+        ) -> tuple[Bounds, Bounds | None, *tuple[Bounds | None, ...]]:
+            raise NotImplementedError
 
+        def __set__(self, scenario: Any, bounds: Bounds | Sequence[Bounds | None]) -> None: ...
 
-BOUNDS_OF_SECOND_LEVEL = {"part_units": _of_level(2)}
-"""Metadata of the bounds of the levels from the second on."""
+else:
+    BoundsOfLevels = tuple[Bounds | None, ...]
 
 
 class Loop(NamedTuple):
@@ -179,7 +180,12 @@ class Scenario:
     Args:
       plant: the simulated plant, any of `iblf_jax.robots` or `iblf_jax.plants`.
       reference: the desired trajectory, any of `iblf_jax.references`.
-      bounds: constraints on the joint positions, a `bounds.Bounds`.
+      bounds: constraints on the levels x_1, x_2, ... of the plant, a tuple of `bounds.Bounds`, or
+        None for a level without; a single `Bounds` is that of x_1, which every scenario has.  The
+        levels of a robot are its joint positions [rad] and velocities [rad/s]; the funnels of
+        velocities follow q_d', and those of the levels of another plant the virtual control.  Runs
+        record the margins of all levels under every law; `controllers.BarrierBackstepping` and
+        `controllers.FullState` enforce those from the second level on.
       controller: the law, any of `iblf_jax.controllers`.
       initial: position and velocity at the start, an `Initial`.
       observer: estimator of f, any of `iblf_jax.observers`; `NoObserver()` if not given.
@@ -193,13 +199,6 @@ class Scenario:
         `iblf_jax.sensors`; `Ideal()` if not given.  Others need a sampling.  A level that is not
         measured needs an observer that estimates it, such as `observers.StateObserver`.
       actuator: map from command to torque, any of `iblf_jax.actuators`; `Ideal()` if not given.
-      velocity_bounds: constraints on the joint velocities, a `bounds.Bounds` [rad/s] whose funnels
-        follow q_d'; none if not given.  Runs record their margins under every law;
-        `controllers.FullState` enforces them.
-      state_bounds: constraints on the levels x_2 ... x_r of the plant, a tuple of `bounds.Bounds`,
-        or None for a level without; () if not given.  Those of a robot's second level are its
-        `velocity_bounds`, which take their place.  Runs record their margins under every law;
-        `controllers.BarrierBackstepping` enforces them.
       regions: sets in which points of the robot must stay, a tuple of any of `iblf_jax.regions`; ()
         if not given.  Runs record their margins under every law; `controllers.SafetyFilter`
         enforces them.
@@ -213,7 +212,7 @@ class Scenario:
 
     plant: Annotated[Robot, Plant]
     reference: Reference
-    bounds: Bounds
+    bounds: BoundsOfLevels
     controller: TrackingLaw
     initial: Initial
     observer: DisturbanceObserver = NoObserver()
@@ -222,14 +221,7 @@ class Scenario:
     sampling: Sampling | None = None
     sensor: AnySensor = IdealSensor()
     actuator: Actuator = IdealActuator()
-    velocity_bounds: Bounds | None = dataclasses.field(
-        default=None, metadata=BOUNDS_OF_SECOND_LEVEL
-    )
     regions: tuple[regions.Region, ...] = ()
-    state_bounds: tuple[Bounds | None, ...] = dataclasses.field(
-        default=(), metadata=BOUNDS_OF_SECOND_LEVEL
-    )
-
     process_noise: ProcessNoise | None = None
 
     def check(self) -> None:
@@ -246,7 +238,7 @@ class Scenario:
             base = contract if isinstance(contract, type) else contract(parts[name])
             checks.conforms(f"Scenario.{name}", parts[name], base, remedy)
         self._check_classes()
-        self._fit_state_bounds()
+        self._fit_bounds()
         self._check_combination()
         check_levels(self)
         self._check_regions()
@@ -266,32 +258,20 @@ class Scenario:
         if new is not law:
             object.__setattr__(self, "controller", rewrapped(self.controller, new))
 
-    def _fit_state_bounds(self) -> None:
-        """Makes a tuple of the bounds of the levels; those of a robot's velocities are its
-        `velocity_bounds`.
-        """
-        given = tuple(self.state_bounds)
+    def _fit_bounds(self) -> None:
+        """Makes a tuple of the bounds, one for each level."""
+        given = (self.bounds,) if isinstance(self.bounds, Bounds) else tuple(self.bounds)
         order = plants.order_of(self.plant)
         for i, bounds in enumerate(given):
             if not isinstance(bounds, Bounds | None):
                 expected = "a Bounds, or None for a level without bounds"
-                raise checks.fail(f"Scenario.state_bounds[{i}]", bounds, expected)
-        if len(given) > order - 1:
-            expected = f"at most {order - 1}, for the levels 2 to {order}"
-            raise checks.fail("Scenario.state_bounds", f"{len(given)} bounds", expected)
-        velocity, second = self.velocity_bounds, given[0] if given else None
-        if velocity is not None and second is not None:
-            expected = "either velocity_bounds or state_bounds[0]"
-            remedy = "Both are the bounds of the second level."
-            raise checks.fail("Scenario.state_bounds", second, expected, remedy)
-        second = second if velocity is None else velocity
-        if not plants.is_chain(self.plant):
-            object.__setattr__(self, "velocity_bounds", second)
-            object.__setattr__(self, "state_bounds", ())
-            return
-        levels = (second, *given[1:])
-        object.__setattr__(self, "velocity_bounds", None)
-        object.__setattr__(self, "state_bounds", () if levels == (None,) else levels)
+                raise checks.fail(f"Scenario.bounds[{i}]", bounds, expected)
+        if any(bounds is not None for bounds in given[order:]):
+            expected = f"at most {order}, for the levels 1 to {order}"
+            raise checks.fail("Scenario.bounds", f"{len(given)} bounds", expected)
+        if not given or given[0] is None:
+            raise checks.fail("Scenario.bounds[0]", None, "the bounds of the first level")
+        object.__setattr__(self, "bounds", given[:order] + (None,) * (order - len(given)))
 
     def _check_classes(self) -> None:
         """Raises ValueError for a part of the wrong class."""
@@ -307,10 +287,12 @@ class Scenario:
             expected = f"{plants.counted_components(self.plant, self.plant.n)}, as the plant has"
             raise checks.fail("Scenario.model", got, expected)
         law = unwrapped(self.controller)
-        if self.context.level_bounds(2) is None and law.needs_velocity_bounds:
+        if self.bounds[1] is None and law.needs_velocity_bounds:
             expected = f"the bounds that {type(law).__name__} keeps"
-            remedy = "Such as velocity_bounds=Bounds(lower=Constant(-1.0), upper=Constant(1.0))."
-            raise checks.fail("Scenario.velocity_bounds", None, expected, remedy)
+            remedy = (
+                "Such as bounds=(positions, Bounds(lower=Constant(-1.0), upper=Constant(1.0)))."
+            )
+            raise checks.fail("Scenario.bounds[1]", None, expected, remedy)
         if self.sampling is None and not isinstance(self.sensor, IdealSensor):
             got, expected = type(self.sensor).__name__, "an Ideal sensor where no law is sampled"
             remedy = "Add sampling=ij.Sampling(period=...): a sensor is read once a period."
@@ -332,8 +314,14 @@ class Scenario:
                 robot = plants.robot_of(part)
                 if robot is None:
                     expected = "no regions, as this plant has no points in space"
-                    raise checks.fail(name, region, expected, "Use bounds or state_bounds.")
+                    raise checks.fail(name, region, expected, "Use bounds.")
                 _check_region(name, region, robot)
+
+    def symbols_of_part(self, field: str, index: int, symbols: Any) -> Any:
+        """The units of the symbols in a part: bounds have the unit of their level."""
+        if field != "bounds":
+            return symbols
+        return {**symbols, "x1": symbols[f"x{index + 1}"]}
 
     @property
     def loop(self) -> Loop:
@@ -356,14 +344,10 @@ class Scenario:
         them, (m,) [s], unsorted.
         """
         parts: dict[str, Any] = {"plant": self.plant, "reference": self.reference}
-        for name, bounds in (("bounds", self.bounds), ("velocity_bounds", self.velocity_bounds)):
+        for i, bounds in enumerate(self.bounds):
             if bounds is not None:
-                parts[f"{name}.lower"] = bounds.lower
-                parts[f"{name}.upper"] = bounds.upper
-        for i, bounds in enumerate(self.state_bounds):
-            if bounds is not None:
-                parts[f"state_bounds[{i}].lower"] = bounds.lower
-                parts[f"state_bounds[{i}].upper"] = bounds.upper
+                parts[f"bounds[{i}].lower"] = bounds.lower
+                parts[f"bounds[{i}].upper"] = bounds.upper
         for i, law in enumerate(layers(self.controller)):
             parts[f"controller[{i}]"] = law
         parts["observer"] = self.observer
@@ -375,14 +359,7 @@ class Scenario:
     @property
     def context(self) -> LawContext:
         """The information of the law: model, reference, bounds and regions."""
-        return LawContext(
-            self.model,
-            self.reference,
-            self.bounds,
-            self.velocity_bounds,
-            self.regions,
-            self.state_bounds,
-        )
+        return LawContext(self.model, self.reference, self.bounds, self.regions)
 
     def _repr_html_(self) -> str:
         return present("card", self)
@@ -566,9 +543,9 @@ def with_parts(scenario: Scenario, **parts: Any) -> Scenario:
     Args:
       scenario: the original; it stays as it is.
       parts: any of plant, model, robot, reference, bounds, controller, observer, disturbance,
-        initial, sampling, sensor, actuator, velocity_bounds, regions, process_noise; each as
-        `Scenario` takes it, so that a scalar stands for one number per joint.  Numbers take the
-        scenario's floating-point type.
+        initial, sampling, sensor, actuator, regions, process_noise; each as `Scenario` takes it, so
+        that a scalar stands for one number per joint.  A single `Bounds` replaces that of the first
+        level and keeps the others.  Numbers take the scenario's floating-point type.
 
     Returns:
       A new Scenario; it runs like any other, and compiles where the structure is new.
@@ -584,7 +561,10 @@ def with_parts(scenario: Scenario, **parts: Any) -> Scenario:
         if name not in names:
             remedy = f"{checks.nearest(name, names)} Leaves change by ij.with_parameters.".strip()
             raise checks.fail("part", name, f"the name of a part: {', '.join(names)}", remedy)
-    new = dataclasses.replace(scenario, **_with_both_robots(scenario, parts))
+    parts = _with_both_robots(scenario, parts)
+    if isinstance(parts.get("bounds"), Bounds):
+        parts = {**parts, "bounds": (parts["bounds"], *scenario.bounds[1:])}
+    new = dataclasses.replace(scenario, **parts)
     dtype = _shared_dtype(scenario)
     if _shared_dtype(new) == dtype:
         return new
@@ -867,14 +847,14 @@ def _initial_values(scenario: Scenario) -> _InitialValues:
     """
     n, q, dq = scenario.n, scenario.initial.q, scenario.initial.dq
     t, plant, model = jnp.zeros((), q.dtype), scenario.plant, scenario.model
-    reference, velocity_bounds = scenario.reference, scenario.velocity_bounds
+    reference, (positions, velocities, *_) = scenario.reference, scenario.bounds
     q_d = _shaped("reference.position(t)", partial(reference.position, t), n)
 
     def limit(name: str, side: Side) -> jax.Array:
         return _shaped(name, partial(side.at, t, q_d), n)
 
-    lower = limit("bounds.lower.at(t, q_d)", scenario.bounds.lower)
-    upper = limit("bounds.upper.at(t, q_d)", scenario.bounds.upper)
+    lower = limit("bounds[0].lower.at(t, q_d)", positions.lower)
+    upper = limit("bounds[0].upper.at(t, q_d)", positions.upper)
     parts: dict[str, Any] = {"plant": plant, "model": model}
     for name, part in parts.items():
         robot = plants.robot_of(part)
@@ -889,10 +869,10 @@ def _initial_values(scenario: Scenario) -> _InitialValues:
     torque = partial(scenario.disturbance.torque, t, q, dq, *disturbed)
     _shaped("disturbance.torque(t, q, dq, plant, model)", torque, n)
     speed_limits = None
-    if velocity_bounds is not None:
-        limit("velocity_bounds.lower.at(t, dq_d)", velocity_bounds.lower)
-        limit("velocity_bounds.upper.at(t, dq_d)", velocity_bounds.upper)
-        speed_limits = speed_limits_at(reference, velocity_bounds, t)
+    if velocities is not None and has_speed_limits(scenario):
+        limit("bounds[1].lower.at(t, dq_d)", velocities.lower)
+        limit("bounds[1].upper.at(t, dq_d)", velocities.upper)
+        speed_limits = speed_limits_at(reference, velocities, t)
     margins = q[:0]
     if scenario.regions:
         margins = regions.margins(scenario.regions, plants.robot_of(plant), q)
@@ -927,13 +907,15 @@ def _check_start(scenario: Scenario) -> None:
     """
     start = jax.tree.map(np.asarray, _initial_values(scenario))
     q, dq = np.asarray(scenario.initial.q), np.asarray(scenario.initial.dq)
-    finite = {"reference": start.q_d, "bounds.lower": start.lower, "bounds.upper": start.upper}
+    finite = {"reference": start.q_d, "bounds[0].lower": start.lower}
+    finite["bounds[0].upper"] = start.upper
     for name, values in finite.items():
         if not np.all(np.isfinite(values)):
             raise checks.fail(name, values, "finite values at t = 0")
     noun = plants.component_noun(scenario.plant)
-    _check_order(f"bounds of {noun}", start.lower, start.upper, scenario.bounds)
-    remedy = _funnel_remedy(scenario.bounds)
+    positions: Any = scenario.bounds[0]
+    _check_order(f"bounds of {noun}", start.lower, start.upper, positions)
+    remedy = _funnel_remedy(positions)
     remedy = remedy or "Move the reference or widen the bounds (Assumption 2)."
     _check_inside(
         f"reference of {noun} {{}}", "bounds", start.q_d, start.lower, start.upper, remedy
@@ -942,7 +924,7 @@ def _check_start(scenario: Scenario) -> None:
     _check_inside("initial.q[{}]", "bounds", q, start.lower, start.upper, remedy)
     if start.speed_limits is not None:
         slowest, fastest = start.speed_limits
-        _check_order("velocity_bounds of joint", slowest, fastest, scenario.velocity_bounds)
+        _check_order("bounds[1] of joint", slowest, fastest, scenario.bounds[1])
         _check_inside("initial.dq[{}]", "velocity bounds", dq, slowest, fastest, remedy)
     for region, margin in zip(scenario.regions, start.region_margins, strict=True):
         if not margin > 0:
@@ -974,19 +956,19 @@ def _check_levels_at_start(scenario: Scenario) -> None:
     t = jnp.zeros((), x.dtype)
     if not np.all(np.isfinite(x)):
         raise checks.fail("initial.x", x, "finite levels at the start")
-    for i, bounds in enumerate(scenario.state_bounds):
+    for i, bounds in enumerate(scenario.bounds[1:], start=1):
         if bounds is None:
             continue
         lower, upper = (np.asarray(side) for side in bounds_at(bounds, t, jnp.zeros_like(x[0])))
         if isinstance(bounds.lower, Funnel) or isinstance(bounds.upper, Funnel):
             continue  # around alpha, which the law computes
         noun = plants.component_noun(scenario.plant)
-        _check_order(f"state_bounds[{i}] of {noun}", lower, upper, bounds)
+        _check_order(f"bounds[{i}] of {noun}", lower, upper, bounds)
         remedy = "Move the start or widen the bounds."
-        if i == 0 and not np.any(x[1]):
+        if i == 1 and not np.any(x[1]):
             remedy = f"{remedy} {WITHOUT_DQ}"
-        level = f"initial.x[{i + 1}][{{}}]"
-        _check_inside(level, f"bounds of level {i + 2}", np.asarray(x[i + 1]), lower, upper, remedy)
+        level = f"initial.x[{i}][{{}}]"
+        _check_inside(level, f"bounds of level {i + 1}", np.asarray(x[i]), lower, upper, remedy)
     parts: dict[str, Any] = {"plant": scenario.plant, "model": scenario.model}
     for name, plant in parts.items():
         if plants.is_chain(plant):

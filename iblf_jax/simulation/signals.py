@@ -10,7 +10,6 @@ import jax.numpy as jnp
 from jax import Array
 
 from iblf_jax.core.units import (
-    HIGHER,
     INPUT,
     LAST_LEVEL,
     LEVELS,
@@ -31,30 +30,31 @@ class Recorded(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Signals:
-    """The recorded signals.  At an instant vectors are (n,); the time axis of a run comes first."""
+    """The recorded signals.  At an instant vectors are (n,), and signals of the levels have one row
+    a level; the time axis of a run comes first.
+    """
 
     t: Annotated[Array, Recorded("s", "time")]
-    q: Annotated[Array, Recorded(POSITION, "joint position")]
-    dq: Annotated[Array, Recorded(VELOCITY, "joint velocity")]
+    x: Annotated[Array, Recorded(LEVELS, "levels of the state")]
+    """(r, n); of a robot q and q'."""
     tau: Annotated[Array, Recorded(INPUT, "applied torque")]
-    e1: Annotated[Array, Recorded(POSITION, "position error q - q_d")]
-    e2: Annotated[Array, Recorded(VELOCITY, "velocity error dq - alpha")]
+    e: Annotated[Array, Recorded(LEVELS, "errors of the levels")]
+    """e_1 = x_1 - q_d and e_i = x_i - alpha_{i-1}, (r, n); (2, n) under a law of robots."""
     xi: Annotated[Array, Recorded("1", "position error relative to its bound")]
     """Inside the bounds if |xi| < 1."""
     q_d: Annotated[Array, Recorded(POSITION, "reference position")]
     dq_d: Annotated[Array, Recorded(VELOCITY, "reference velocity")]
-    lower: Annotated[Array, Recorded(POSITION, "lower bound of q")]
-    upper: Annotated[Array, Recorded(POSITION, "upper bound of q")]
+    level_lower: Annotated[Array, Recorded(LEVELS, "lower bounds of the levels")]
+    """Up to the last level with bounds, -infinity for one without."""
+    level_upper: Annotated[Array, Recorded(LEVELS, "upper bounds of the levels")]
     alpha: Annotated[Array, Recorded(VELOCITY, "virtual velocity")]
+    """The virtual control of the second level; those of others are x_i - e_i."""
     disturbance: Annotated[Array, Recorded(UNCERTAIN, "lumped uncertain term f")]
     """Of (2.1)."""
     disturbance_estimate: Annotated[Array, Recorded(UNCERTAIN, "estimate of the uncertain term")]
     V: Annotated[Array, Recorded("1", "Lyapunov function V2")]
     """Of (3.12), ()."""
     _: dataclasses.KW_ONLY
-    dq_lower: Annotated[Any, Recorded(VELOCITY, "lower bound of dq")] = ()
-    """`()` where velocities have no bounds."""
-    dq_upper: Annotated[Any, Recorded(VELOCITY, "upper bound of dq")] = ()
     slack: Annotated[
         Any, Recorded(PlantUnit("rad/s^2", "x2/s"), "violation of the safety filter's conditions")
     ] = ()
@@ -73,15 +73,78 @@ class Signals:
     """`()` under laws without one."""
     events: Annotated[Any, Recorded("1", "number of commands that the event trigger has sent")] = ()
     """(); `()` without an event trigger."""
-    higher: Annotated[Any, Recorded(HIGHER, "levels of the state from the third on")] = ()
-    """One row a level; `()` for robots."""
-    e_higher: Annotated[Any, Recorded(HIGHER, "errors x_i - alpha_{i-1} of these levels")] = ()
-    """`()` for robots, and under laws without virtual controls for these levels."""
-    higher_lower: Annotated[Any, Recorded(HIGHER, "lower bounds of these levels")] = ()
-    """-infinity for a level without bounds; `()` where none has bounds."""
-    higher_upper: Annotated[Any, Recorded(HIGHER, "upper bounds of these levels")] = ()
     x_hat: Annotated[Any, Recorded(LEVELS, "levels that the law received")] = ()
     """One row a level; `()` without an observer that estimates levels."""
+
+    @property
+    def q(self) -> Array:
+        """The first level, (n,)."""
+        return self.x[..., 0, :]
+
+    @property
+    def dq(self) -> Array:
+        """The second level, (n,)."""
+        return self.x[..., 1, :]
+
+    @property
+    def e1(self) -> Array:
+        """The error of the first level, (n,)."""
+        return self.e[..., 0, :]
+
+    @property
+    def e2(self) -> Array:
+        """The error of the second level, (n,)."""
+        return self.e[..., 1, :]
+
+    @property
+    def lower(self) -> Array:
+        """The lower bound of the first level, (n,)."""
+        return self.level_lower[..., 0, :]
+
+    @property
+    def upper(self) -> Array:
+        """The upper bound of the first level, (n,)."""
+        return self.level_upper[..., 0, :]
+
+    @property
+    def dq_lower(self) -> Any:
+        """The lower bound of the second level, (n,); `()` where only the first level has bounds."""
+        return self.level_lower[..., 1, :] if has_bounds_above(self) else ()
+
+    @property
+    def dq_upper(self) -> Any:
+        """As `dq_lower`."""
+        return self.level_upper[..., 1, :] if has_bounds_above(self) else ()
+
+
+def has_bounds_above(sample: Signals) -> bool:
+    """Whether a level above the first has bounds."""
+    return sample.level_lower.shape[-2] > 1
+
+
+FIELDS = tuple(field.name for field in dataclasses.fields(Signals))
+"""What a run records."""
+
+
+class View(NamedTuple):
+    """A row of a signal of the levels that has a name of its own."""
+
+    signal: str
+    row: int
+    recorded: Recorded
+
+
+VIEWS = {
+    "q": View("x", 0, Recorded(POSITION, "joint position")),
+    "dq": View("x", 1, Recorded(VELOCITY, "joint velocity")),
+    "e1": View("e", 0, Recorded(POSITION, "position error q - q_d")),
+    "e2": View("e", 1, Recorded(VELOCITY, "velocity error dq - alpha")),
+    "lower": View("level_lower", 0, Recorded(POSITION, "lower bound of q")),
+    "upper": View("level_upper", 0, Recorded(POSITION, "upper bound of q")),
+    "dq_lower": View("level_lower", 1, Recorded(VELOCITY, "lower bound of dq")),
+    "dq_upper": View("level_upper", 1, Recorded(VELOCITY, "upper bound of dq")),
+}
+"""Properties of `Signals` -> what they show."""
 
 
 @jax.tree_util.register_dataclass
@@ -108,14 +171,9 @@ class Sample(Signals):
     """`x_hat` less the levels at the instant at which the law ran, (r, n); `()` without it."""
     limit_excess: Any = dataclasses.field(default=(), kw_only=True)
     """Positive where a limit of an observer's estimates is active, () [1]; `()` without limits."""
-    q_sides: Any = dataclasses.field(default=(), kw_only=True)
-    """Smallest distances of q to its lower and its upper bound since the instant before, (2, n),
-    where process noise acts on the first level (`noise.least_distances`); `()` elsewhere, as in the
-    two fields below."""
-    dq_sides: Any = dataclasses.field(default=(), kw_only=True)
-    """The same of dq, (2, n)."""
-    higher_sides: Any = dataclasses.field(default=(), kw_only=True)
-    """The same of the levels from the third on, (2, r - 2, n)."""
+    sides: Any = dataclasses.field(default=(), kw_only=True)
+    """Smallest distances of the levels to their lower and their upper bounds since the instant
+    before, (2, m, n), under process noise (`noise.least_distances`); `()` without."""
 
 
 def has(sample: Signals, signal: str) -> bool:
@@ -125,45 +183,51 @@ def has(sample: Signals, signal: str) -> bool:
     return not isinstance(getattr(sample, signal), tuple)
 
 
-def least_position_margin(sample: Sample) -> Array:
-    """Smallest distance of the positions to the nearer of their bounds since the instant before,
-    (n,): that at the instant where no noise acts on them.
+def least_margin(sample: Sample, level: int) -> Array:
+    """Smallest distance of a level, counted from 1, to the nearer of its bounds since the instant
+    before, (n,): that at the instant where no noise acts.
     """
-    if has(sample, "q_sides"):
-        return jnp.minimum(sample.q_sides[0], sample.q_sides[1])
-    return jnp.minimum(sample.q - sample.lower, sample.upper - sample.q)
+    i = level - 1
+    if has(sample, "sides"):
+        return jnp.minimum(sample.sides[0, i], sample.sides[1, i])
+    return margin_of(sample, level, sample.x[i])
 
 
 def least_xi_margin(sample: Sample) -> Array:
-    """The same distance relative to that of the reference to the bound, 1 - |xi|, (n,) [1]."""
-    if has(sample, "q_sides"):
+    """The same distance of the first level, relative to that of the reference to the bound,
+    1 - |xi|, (n,) [1].
+    """
+    if has(sample, "sides"):
         below, above = sample.q_d - sample.lower, sample.upper - sample.q_d
-        return jnp.minimum(sample.q_sides[0] / below, sample.q_sides[1] / above)
+        return jnp.minimum(sample.sides[0, 0] / below, sample.sides[1, 0] / above)
     return 1.0 - jnp.abs(sample.xi)
 
 
-def least_speed_margin(sample: Sample) -> Array:
-    """As `least_position_margin`, of the velocities."""
-    if has(sample, "dq_sides"):
-        return jnp.minimum(sample.dq_sides[0], sample.dq_sides[1])
-    return speed_margin(sample, sample.dq)
+def margin_of(sample: Sample, level: int, value: Array) -> Array:
+    """Distance of a value to the nearer of the bounds of a level, counted from 1, (n,)."""
+    i = level - 1
+    return jnp.minimum(value - sample.level_lower[i], sample.level_upper[i] - value)
 
 
-def least_level_margin(sample: Sample) -> Array:
-    """As `least_position_margin`, of the levels from the third on, (r - 2, n)."""
-    if has(sample, "higher_sides"):
-        return jnp.minimum(sample.higher_sides[0], sample.higher_sides[1])
-    return level_margin(sample, sample.higher)
+def least_margins_above(sample: Sample) -> Array:
+    """`least_margin` of the levels from the third to the last one with bounds, (m, n)."""
+    levels = range(3, len(sample.level_lower) + 1)
+    return jnp.stack([least_margin(sample, level) for level in levels])
 
 
-def level_margin(sample: Sample, levels: Array) -> Array:
-    """Distances of levels from the third on to the nearer of their bounds, (r - 2, n)."""
-    return jnp.minimum(levels - sample.higher_lower, sample.higher_upper - levels)
+def alpha_margins_above(sample: Sample) -> Array | None:
+    """`margin_of` the virtual controls for these levels, (m, n); None under a law without."""
+    levels = range(3, len(sample.level_lower) + 1)
+    _, *alphas = virtual_controls(sample)
+    if not alphas:
+        return None
+    return jnp.stack([margin_of(sample, *pair) for pair in zip(levels, alphas, strict=False)])
 
 
-def speed_margin(sample: Sample, velocity: Array) -> Array:
-    """Distance of a velocity to the nearer of its bounds, (n,) [rad/s]."""
-    return jnp.minimum(velocity - sample.dq_lower, sample.dq_upper - velocity)
+def virtual_controls(sample: Sample) -> list[Array]:
+    """alpha_1, alpha_2, ..., (n,) each, as many as the law has."""
+    higher = sample.x[2 : len(sample.e)] - sample.e[2:]
+    return [sample.alpha, *higher]
 
 
 PER_REGION = ("region_margin", "region_slack", "largest_region_slack")
@@ -172,19 +236,16 @@ PER_LEVEL = (
     "disturbance",
     "disturbance_estimate",
     "estimate_rmse",
+    "x",
+    "e",
+    "level_lower",
+    "level_upper",
     "x_hat",
     "peak_level_error",
 )
 """Signals and metrics with one row per level: the estimates of levels of every model, and the
 others of a model in strict-feedback form."""
-PER_HIGHER_LEVEL = (
-    "higher",
-    "e_higher",
-    "higher_lower",
-    "higher_upper",
-    "level_margin",
-    "level_alpha_margin",
-)
+PER_HIGHER_LEVEL = ("level_margin", "level_alpha_margin")
 """Signals and metrics with one row per level from the third on."""
 
 
@@ -205,8 +266,11 @@ def dimension_names(name: str, shape: tuple[int, ...], joints: int) -> tuple[str
 
 
 SIGNALS: dict[str, Recorded] = {
-    name: hint.__metadata__[0]
-    for name, hint in get_type_hints(Signals, include_extras=True).items()
-    if name != "_"
+    **{
+        name: hint.__metadata__[0]
+        for name, hint in get_type_hints(Signals, include_extras=True).items()
+        if name in FIELDS
+    },
+    **{name: view.recorded for name, view in VIEWS.items()},
 }
-"""Name of a recorded signal -> its unit and meaning, time first."""
+"""Name of a signal -> its unit and meaning, time first."""

@@ -41,6 +41,7 @@ from iblf_jax.simulation.closed_loop import (
     perturbed_rate,
     perturbed_state,
 )
+from iblf_jax.simulation.levels import has_speed_limits
 from iblf_jax.simulation.scenario import Scenario
 
 POWER_ITERATIONS, AVERAGED_STEPS = 48, 16
@@ -161,7 +162,7 @@ def largest_difference_sizes(
     tube = scenario.context.tube(t, acceleration=False)
     side = jnp.minimum(plant.q - tube.lower, tube.upper - plant.q)
     near = [jnp.clip(MAX_BOUND_FRACTION * side, 0.0, THIRD_SIZE_OF_POSITION)]
-    if scenario.velocity_bounds is not None:
+    if has_speed_limits(scenario):
         slow, fast = scenario.context.speed_limits(t)
         side = jnp.minimum(plant.dq - slow, fast - plant.dq)
         near.append(jnp.clip(MAX_BOUND_FRACTION * side, 0.0, THIRD_SIZE))

@@ -5,7 +5,9 @@ The loop's own state is a pytree, and contains an empty tuple for a law without 
 solvers do not accept (diffrax: "Only arrays can be treated as buffers"). Here its numbers are
 concatenated in the order of `iblf_jax.simulation.closed_loop.LoopState`:
 
-    x = (q, q', state of the law, state of the observer, state of the actuator),   (m,)
+    x = (state of the plant, of the law, of the observer, of the actuator),   (m,)
+
+The state of a robot is q, then q'.
 
 `VectorField.names` names the entries; `unpack` and `pack` convert between the two forms.
 """
@@ -86,8 +88,8 @@ class VectorField:
         for path, leaf in jax.tree_util.tree_leaves_with_path(_layout(self.scenario)):
             name = jax.tree_util.keystr(path).lstrip(".")
             for index in np.ndindex(leaf.shape):
-                if name == "higher":
-                    found.append(f"x[{index[0] + 2}, {index[1]}]")
+                if name == "x" and index[0] < 2:
+                    found.append(f"{('q', 'dq')[index[0]]}[{index[1]}]")
                     continue
                 entry = ", ".join(map(str, index))
                 found.append(f"{name}[{entry}]" if index else name)
@@ -97,8 +99,8 @@ class VectorField:
         """The flat vector of a state.
 
         Args:
-          state: q [rad], dq [rad/s], and the states of law and observer, with the same leading axes
-            each, or none.
+          state: x, (r, n), and the states of law and observer, with the same leading axes each, or
+            none.
 
         Returns:
           (..., m).
@@ -109,15 +111,15 @@ class VectorField:
         return _pack(self.scenario, state)
 
     def unpack(self, x: Any) -> LoopState:
-        """Position, velocity and the states of law and observer from flat vectors: of one instant,
-        or of a trajectory.
+        """The states of plant, law and observer from flat vectors: of one instant, or of a
+        trajectory.
 
         Args:
           x: (..., m); SciPy's `solution.y` has time last, so give `solution.y.T`.
 
         Returns:
-          `iblf_jax.simulation.closed_loop.LoopState`: q (..., n) [rad], dq (..., n) [rad/s], and
-          the states of law and observer, leading axes first.
+          `iblf_jax.simulation.closed_loop.LoopState`: x (..., r, n), with q and dq of it, and the
+          states of law and observer, leading axes first.
 
         Raises:
           ValueError: another last axis.
@@ -145,7 +147,7 @@ def vector_field(scenario: Scenario) -> VectorField:
     """The closed loop of a scenario for solvers of other libraries: a function of time and of one
     flat state.
 
-        x' = field(t, x),   x(0) = field.start,   x = (q, q', state of the law, state of the
+        x' = field(t, x),   x(0) = field.start,   x = (state of the plant, of the law, of the
         observer)
 
     It takes (t, x) for SciPy and (t, x, args) for diffrax, works under `jit`, `vmap`, `grad` and

@@ -73,19 +73,21 @@ def initial_margins(scenario: Scenario, samples: Mapping[str, Any]) -> dict[str,
 def _initial_margins(scenario: Scenario, samples: Mapping[str, Any]) -> dict[str, jax.Array]:
     def margins_of_run(drawn: Mapping[str, Any]) -> dict[str, jax.Array]:
         perturbed = with_parameters(scenario, drawn)
-        q, dq = perturbed.initial.q, perturbed.initial.dq
+        q = perturbed.initial.q
         zero = jnp.zeros((), q.dtype)
-        tube = tube_at(perturbed.reference, perturbed.bounds, zero)
+        tube = tube_at(perturbed.reference, perturbed.bounds[0], zero)
         found = {LEVELS[0]: jnp.minimum(q - tube.lower, tube.upper - q)}
-        if perturbed.velocity_bounds is not None:
-            low, high = perturbed.context.speed_limits(zero)
-            found[LEVELS[1]] = jnp.minimum(dq - low, high - dq)
-        for i, bounds in enumerate(perturbed.state_bounds):
-            if bounds is None or Funnel in (type(bounds.lower), type(bounds.upper)):
+        x = start_levels(perturbed)
+        for i, bounds in enumerate(perturbed.bounds[1:], start=1):
+            if bounds is None:
                 continue
-            x = start_levels(perturbed)[i + 1]
-            low, high = bounds_at(bounds, zero, jnp.zeros_like(x))
-            found[LEVELS[i + 1]] = jnp.minimum(x - low, high - x)
+            if i < perturbed.loop.plant.reference_levels:
+                low, high = perturbed.context.speed_limits(zero)
+            elif Funnel in (type(bounds.lower), type(bounds.upper)):
+                continue  # around alpha, which the law computes
+            else:
+                low, high = bounds_at(bounds, zero, jnp.zeros_like(x[i]))
+            found[LEVELS[i]] = jnp.minimum(x[i] - low, high - x[i])
         if perturbed.regions:
             found[REGIONS] = margins(perturbed.regions, plants.robot_of(perturbed.plant), q)
         return found

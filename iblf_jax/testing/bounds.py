@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.control.controllers._base import law_of_x
-from iblf_jax.simulation.levels import levels_on_reference, start_levels
+from iblf_jax.simulation.levels import has_speed_limits, levels_on_reference, start_levels
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.testing._contract import Findings
 
@@ -47,7 +47,7 @@ def check_at_the_bounds(findings: Findings, scenario: Scenario) -> bool:
     """
     infinite = _infinite_in_e2(findings, scenario)
     everywhere = _swept(findings, scenario, "xi", infinite)
-    if scenario.velocity_bounds is None:
+    if not has_speed_limits(scenario):
         return everywhere
     return _swept(findings, scenario, "xi of the velocity", infinite) and everywhere
 
@@ -150,7 +150,7 @@ def _at_points(scenario: Scenario, axis: str) -> Points:
             law, context, t = scenario.controller, scenario.context, jnp.asarray(TIME)
             tube = context.tube(t)
             q, dq = levels_on_reference(scenario, t)[:2]
-            limits: Any = () if scenario.velocity_bounds is None else context.speed_limits(t)
+            limits: Any = context.speed_limits(t) if has_speed_limits(scenario) else ()
             if axis == "xi":
                 q = tube.q_d + xi * jnp.where(xi > 0, tube.k_u, tube.k_l)
             else:

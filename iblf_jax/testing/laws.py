@@ -67,13 +67,13 @@ def check_law(
     check_scenario(scenario, n)
     with examine(law, "TrackingLaw", contract_of(law)) as findings:
         base = in_dtype(scenario_for(findings, law, scenario, n), "float64")
-        speeds = base.velocity_bounds
-        if speeds is None and unwrapped(law).needs_velocity_bounds:
-            speeds = Bounds(lower=Constant(-SPEED), upper=Constant(SPEED))
+        bounds = base.bounds
+        if bounds[1] is None and unwrapped(law).needs_velocity_bounds:
+            bounds = (bounds[0], Bounds(lower=Constant(-SPEED), upper=Constant(SPEED)))
         plant = law.drive if isinstance(law, WithDrive) else base.plant
         try:
             base = dataclasses.replace(
-                base, controller=law, velocity_bounds=speeds, plant=plant, model=base.model
+                base, controller=law, bounds=bounds, plant=plant, model=base.model
             )
             base = in_dtype(base, "float64")
             unwrapped(law).check_start(base.context)

@@ -82,27 +82,25 @@ def samples(rng: np.random.Generator, n: int = 2, step: float = 0.01) -> Sample:
         )
 
     q_d, e1, tau = 0.5 + wave(0.1), wave(0.2), wave(5.0)
-    names = ("dq", "e2", "dq_d", "alpha", "disturbance", "disturbance_estimate", "gravity")
+    dq, e2 = wave(1.0), wave(1.0)
+    names = ("dq_d", "alpha", "disturbance", "disturbance_estimate", "gravity")
     signals = {name: wave(1.0) for name in names}
-    lower, upper = np.full((LENGTH, n), 0.2), np.full((LENGTH, n), 0.85)
+    lower, upper = (
+        np.broadcast_to(np.array(rows)[:, None], (LENGTH, 3, n))
+        for rows in ((0.2, -0.9, -0.9), (0.85, 1.1, 1.1))
+    )
     signals |= {
         "slack": np.abs(wave(0.1)),
-        "dq_lower": np.full((LENGTH, n), -0.9),
-        "dq_upper": np.full((LENGTH, n), 1.1),
-        "higher": wave(1.0)[:, None],
-        "e_higher": wave(0.2)[:, None],
-        "higher_lower": np.full((LENGTH, 1, n), -0.9),
-        "higher_upper": np.full((LENGTH, 1, n), 1.1),
+        "x": np.stack([q_d + e1, dq, wave(1.0)], axis=1),
+        "e": np.stack([e1, e2, wave(0.2)], axis=1),
+        "level_lower": lower,
+        "level_upper": upper,
         "x_hat": np.stack([wave(0.2), wave(1.0)], axis=1),
         "level_error": np.stack([wave(0.01), wave(0.1)], axis=1),
         "limit_excess": wave(1.0)[:, 0],
         "region_margin": 0.3 + wave(0.2)[:, :REGIONS],
         "region_slack": np.abs(wave(0.1))[:, :REGIONS],
-        "lower": lower,
-        "upper": upper,
-        "q": q_d + e1,
-        "e1": e1,
-        "xi": e1 / np.where(e1 > 0, upper - q_d, q_d - lower),
+        "xi": e1 / np.where(e1 > 0, upper[:, 0] - q_d, q_d - lower[:, 0]),
         "q_d": q_d,
         "tau": tau,
         "V": np.abs(wave(1.0))[:, 0],
@@ -111,7 +109,7 @@ def samples(rng: np.random.Generator, n: int = 2, step: float = 0.01) -> Sample:
         "step": since,
     }
     signals["events"] = 1.0 + np.floor(np.sqrt(index))  # intervals that differ
-    signals["auxiliary"] = 0.1 * np.cos(angle) * signals["e2"]
+    signals["auxiliary"] = 0.1 * np.cos(angle) * e2
     for name in ("guard_active", "saturated"):
         signals[name] = rng.uniform(size=(LENGTH, n)) < 0.3
     return Sample(**jax.tree.map(jnp.asarray, signals))
@@ -148,9 +146,12 @@ def accumulates(findings: Findings, fold: Any, sample: Any) -> Any:
 
 def at_rest(findings: Findings, fold: Any, samples: Sample) -> None:
     """Requires that no result and no derivative is NaN on a run without errors and torques."""
-    kept = {name: vars(samples)[name] for name in ("t", "dt", "step", "lower", "upper", "q_d")}
+    kept = {
+        name: vars(samples)[name]
+        for name in ("t", "dt", "step", "level_lower", "level_upper", "q_d")
+    }
     zeros = jax.tree.map(jnp.zeros_like, samples)
-    numbers, flags = parts(dataclasses.replace(zeros, q=samples.q_d, **kept))
+    numbers, flags = parts(dataclasses.replace(zeros, x=zeros.x.at[:, 0].set(samples.q_d), **kept))
 
     @jax.jit
     def both(fold, numbers):

@@ -652,7 +652,7 @@ def velocity_margin(
     target: Any = 0.05, *, sharpness: Any = 5.0, smoothing: Any = 0.02, joints: Any = None
 ) -> Objective:
     """Soft penalty on a margin to the velocity bounds below a target; as `margin`, in rad/s, for
-    scenarios with `velocity_bounds`.
+    scenarios with bounds of the second level.
     """
     return _soft(
         "velocity_margin", "velocity_deficit", target, "0.05", sharpness, smoothing, joints
@@ -738,7 +738,7 @@ def margin_above(limit: Any, *, allowed: Any = 0.01, joints: Any = None) -> Requ
 
 def velocity_margin_above(limit: Any, *, allowed: Any = 0.01, joints: Any = None) -> Requirement:
     """Minimum over time and joints of min(q' - v_l, v_u - q') > limit [rad/s], for scenarios with
-    `velocity_bounds`; as `margin_above`.
+    bounds of the second level; as `margin_above`.
     """
     return _requirement("velocity_margin_above", "velocity_deficit", limit, "0.05", allowed, joints)
 

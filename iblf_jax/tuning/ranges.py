@@ -122,7 +122,7 @@ PERIOD = "sampling.period"
 DELAY = "sampling.delay"
 FREQUENCY = re.compile(r"(sensor|actuator)\..*?(cutoff|bandwidth)(\[\d+\])*$")
 """Paths of cut-off frequencies and bandwidths."""
-LEVEL_BOUND = re.compile(r"state_bounds\[(\d+)\]\.(lower|upper)\.value((?:\[\d+\])*)$")
+LEVEL_BOUND = re.compile(r"bounds\[([1-9]\d*)\]\.(lower|upper)\.value((?:\[\d+\])*)$")
 """Paths of constant bounds of the levels above the first."""
 
 SMOOTHING = re.compile(r"controller\.(law\.)*decays\[\d+\]\.(a|delta)(\[\d+\])*$")
@@ -244,7 +244,7 @@ def _is_of_chain(scenario: Scenario, path: str) -> bool:
 def _bound_at_start(scenario: Scenario, path: str, start: np.ndarray) -> End:
     """The end of the range of a constant bound of a level towards the start of the level."""
     found: Any = LEVEL_BOUND.match(path)
-    level = np.asarray(start_levels(scenario))[int(found[1]) + 1]
+    level = np.asarray(start_levels(scenario))[int(found[1])]
     for entry in re.findall(r"\d+", found[3]):
         level = level[int(entry)]
     return End(level + LEAST_SHARE * (start - level), BY_LEVEL)
@@ -446,6 +446,5 @@ def _command_steps(scenario: Scenario, times: jax.Array) -> tuple[jax.Array, jax
 def _with_levels_of_sensor(state: LoopState, y: jax.Array) -> LoopState:
     """The state with other levels, (r, n), or with another q, (n,), as the sensor receives them."""
     if y.ndim == 1:
-        return state._replace(q=y)
-    higher = y[2:] if len(y) > 2 else ()
-    return state._replace(q=y[0], dq=y[1], higher=higher)
+        return state._replace(x=state.x.at[0].set(y))
+    return state._replace(x=y)

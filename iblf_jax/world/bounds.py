@@ -1,8 +1,7 @@
 """Bounds on joint positions, k_lc(t) < q < k_uc(t), and the tube that they form around the
 reference.  Bounds on joint velocities, and on the levels of a plant in strict-feedback form, have
-the same form: `Scenario.bounds` are those of q or of the first level x_1, and `state_bounds` those
-of x_2 ... x_r.  The units rad and rad/s are those of a robot; the bounds of another plant have the
-unit of their level.
+the same form: `Scenario.bounds` has those of x_1, x_2, ...  The units rad and rad/s are those of
+a robot; the bounds of another plant have the unit of their level.
 
 Each side is a component: constant, sinusoidal, or a funnel that shrinks onto the reference.  The
 law uses the bounds of the error
@@ -122,8 +121,7 @@ class Bounds:
     """A lower and an upper side, each of any kind: `Bounds(lower=Constant(0.1), upper=Sinusoid(0.9,
     0.14))`.
 
-    On positions in rad; on velocities (`Scenario.velocity_bounds`) in rad/s; on a level of another
-    plant (`Scenario.state_bounds`) in the unit of the level.
+    On positions in rad, on velocities in rad/s, on a level of another plant in its unit.
 
     Args:
       lower: the lower side, any `Side`.
@@ -193,8 +191,8 @@ def from_limits(robot: Robot, *, margin: float = 0.0, unlimited: float | None = 
 def from_speed_limits(
     robot: Robot, *, share: float = 1.0, unlimited: float | None = None
 ) -> Bounds:
-    """Constant bounds on the velocities at a share of a robot's largest joint speeds, for
-    `Scenario.velocity_bounds`.
+    """Constant bounds on the velocities at a share of a robot's largest joint speeds, for the
+    second level.
 
         -share speed < q' < share speed
 

@@ -18,8 +18,6 @@ plant; on a plant without a robot it is added to the input u, in the unit of u.
 from __future__ import annotations
 
 import abc
-import dataclasses
-from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -29,7 +27,7 @@ from iblf_jax.core import checks
 from iblf_jax.core.linalg import matvec
 from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.core.time import Timed, joined, jump_times_of, no_times
-from iblf_jax.core.units import TORQUE, VELOCITY, PlantUnit, Unit
+from iblf_jax.core.units import TORQUE, VELOCITY, PlantUnit
 from iblf_jax.world.robots import Robot, momentum
 
 
@@ -280,12 +278,6 @@ class Sum(Disturbance):
         return total
 
 
-def _rate_of_level(units: Mapping[str, Unit], i: int) -> Mapping[str, Unit]:
-    """The units of the parameters of part i of `Levels`: its torque is a rate of level i + 1."""
-    rates = units["rates"]
-    return {**units, "tau": rates[i] if i < len(rates) else "1"}
-
-
 @component
 class Levels(Disturbance):
     """d_1 ... d_r of (S.1): one disturbance for each level of the plant.
@@ -300,9 +292,7 @@ class Levels(Disturbance):
         parts than levels leave the last levels undisturbed.
     """
 
-    parts: tuple[Disturbance | None, ...] = dataclasses.field(
-        metadata={"part_units": _rate_of_level}
-    )
+    parts: tuple[Disturbance | None, ...]
 
     def check(self) -> None:
         """Takes a list for a tuple; raises ValueError for a part that is not a disturbance."""
@@ -313,6 +303,11 @@ class Levels(Disturbance):
         for i, part in enumerate(self.parts):
             if part is not None:
                 checks.conforms(f"Levels.parts[{i}]", part, Disturbance)
+
+    def symbols_of_part(self, field: str, index: int, symbols: Any) -> Any:
+        """The units of the symbols in a part: its torque is a rate of its level."""
+        rates = symbols["rates"]
+        return {**symbols, "tau": rates[index] if index < len(rates) else "1"}
 
     def torque(
         self, t: jax.Array, q: jax.Array, dq: jax.Array, plant: Robot, model: Robot

@@ -72,7 +72,8 @@ def random_loops(
         batch = _rebuilt(
             batch, controller=law, observer=_rebuilt(batch.observer, kf=10 ** uniform(-3, 1.7, n))
         )
-    return batch, t, LoopState(q, dq, (), uniform(-5.0, 5.0, n) - batch.observer.kf * momentum)
+    eta = uniform(-5.0, 5.0, n) - batch.observer.kf * momentum
+    return batch, t, LoopState(jnp.stack([q, dq], axis=-2), (), eta)
 
 
 def _rebuilt(part, **changes):

@@ -92,8 +92,7 @@ def random_scenario(
         ij.Scenario(
             plant=plant,
             reference=ij.references.Sinusoid(offset=[0.2, -0.1], amplitude=[0.3, 0.2]),
-            bounds=bounds_between(*widths[0]),
-            state_bounds=tuple(bounds_between(*sides) for sides in widths[1:]),
+            bounds=tuple(bounds_between(*sides) for sides in widths),
             controller=controller,
             observer=estimator if observer else ij.observers.NoObserver(),
             disturbance=ij.disturbances.Levels(parts),
@@ -120,7 +119,6 @@ def random_states(scenario: ij.Scenario, seed: int = 0, *, nearest: float = 0.6)
         eta = ()
         if isinstance(scenario.observer, ij.observers.LevelObserver):
             eta = d_hat - scenario.observer.gain * x
-        higher = x[2:] if order > 2 else ()
-        return LoopState(x[0], x[1], (), eta, higher=higher)
+        return LoopState(x, (), eta)
 
     return t, states(t, xi, d_hat)

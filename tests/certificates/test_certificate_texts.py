@@ -89,7 +89,7 @@ def outside() -> ij.Scenario:
     return levels.double_integrator(
         law,
         reference=ij.references.Sinusoid(offset=0.0, amplitude=0.4),
-        state_bounds=(levels.between(-0.38, 0.38),),
+        bounds=(levels.between(-3.0, 3.0), levels.between(-0.38, 0.38)),
         initial=ij.Initial(x=[[0.05], [0.0]]),
     )
 

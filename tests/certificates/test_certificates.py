@@ -541,13 +541,13 @@ def test_run_that_its_scenario_does_not_reproduce_is_refused(shaken):
     run = decimated(shaken, 100)
     near = jax.tree.map(lambda x: x * (1 + 1e-13), run.observer_state)
     assert certify(
-        run.scenario, dataclasses.replace(run, q=run.q * (1 + 1e-14), observer_state=near)
+        run.scenario, dataclasses.replace(run, x=run.x * (1 + 1e-14), observer_state=near)
     ).holds
     others = {
         "K2": {"scenario": ij.with_parameters(run.scenario, {"controller.K2": 20.01})},
         "initial": {"scenario": ij.with_parameters(run.scenario, {"initial.q[0]": 0.8001})},
         "mass": {"scenario": ij.with_parameters(run.scenario, {"plant.mass[1]": 0.8501})},
-        "samples": {"dq": run.dq.at[3, 0].add(1e-3)},
+        "samples": {"x": run.x.at[3, 1, 0].add(1e-3)},
         "time": {"dt": 2 * run.dt},
         "distances": {"t": run.t.at[2].add(0.01)},
     }
@@ -608,7 +608,9 @@ def test_f_is_constant_only_where_nothing_that_changes_is_left_in_it(changes, st
     scenario = canonical(one_joint(Growing(mass=[1.3], **changes)))
     apart = dataclasses.replace(scenario, model=jax.tree.map(jnp.copy, scenario.model))
     for one in (scenario, apart):
-        seen = terms_there(one, jnp.asarray(0.15), initial_state(one)._replace(dq=jnp.array([0.3])))
+        start = initial_state(one)
+        moving = start._replace(x=start.x.at[1].set(0.3))
+        seen = terms_there(one, jnp.asarray(0.15), moving)
         assert bool(seen.steady) == steady
         assert (float(jnp.abs(seen.df[0])) < 1e-9) == steady
     other = ij.with_parameters(scenario, {"model.mass": 1.2})
@@ -1160,6 +1162,6 @@ def test_certificate_draws_itself(paper_certificate):
 
 
 def test_state_is_all_that_the_terms_need(paper_run):
-    state = LoopState(paper_run.q[7], paper_run.dq[7], (), paper_run.observer_state[7])
+    state = LoopState(paper_run.x[7], (), paper_run.observer_state[7])
     seen = jax.jit(terms_at)(paper_run.scenario, paper_run.t[7], state)
     np.testing.assert_allclose(seen.V, paper_run.V[7], rtol=1e-10)

@@ -74,7 +74,7 @@ def right_side(scenario, t, state):
         total += jnp.sum(w * (-decay - law.c[i] * s**2 + s * d_tilde[i]))
         if i == 0:
             continue
-        bounds = context.level_bounds(i + 1)
+        bounds = context.bounds[i]
 
         def value(centre, i=i, barrier=barrier, bounds=bounds):
             tube = tubes[i]._replace(
@@ -264,8 +264,7 @@ def pendulum(law=None, **parts):
     chosen = {
         "plant": PENDULUM,
         "reference": ij.references.Sinusoid(offset=0.1, amplitude=0.4),
-        "bounds": between(-0.8, 1.0),
-        "state_bounds": (between(-8.0, 9.0), between(-60.0, 60.0)),
+        "bounds": (between(-0.8, 1.0), between(-8.0, 9.0), between(-60.0, 60.0)),
         "controller": ij.controllers.BarrierBackstepping(**GAINS) if law is None else law,
         "initial": ij.Initial(x=[[0.3], [0.0], [0.0]]),
     }
@@ -592,7 +591,7 @@ def test_alpha_outside_the_bounds_of_its_level_fails():
     scenario = double_integrator(
         law,
         reference=ij.references.Sinusoid(offset=0.0, amplitude=0.4),
-        state_bounds=(between(-0.38, 0.38),),
+        bounds=(between(-3.0, 3.0), between(-0.38, 0.38)),
         initial=ij.Initial(x=[[0.05], [0.0]]),
     )
     with pytest.warns(ij.SimulationWarning):

@@ -79,7 +79,7 @@ def test_vector_field_of_a_chain_at_random_states(rng):
     y = rng.uniform(-2.0, 2.0, (40, 2))
 
     def rate_at(t, q, dq, eta, y):
-        return evaluate(scenario, t, LoopState(q, dq, (), eta, ((), (), (), y)))[0]
+        return evaluate(scenario, t, LoopState(jnp.stack([q, dq]), (), eta, ((), (), (), y)))[0]
 
     found = jax.jit(jax.vmap(rate_at))(times, q, dq, eta, y)
     for i, t in enumerate(times):

@@ -46,7 +46,7 @@ def pendulum(**changes):
         controller=adaptive,
         observer=ij.observers.NoObserver(),
         disturbance=ij.disturbances.Nothing(),
-        state_bounds=(),
+        bounds=preset.bounds[0],
     )
 
 
@@ -139,21 +139,19 @@ def random_states(scenario, rng):
     tubes = jax.vmap(scenario.context.tube)(jnp.asarray(t))
     xi = rng.uniform(-0.8, 0.8, (POINTS, scenario.n))
     q = tubes.q_d + xi * jnp.minimum(tubes.k_l, tubes.k_u)
-    dq = rng.normal(size=(POINTS, scenario.n))
-    higher = ()
-    if not isinstance(start.higher, tuple):
-        higher = jnp.asarray(rng.normal(size=(POINTS, *start.higher.shape)))
+    others = rng.normal(size=(POINTS, *start.x.shape))[:, 1:]
+    x = jnp.concatenate([q[:, None], others], axis=1)
 
     def perturbed(x):
         return jnp.asarray(x + 0.3 * rng.normal(size=(POINTS, *x.shape)))
 
     memory = jax.tree.map(perturbed, start.controller)
-    return jnp.asarray(t), LoopState(q, jnp.asarray(dq), memory, (), (), (), higher)
+    return jnp.asarray(t), LoopState(x, memory, ())
 
 
 def flat(state, i=None):
-    parts = [state.q, state.dq, state.higher, *jax.tree.leaves(state.controller)]
-    taken = [x if i is None else x[i] for x in parts if not isinstance(x, tuple)]
+    parts = [state.x, *jax.tree.leaves(state.controller)]
+    taken = [x if i is None else x[i] for x in parts]
     return np.concatenate([np.ravel(x) for x in taken])
 
 
@@ -188,10 +186,7 @@ def test_a_run_is_that_of_an_independent_program(name):
     start = ij.simulation.closed_loop.initial_state(run.scenario)
     expected = independent.end(program(run.scenario), flat(start), 1.0)
     last = jax.tree.map(lambda x: x[-1], run.controller_state)
-    parts = [run.q[-1], run.dq[-1]]
-    if run.scenario.plant.n == 1:
-        parts.append(run.higher[-1])
-    found = np.concatenate([np.ravel(x) for x in [*parts, *jax.tree.leaves(last)]])
+    found = np.concatenate([np.ravel(x) for x in [run.x[-1], *jax.tree.leaves(last)]])
     np.testing.assert_allclose(found, expected, atol=1e-7)
 
 

@@ -64,7 +64,7 @@ def test_the_vector_field_of_an_arm_is_that_of_the_independent_program(rng):
         scenario = ij.with_parameters(scenario, {"observer.kf": kf})
         q = near(rng, scenario.context.tube(jnp.asarray(t)))
         dq, eta, aux = rng.normal(size=(3, 2))
-        state = LoopState(q, dq, AuxiliaryState((), aux), eta)
+        state = LoopState(np.stack([q, dq]), AuxiliaryState((), aux), eta)
         rate, sample = field(scenario, t, jax.tree.map(jnp.asarray, state))
         loop = Loop(corrected=True, kf=kf, **numbers)
         y = np.concatenate([q, dq, eta, aux])
@@ -110,8 +110,8 @@ def test_the_input_of_a_chain_is_that_of_the_independent_program(coupled, rng):
     for t, x, aux in random_points(case, rng, 20):
         limit, k = rng.uniform(0.1, 20), rng.uniform(1, 30)
         scenario = with_numbers(coupled, limit, k)
-        state = LoopState(x[0], x[1], AuxiliaryState((), aux), (), higher=x[2:])
-        rate, sample = field(scenario, t, jax.tree.map(jnp.asarray, _arrays(state)))
+        state = LoopState(np.asarray(x), AuxiliaryState((), aux), ())
+        rate, sample = field(scenario, t, jax.tree.map(jnp.asarray, state))
         found = other.limited_chain(case, limit, k, t, x, estimate.tolist(), aux)
         _, applied, aux_rate, control = found
         np.testing.assert_allclose(sample.tau, applied, rtol=1e-12, atol=1e-12)
@@ -119,13 +119,6 @@ def test_the_input_of_a_chain_is_that_of_the_independent_program(coupled, rng):
         found_rate = rate.controller.auxiliary
         np.testing.assert_allclose(found_rate, aux_rate, rtol=1e-11, atol=1e-12 * size)
         np.testing.assert_allclose(sample.V, control.V, rtol=1e-11)
-
-
-def _arrays(state):
-    """The state with arrays in the place of lists."""
-    return state._replace(
-        q=np.asarray(state.q), dq=np.asarray(state.dq), higher=np.asarray(state.higher)
-    )
 
 
 # --- the Lyapunov rate ----------------------------------------------------------------------------
@@ -143,7 +136,9 @@ def test_the_rate_of_V2_of_an_arm(rng):
         t = jnp.asarray(rng.uniform(0, 10))
         tube = scenario.context.tube(t)
         q, (dq, eta, aux) = near(rng, tube), rng.normal(size=(3, 2))
-        state = jax.tree.map(jnp.asarray, LoopState(q, dq, AuxiliaryState((), aux), eta))
+        state = jax.tree.map(
+            jnp.asarray, LoopState(np.stack([q, dq]), AuxiliaryState((), aux), eta)
+        )
         proof, sample = terms(scenario, t, state), field(scenario, t, state)[1]
         assert np.any(sample.saturated)
         value = law.weight * law.barrier.value(tube, q)
@@ -161,7 +156,7 @@ def test_the_rate_of_V_of_a_chain_with_bounds_of_every_level(coupled, rng):
     terms = jax.jit(level_terms_at)
     case = chains.CASES["coupled"]
     for t, x, aux in random_points(case, rng, 10):
-        state = _arrays(LoopState(x[0], x[1], AuxiliaryState((), aux), (), higher=x[2:]))
+        state = LoopState(np.asarray(x), AuxiliaryState((), aux), ())
         proof = terms(coupled, jnp.asarray(t), jax.tree.map(jnp.asarray, state))
         claim = proof.claim
         left = claim.dV + claim.decay - growth_along(claim)
@@ -210,7 +205,8 @@ def _limited(law, limit=LIMIT, auxiliary=K):
 def test_without_a_reached_limit_it_is_the_law_without_it(name):
     part = {}
     if name == "full_state":
-        part["velocity_bounds"] = ij.Bounds(ij.bounds.Constant(-9.0), ij.bounds.Constant(9.0))
+        speeds = ij.Bounds(ij.bounds.Constant(-9.0), ij.bounds.Constant(9.0))
+        part["bounds"] = (PAPER.bounds[0], speeds)
     scenario = canonical(ij.with_parts(PAPER, controller=LAWS[name], **part))
     limited = canonical(ij.with_parts(scenario, controller=_limited(LAWS[name], 1e4)))
     field, t = jax.jit(evaluate), jnp.asarray(0.0)

@@ -115,14 +115,17 @@ def law(**fields):
     return controllers.BarrierBackstepping(**(given | fields))
 
 
+def within(size):
+    """Constant bounds."""
+    return ij.Bounds(lower=bounds.Constant(-size), upper=bounds.Constant(size))
+
+
 def third_order(**parts):
     """The pendulum with its motor, with constant bounds."""
-    constant = ij.Bounds(lower=bounds.Constant(-20.0), upper=bounds.Constant(20.0))
     given = {
         "plant": chain_cases.pendulum(),
         "reference": references.Sinusoid(offset=0.1, amplitude=0.5),
-        "bounds": ij.Bounds(lower=bounds.Constant(-1.0), upper=bounds.Constant(1.0)),
-        "state_bounds": (constant, constant),
+        "bounds": (within(1.0), within(20.0), within(20.0)),
         "controller": law(),
         "initial": ij.Initial(x=[[0.0], [0.0], [0.0]]),
     }
@@ -148,8 +151,8 @@ REFUSED = {
         r"barriers\[2\].*error_over_slope",
     ),
     "a barrier on a level without bounds": (
-        {"controller": law(barriers=(MAPPING,) * 3), "state_bounds": ()},
-        r"state_bounds\[0\]",
+        {"controller": law(barriers=(MAPPING,) * 3), "bounds": within(1.0)},
+        r"bounds\[1\]",
     ),
     "a reference with two continuous derivatives": (
         {"reference": references.Quintic(start=0.0, end=0.5, duration=2.0)},
@@ -208,8 +211,7 @@ def test_a_symmetric_tube_needs_no_smooth_barrier():
     narrow = ij.Bounds(lower=bounds.Funnel(-5.0, -5.0, 0.0), upper=bounds.Funnel(5.0, 5.0, 0.0))
     integral = barriers.Integral()
     scenario = third_order(
-        bounds=tube,
-        state_bounds=(narrow, wide),
+        bounds=(tube, narrow, wide),
         controller=law(barriers=(integral, integral, integral), weights=(1.0, 10.0, 1000.0)),
     )
     run = ij.simulate(scenario, duration=0.5, dt=1e-3)
@@ -232,10 +234,9 @@ def test_a_gain_that_becomes_singular_is_flagged():
 
 @pytest.mark.slow
 def test_a_virtual_control_outside_the_bounds_of_its_level_is_flagged():
-    narrow = ij.Bounds(lower=bounds.Constant(-0.3), upper=bounds.Constant(0.3))
-    wide = ij.Bounds(lower=bounds.Constant(-50.0), upper=bounds.Constant(50.0))
     scenario = third_order(
-        state_bounds=(narrow, wide), controller=law(barriers=(MAPPING, MAPPING, MAPPING))
+        bounds=(within(1.0), within(0.3), within(50.0)),
+        controller=law(barriers=(MAPPING, MAPPING, MAPPING)),
     )
     with pytest.warns(ij.SimulationWarning):
         run = ij.simulate(scenario, duration=1.0, dt=1e-3)
@@ -251,4 +252,4 @@ def test_the_input_jumps_where_the_last_error_is_zero():
     )
     state, t = initial_state(scenario), jnp.asarray(0.2)
     sample = evaluate(scenario, t, state)[1]
-    np.testing.assert_allclose(surfaces(scenario, t, state), sample.e_higher[-1], rtol=1e-12)
+    np.testing.assert_allclose(surfaces(scenario, t, state), sample.e[-1], rtol=1e-12)

@@ -38,8 +38,7 @@ def scenario(amplitude):
     return ij.Scenario(
         plant=plants.StrictFeedback(drift, lambda t, x: jnp.ones_like(x), n=1, order=2),
         reference=references.Sinusoid(offset=0.0, amplitude=amplitude),
-        bounds=ij.Bounds(*sides[0]),
-        state_bounds=(ij.Bounds(*sides[1]),),
+        bounds=[ij.Bounds(*pair) for pair in sides],
         controller=controllers.BarrierBackstepping(k=K, barriers=(mapping, mapping)),
         initial=ij.Initial(x=[[START[0]], [START[1]]]),
     )

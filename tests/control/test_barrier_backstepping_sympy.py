@@ -127,8 +127,7 @@ def scenario():
             lambda t, x: rows(t, x)[0], lambda t, x: rows(t, x)[1], n=1, order=ORDER
         ),
         reference=references.Sinusoid(offset=0.0, amplitude=0.5),
-        bounds=levels[0],
-        state_bounds=tuple(levels[1:]),
+        bounds=levels,
         controller=controllers.BarrierBackstepping(
             k=K, barriers=(barriers.Mapping(),) * ORDER, c=C, weights=WEIGHTS
         ),

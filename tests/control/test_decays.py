@@ -161,9 +161,8 @@ def free_pendulum(levels):
         decays=tuple(map(of_package, levels)),
     )
     nothing = {"disturbance": disturbances.Nothing(), "observer": observers.NoObserver()}
-    return case, chain_cases.scenario(
-        "pendulum", controller=law, state_bounds=(None, None), **nothing
-    )
+    bounds = chain_cases.bounds_of(case)
+    return case, chain_cases.scenario("pendulum", controller=law, bounds=bounds, **nothing)
 
 
 @pytest.mark.slow
@@ -390,7 +389,8 @@ def test_units_of_the_levels_of_a_plant():
         barriers=(barriers.PrescribedPerformance(), barriers.Quadratic(), barriers.Quadratic()),
         decays=decays.FiniteTime(k_a=0.1),
     )
-    scenario = ij.with_parts(ij.presets.motor_driven_pendulum(), controller=law, state_bounds=())
+    preset = ij.presets.motor_driven_pendulum()
+    scenario = ij.with_parts(preset, controller=law, bounds=preset.bounds[:1])
     units = {p.path: p.unit for p in ij.parameters(scenario)}
     found = [units[f"controller.decays[{i}].delta"] for i in range(3)]
     levels = [ij.plants.units_of(scenario.plant)[i] for i in (1, 2)]

@@ -35,7 +35,11 @@ def law(**options):
 
 def with_reference(reference, **options):
     return ij.with_parts(
-        BASE, reference=reference, state_bounds=(), controller=law(**options), initial=AT_REST
+        BASE,
+        reference=reference,
+        bounds=BASE.bounds[:1],
+        controller=law(**options),
+        initial=AT_REST,
     )
 
 
@@ -82,7 +86,7 @@ def test_a_dynamic_surface_takes_any_reference():
     scenario = ij.Scenario(
         plant=chain,
         reference=references.Quintic(0.0, 0.5, 1.0),
-        bounds=BASE.bounds,
+        bounds=BASE.bounds[0],
         controller=law(filter=0.01),
         initial=ij.Initial(x=[[0.0], [0.0], [0.0]]),
     )
@@ -91,13 +95,13 @@ def test_a_dynamic_surface_takes_any_reference():
 
 def with_bounds(level, barriers):
     side = bounds.Bounds(lower=bounds.Constant(-2.4), upper=Rounded(2.4))
-    parts = {1: {"bounds": side, "state_bounds": ()}, 3: {"state_bounds": (None, side)}}
-    parts[2] = {"state_bounds": (side,)}
-    return ij.with_parts(BASE, controller=law(barriers=barriers), **parts[level])
+    first = BASE.bounds[0]
+    levels = {1: (side,), 2: (first, side), 3: (first, None, side)}[level]
+    return ij.with_parts(BASE, controller=law(barriers=barriers), bounds=levels)
 
 
 @pytest.mark.parametrize(
-    ("level", "name", "needed"), [(1, "bounds.upper", 3), (2, r"state_bounds\[0\].upper", 2)]
+    ("level", "name", "needed"), [(1, r"bounds\[0\].upper", 3), (2, r"bounds\[1\].upper", 2)]
 )
 def test_bounds_with_too_few_derivatives_are_refused(level, name, needed):
     barriers = (Mapping(), Mapping() if level == 2 else Quadratic(), Quadratic())

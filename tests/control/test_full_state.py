@@ -112,11 +112,9 @@ class FullLoop(Loop):
             ij.presets.zhang_yan_2024(reading="corrected"),
             controller=law,
             observer=ij.observers.Momentum(kf=self.kf),
-            bounds=bounds.Bounds(
-                lower=bounds.Sinusoid(*self.lower), upper=bounds.Sinusoid(*self.upper)
-            ),
-            velocity_bounds=bounds.Bounds(
-                lower=bounds.Sinusoid(*self.slowest), upper=bounds.Sinusoid(*self.fastest)
+            bounds=(
+                bounds.Bounds(bounds.Sinusoid(*self.lower), bounds.Sinusoid(*self.upper)),
+                bounds.Bounds(bounds.Sinusoid(*self.slowest), bounds.Sinusoid(*self.fastest)),
             ),
             initial=ij.Initial(self.q0, self.dq0),
         )
@@ -131,7 +129,7 @@ def random_states(scenario, count=64, seed=0):
         q = tube.q_d + xi * jnp.where(xi > 0, tube.k_u, tube.k_l)
         inner = law.tubes(t, q, jnp.zeros(2), context)[1]  # alpha and K do not depend on q'
         dq = inner.q_d + xi2 * jnp.where(xi2 > 0, inner.k_u, inner.k_l)
-        return initial_state(scenario)._replace(q=q, dq=dq, observer=eta), jnp.minimum(
+        return initial_state(scenario)._replace(x=jnp.stack([q, dq]), observer=eta), jnp.minimum(
             inner.q_d - inner.lower, inner.upper - inner.q_d
         )
 
@@ -281,13 +279,11 @@ def test_symmetric_bounds_and_logarithms_are_the_published_barriers():
         k1=2.0, K2=20.0, c=1.0, barrier=barriers.Log(), velocity_barrier=barriers.Log()
     )
     rest = ij.references.Sinusoid(offset=0.5, amplitude=0.0)
-    walls, speeds = (
+    walls = tuple(
         bounds.Bounds(lower=bounds.Constant(x - w), upper=bounds.Constant(x + w))
         for x, w in ((0.5, 0.4), (0.0, 0.8))
     )
-    scenario = dataclasses.replace(
-        base, controller=law, reference=rest, bounds=walls, velocity_bounds=speeds
-    )
+    scenario = dataclasses.replace(base, controller=law, reference=rest, bounds=walls)
     t, q, dq, f_hat = (
         jnp.zeros(()),
         jnp.array([0.5, 0.5]),
@@ -670,11 +666,12 @@ def test_bad_ones_are_refused(change, words):
 
 
 def test_it_needs_bounds_to_keep():
+    preset = ij.presets.zhang_yan_2024_full_state()
     with pytest.raises(ValueError, match="the bounds that FullState keeps"):
-        ij.with_parts(ij.presets.zhang_yan_2024_full_state(), velocity_bounds=None)
+        ij.with_parts(preset, bounds=preset.bounds[:1])
     with pytest.raises(ValueError, match="Q is Theorem 2's"):
         ij.certificates.counterexample(
-            ij.presets.zhang_yan_2024_full_state(),
+            preset,
             {"controller.k1": ij.value(ij.uniform(1.0, 3.0))},
         )
 

@@ -267,7 +267,7 @@ def inequality_excess(run):
         )
         return dV + rho * V - 0.5 * jnp.sum(df**2)
 
-    states = LoopState(run.q, run.dq, run.controller_state, run.observer_state)
+    states = LoopState(run.x, run.controller_state, run.observer_state)
     return jax.jit(jax.vmap(at))(run.t, states)
 
 
@@ -557,9 +557,8 @@ def weighted(name, weight=None):
     """The paper's scenario under one of these laws, its weight given to the constructor."""
     law = dataclasses.replace(WEIGHTED[name], weight=weight)
     velocities = ij.bounds.Bounds(lower=ij.bounds.Constant(-4.0), upper=ij.bounds.Constant(4.0))
-    return dataclasses.replace(
-        ij.presets.zhang_yan_2024(), controller=law, velocity_bounds=velocities
-    )
+    paper = ij.presets.zhang_yan_2024()
+    return dataclasses.replace(paper, controller=law, bounds=(paper.bounds[0], velocities))
 
 
 def commanded(scenario):

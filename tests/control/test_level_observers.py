@@ -35,7 +35,7 @@ def scenario(order, observer, **parts):
     values = {"plant": PLANTS[order], "disturbance": DISTURBANCE} | parts
     return ij.Scenario(
         reference=PAPER.reference,
-        bounds=PAPER.bounds,
+        bounds=PAPER.bounds[0],
         controller=ij.controllers.BarrierBackstepping(**gains),
         initial=PAPER.initial,
         observer=observer,
@@ -63,8 +63,7 @@ def random_state(scenario, rng):
     state = initial_state(scenario)
     x = state.x + jnp.asarray(rng.normal(size=state.x.shape)) * 0.05
     memory = jax.tree.map(lambda z: z + jnp.asarray(rng.normal(size=z.shape)), state.observer)
-    higher = x[2:] if len(x) > 2 else ()
-    return LoopState(x[0], x[1], state.controller, memory, higher=higher)
+    return LoopState(x, state.controller, memory)
 
 
 @pytest.mark.slow

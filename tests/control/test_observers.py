@@ -24,7 +24,7 @@ def estimate_rate():
 
     @jax.jit
     def at(scenario, t, q, dq, eta):
-        state = LoopState(q, dq, (), eta)
+        state = LoopState(jnp.stack([q, dq]), (), eta)
         rate, sample = evaluate(scenario, t, state)
 
         def f_hat(q, dq, eta):

@@ -67,7 +67,7 @@ def test_the_vector_field_at_random_states(rng):
         z[4] *= 3.0
         state = initial_state(scenario)
         inner = state.observer._replace(x_hat=jnp.asarray(z[2:4]), d_hat=jnp.asarray(z[4])[None])
-        state = state._replace(q=jnp.asarray(z[0]), dq=jnp.asarray(z[1]), observer=inner)
+        state = state._replace(x=jnp.asarray(z[:2]), observer=inner)
         found = field(scenario, jnp.asarray(t), state)
         x_hat, d_hat = found.observer
         rates = np.concatenate([found.q, found.dq, *np.asarray(x_hat), d_hat[0]])

@@ -17,7 +17,7 @@ RUN = {"duration": 1.5, "dt": 1e-3}
 LIMITED = {"limit": [60.0, 40.0]}
 
 
-def falling(**changes):
+def falling(speeds=None, **changes):
     """PD that overshoots: soft, from a fast start, towards a reference next to the bound."""
     law = controllers.PDGravity(Kp=30.0, Kd=0.4)
     scenario = ij.presets.zhang_yan_2024(law="pd", reading="corrected")
@@ -28,7 +28,7 @@ def falling(**changes):
     parts = {
         "controller": law,
         "reference": rest,
-        "bounds": walls,
+        "bounds": (walls, speeds),
         "initial": ij.Initial([0.75, 0.3], [0.4, -0.1]),
     }
     return ij.with_parts(scenario, **(parts | {"disturbance": ij.disturbances.Nothing()} | changes))
@@ -174,7 +174,7 @@ def test_the_law_is_passed_on_where_it_is_safe():
 @pytest.mark.slow
 def test_velocity_bounds_are_kept_too():
     speeds = bounds.Bounds(lower=bounds.Constant(-0.8), upper=bounds.Sinusoid(0.6, 0.05, 2.0))
-    scenario = falling(velocity_bounds=speeds)
+    scenario = falling(speeds)
     with pytest.warns(ij.SimulationWarning, match="velocity bound was violated"):
         bare = ij.simulate(scenario, **RUN)
     assert float(jnp.min(bare.metrics.velocity_margin)) < -0.1
@@ -188,9 +188,7 @@ def test_velocity_bounds_are_kept_too():
 @pytest.mark.slow
 def test_an_empty_box_is_flagged_with_its_slack():
     narrow = bounds.Bounds(lower=bounds.Constant(-0.5), upper=bounds.Constant(0.5))
-    scenario = filtered(
-        falling(velocity_bounds=narrow), nearest="acceleration", a1=40.0, a2=40.0, a3=1.0
-    )
+    scenario = filtered(falling(narrow), nearest="acceleration", a1=40.0, a2=40.0, a3=1.0)
     with pytest.warns(
         ij.SimulationWarning, match=r"safety filter's conditions could not all be met.*rad/s\^2"
     ):
@@ -234,9 +232,7 @@ def test_backends_agree_and_a_run_alone_is_that_of_a_batch():
 @pytest.mark.slow
 def test_a_study_tells_the_largest_slack():
     narrow = bounds.Bounds(lower=bounds.Constant(-0.5), upper=bounds.Constant(0.5))
-    scenario = filtered(
-        falling(velocity_bounds=narrow), nearest="acceleration", a1=40.0, a2=40.0, a3=1.0
-    )
+    scenario = filtered(falling(narrow), nearest="acceleration", a1=40.0, a2=40.0, a3=1.0)
     starts = {
         "initial.q": ij.value(ij.uniform([0.7, 0.8], [0.87, 0.87])),
         "initial.dq": ij.value(ij.uniform(0.0, 0.48)),

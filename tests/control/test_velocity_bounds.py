@@ -21,10 +21,13 @@ def speeds(low=(-1.6, -1.4), high=(0.6, 0.5), amplitude=(0.1, 0.0)):
     )
 
 
-def paper(**parts):
-    return ij.with_parts(
-        ij.presets.zhang_yan_2024(reading="corrected"), **({"velocity_bounds": speeds()} | parts)
-    )
+PAPER = ij.presets.zhang_yan_2024(reading="corrected")
+WIDE = speeds()
+NARROW = speeds((-0.5, -0.3), (0.6, 0.5))
+
+
+def paper(velocities=WIDE, **parts):
+    return ij.with_parts(PAPER, bounds=(PAPER.bounds[0], velocities), **parts)
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +40,7 @@ def violated():
     with pytest.warns(
         ij.SimulationWarning, match=r"Joint 1 left its velocity bounds first, at t = 0\.00\d s"
     ):
-        return ij.simulate(paper(velocity_bounds=speeds((-0.5, -0.3), (0.6, 0.5))), **SHORT)
+        return ij.simulate(paper(NARROW), **SHORT)
 
 
 @pytest.mark.slow
@@ -58,7 +61,7 @@ def test_what_is_watched_is_what_the_samples_say(watched):
 
 @pytest.mark.slow
 def test_the_law_and_the_loop_do_not_know(watched):
-    free = ij.simulate(paper(velocity_bounds=None), **SHORT)
+    free = ij.simulate(paper(None), **SHORT)
     for name in ("q", "dq", "tau", "V"):
         np.testing.assert_array_equal(getattr(free, name), getattr(watched, name))
     assert all(getattr(free, name) == () for name in ("dq_lower", "dq_upper"))
@@ -80,7 +83,7 @@ def test_a_violation_is_flagged_with_time_and_joint(violated):
 
 @pytest.mark.slow
 def test_backends_agree():
-    scenario = paper(velocity_bounds=speeds((-0.5, -0.3), (0.6, 0.5)))
+    scenario = paper(NARROW)
     options = {"runs": 4, "duration": 0.3, "dt": 1e-3, "progress": False}
     studies = [
         ij.monte_carlo(
@@ -98,7 +101,7 @@ def test_backends_agree():
 def test_a_funnel_of_velocities_follows_the_reference():
     funnel = bounds.Bounds(lower=bounds.Funnel(-1.0, -0.2, 2.0), upper=bounds.Funnel(1.5, 0.2, 2.0))
     run = ij.simulate(
-        paper(velocity_bounds=funnel, initial=ij.Initial([0.5, 0.64], [0.14, 0.0])),
+        paper(funnel, initial=ij.Initial([0.5, 0.64], [0.14, 0.0])),
         duration=0.2,
         dt=1e-3,
     )
@@ -111,7 +114,7 @@ def test_a_funnel_of_velocities_follows_the_reference():
 def test_the_margin_has_a_derivative():
     def margin(low):
         scenario = ij.with_parameters(
-            paper(), {"velocity_bounds.lower.offset": low, "controller.k1": 2.0 + low}
+            paper(), {"bounds[1].lower.offset": low, "controller.k1": 2.0 + low}
         )
         return jnp.min(
             ij.simulate(scenario, duration=0.2, dt=1e-3, record_every=200).metrics.velocity_margin
@@ -130,11 +133,12 @@ def test_files_hold_them_and_say_their_unit(tmp_path):
     assert jax.tree.structure(again) == jax.tree.structure(scenario)
     jax.tree.map(np.testing.assert_array_equal, again, scenario)
     assert "offset = [-1.6, -1.4]  # rad/s" in scenario_to_toml(scenario)
-    assert "velocity_bounds" not in scenario_to_toml(paper(velocity_bounds=None))
+    assert "[[bounds]]" in scenario_to_toml(scenario)
+    assert "[[bounds]]" not in scenario_to_toml(paper(None))
     units = {p.path: p.unit for p in ij.parameters(scenario)}
-    assert units["velocity_bounds.lower.offset"] == "rad/s"
-    assert units["velocity_bounds.lower.phase"] == units["bounds.lower.offset"] == "rad"
-    assert ij.simulation.paths.unit_at(scenario, "velocity_bounds.upper.amplitude[0]") == "rad/s"
+    assert units["bounds[1].lower.offset"] == "rad/s"
+    assert units["bounds[1].lower.phase"] == units["bounds[0].lower.offset"] == "rad"
+    assert ij.simulation.paths.unit_at(scenario, "bounds[1].upper.amplitude[0]") == "rad/s"
 
 
 def test_a_dataset_has_them(watched):
@@ -145,7 +149,7 @@ def test_a_dataset_has_them(watched):
 
 @pytest.mark.slow
 def test_requirements_on_velocities():
-    scenario = paper(velocity_bounds=speeds((-0.6, -0.6)))
+    scenario = paper(speeds((-0.6, -0.6)))
     objective = ij.objectives.tracking() + ij.objectives.velocity_margin_above(0.02)
     result = ij.tune(
         scenario,
@@ -161,9 +165,9 @@ def test_requirements_on_velocities():
     run = result.nominal[1]
     assert float(np.min(run.metrics.velocity_margin)) == pytest.approx(line.value)
     assert float(np.min(result.nominal[0].metrics.velocity_margin)) < 0.02
-    with pytest.raises(ValueError, match="velocity_bounds"):
+    with pytest.raises(ValueError, match="bounds of the second level"):
         ij.tune(
-            paper(velocity_bounds=None),
+            paper(None),
             ["controller.k1"],
             objective,
             duration=0.3,
@@ -186,7 +190,7 @@ def test_figures(watched, violated):
     )
     np.testing.assert_allclose(box.get_ydata(), [-1.4, -1.4, 0.5, 0.5, -1.4])
     np.testing.assert_allclose(box.get_xdata()[:2], [watched.lower[0, 1], watched.upper[0, 1]])
-    free = ij.simulate(paper(velocity_bounds=None), **SHORT)
+    free = ij.simulate(paper(None), **SHORT)
     assert "bounds" not in [
         line.get_label() for line in plotting.velocities(free).axes[0].get_lines()
     ]
@@ -199,14 +203,14 @@ def test_figures(watched, violated):
 @pytest.mark.parametrize(
     ("parts", "words"),
     [
-        ({"velocity_bounds": 3.0}, "a Bounds, or None"),
+        ({"velocities": 3.0}, r"bounds\[1\]: got 3\.0?, .*a Bounds, or None"),
         (
-            {"velocity_bounds": speeds((-1.6, -1.4), (-1.7, 0.5), (0.0, 0.0))},
-            "velocity_bounds of joint 0",
+            {"velocities": speeds((-1.6, -1.4), (-1.7, 0.5), (0.0, 0.0))},
+            r"bounds\[1\] of joint 0",
         ),
         ({"initial": ij.Initial([0.8, 0.8], [0.0, 0.6])}, r"initial\.dq\[1\]"),
         (
-            {"velocity_bounds": speeds((-1.6, -1.4, 0.0), (0.6, 0.5, 0.0), (0.1, 0.0, 0.0))},
+            {"velocities": speeds((-1.6, -1.4, 0.0), (0.6, 0.5, 0.0), (0.1, 0.0, 0.0))},
             "2 .one a joint.",
         ),
     ],
@@ -217,8 +221,8 @@ def test_bad_ones_are_refused(parts, words):
 
 
 def test_the_metric_asks_for_bounds():
-    with pytest.raises(ValueError, match="velocity_bounds"):
-        ij.simulate(paper(velocity_bounds=None), **SHORT, metrics=(metrics.VelocityMargin(),))
+    with pytest.raises(ValueError, match="bounds of the second level"):
+        ij.simulate(paper(None), **SHORT, metrics=(metrics.VelocityMargin(),))
 
 
 def test_limits_of_a_robot():

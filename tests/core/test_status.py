@@ -164,9 +164,10 @@ def test_a_run_away_state_is_frozen_at_its_last_good_value(paper):
 @pytest.mark.slow
 def test_an_infeasible_reference_is_an_error_with_joint_and_time(paper):
     """It touches the bound of joint 1 between recorded samples only, long after the start."""
+    positions = paper.bounds[0]
     close = dataclasses.replace(
-        paper.bounds,
-        upper=dataclasses.replace(paper.bounds.upper, offset=[0.9, 0.5 + 0.14 * np.sqrt(2) - 1e-7]),
+        positions,
+        upper=dataclasses.replace(positions.upper, offset=[0.9, 0.5 + 0.14 * np.sqrt(2) - 1e-7]),
     )
     scenario = dataclasses.replace(paper, bounds=close, initial=ij.Initial(q=[0.8, 0.6]))
     with pytest.raises(
@@ -239,9 +240,9 @@ def test_gains_below_the_theorem_are_advised_against(paper):
 
 def test_a_reference_that_is_too_fast_is_named_with_its_limit(paper):
     slow = ij.bounds.Constant([0.1, 9.0])
-    velocity_bounds = ij.Bounds(lower=ij.bounds.Constant(-9.0), upper=slow)
+    speeds = ij.Bounds(lower=ij.bounds.Constant(-9.0), upper=slow)
     start = ij.Initial(q=paper.reference.position(0.0), dq=[0.0, 0.0])
-    scenario = ij.with_parts(paper, velocity_bounds=velocity_bounds, initial=start)
+    scenario = ij.with_parts(paper, bounds=(paper.bounds[0], speeds), initial=start)
     with pytest.warns(ij.SimulationWarning) as caught:
         run = ij.simulate(scenario, **SHORT)
     fastest = float(run.dq_d[:, 0].max())

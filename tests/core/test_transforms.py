@@ -212,7 +212,7 @@ LEAVES = (
     "plant.g",
     "initial.q",
     "disturbance.phase",
-    "bounds.upper",
+    "bounds[0].upper",
 )
 """Gains, the robot, the start, the world: one of every kind of leaf."""
 LIGHT = {

@@ -54,12 +54,9 @@ def walk(scenario, dtype, seed=0):
 
 @pytest.fixture(scope="module")
 def base():
-    scenario = ij.with_parts(
-        ij.presets.zhang_yan_2024(),
-        sampling=ij.Sampling(1e-3),
-        velocity_bounds=ij.Bounds(ij.bounds.Constant(-2.0), ij.bounds.Constant(2.5)),
-    )
-    return scenario
+    paper = ij.presets.zhang_yan_2024()
+    speeds = ij.Bounds(ij.bounds.Constant(-2.0), ij.bounds.Constant(2.5))
+    return ij.with_parts(paper, sampling=ij.Sampling(1e-3), bounds=(paper.bounds[0], speeds))
 
 
 CASES = [(law, "momentum") for law in members.LAWS] + [
@@ -328,7 +325,7 @@ int main(void) {
   int k, status = 0;
   p.controller.K2[0] = 33.0;
   p.model.mass[1] = 1.5;
-  p.bounds.upper.offset[0] = 0.6;
+  p.bounds.part_0.upper.offset[0] = 0.6;
   if (arm_law_init(&p, &s, q, dq)) return 1;
   for (k = 0; k < 3; k++) status = arm_law_step(&p, &s, 0.002 * k, q, dq, tau);
   printf("%.17g %.17g %d\\n", tau[0], tau[1], status);
@@ -387,7 +384,7 @@ def test_a_folder_is_complete_and_its_parameters_are_those_of_the_paths(tmp_path
 
     lab = canonical(ij.load_scenario(folder / "scenario.toml"))
     lab = ij.with_parameters(
-        lab, {"controller.K2[0]": 33.0, "model.mass[1]": 1.5, "bounds.upper.offset[0]": 0.6}
+        lab, {"controller.K2[0]": 33.0, "model.mass[1]": 1.5, "bounds[0].upper.offset[0]": 0.6}
     )
     inputs = SampleInputs(jnp.zeros(()), jnp.asarray([0.75, 0.7]), jnp.asarray([0.1, -0.2]))
     memory = start(lab, inputs)[0]

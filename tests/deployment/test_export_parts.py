@@ -130,7 +130,7 @@ def test_a_law_that_estimates_levels_as_an_fmu(tmp_path):
     run = ij.simulate(scenario, duration=DURATION, dt=1e-3)
     inputs = np.zeros(run.t.size, [("time", float), ("q", float, (2,))])
     inputs["time"], inputs["q"] = run.t, run.measured.q
-    starts = {"dq": run.dq[0].tolist(), "x_3": run.higher[0, 0].tolist()}
+    starts = {"dq": run.dq[0].tolist(), "x_3": run.x[0, 2].tolist()}
     found = fmpy.simulate_fmu(
         str(tmp_path / "iblf_law.fmu"),
         stop_time=DURATION,

@@ -214,7 +214,7 @@ def test_gains_starts_and_bounds_have_sliders(page):
         "controller.K2",
         "observer.kf",
         "initial.q",
-        "bounds.upper.offset",
+        "bounds[0].upper.offset",
     } <= set(sliders)
     assert (
         sliders["controller.K2"]["slider"] == [[4.0, 100.0]]

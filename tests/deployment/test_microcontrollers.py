@@ -228,12 +228,9 @@ def test_a_law_links_without_a_c_library(law):
 
 @pytest.mark.parametrize("name", members.LAWS)
 def test_every_law_needs_only_memory_and_mathematics(name, sampled, tmp_path):
-    scenario = ij.with_parts(
-        sampled,
-        controller=members.LAWS[name],
-        velocity_bounds=ij.Bounds(ij.bounds.Constant(-2.0), ij.bounds.Constant(2.5)),
-    )
-    scenario = canonical(scenario)
+    speeds = ij.Bounds(ij.bounds.Constant(-2.0), ij.bounds.Constant(2.5))
+    bounds = (sampled.bounds[0], speeds)
+    scenario = canonical(ij.with_parts(sampled, controller=members.LAWS[name], bounds=bounds))
     none = vectors_of_nothing(scenario)
     law = Law(scenario, control_law(scenario, False), "arm_law", False, none, (), None)
     for file, text in generate(law).files.items():

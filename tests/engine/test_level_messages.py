@@ -4,7 +4,7 @@ import dataclasses
 
 import jax.numpy as jnp
 import pytest
-from plant_cases import body, pendulum, symmetric
+from plant_cases import ANGLES, body, pendulum, symmetric
 
 import iblf_jax as ij
 from iblf_jax.core.status import Status
@@ -29,7 +29,7 @@ def message_of(scenario, duration=0.5, dt=1e-3) -> str:
 @pytest.mark.slow
 def test_a_violated_level_is_named_with_time_margin_unit_and_remedy():
     plain = law(Mapping(), Quadratic(), Quadratic())
-    text = message_of(pendulum(controller=plain, state_bounds=(None, symmetric(2.0))))
+    text = message_of(pendulum(controller=plain, bounds=(ANGLES, None, symmetric(2.0))))
     assert "Level 3 (current) of pendulum left its bounds first, at t = 0.0" in text
     assert " A. The law has barriers.Quadratic() on that level" in text
     assert "give it barriers.Mapping() there" in text
@@ -38,7 +38,7 @@ def test_a_violated_level_is_named_with_time_margin_unit_and_remedy():
 @pytest.mark.slow
 def test_a_violated_second_level_has_the_unit_of_the_level():
     plain = law(Mapping(), Quadratic(), Quadratic())
-    text = message_of(pendulum(controller=plain, state_bounds=(symmetric(0.1),)))
+    text = message_of(pendulum(controller=plain, bounds=(ANGLES, symmetric(0.1))))
     assert "a bound of the second level was violated" in text
     assert "Level 2 (speed) of pendulum left its bounds first" in text
     assert "rad/s. The law has barriers.Quadratic()" in text
@@ -48,18 +48,18 @@ def test_a_violated_second_level_has_the_unit_of_the_level():
 @pytest.mark.slow
 def test_a_virtual_control_outside_its_level_is_reported_like_assumption_2():
     plain = law(Mapping(), Quadratic(), Quadratic())
-    scenario = pendulum(controller=plain, state_bounds=(symmetric(3.0), symmetric(2.0)))
+    scenario = pendulum(controller=plain, bounds=(ANGLES, symmetric(3.0), symmetric(2.0)))
     run = None
     with pytest.warns(SimulationWarning, match="Assumption 2") as found:
         run = ij.simulate(scenario, duration=0.5, dt=1e-3)
     text = str(found[0].message)
     worst = -float(run.metrics.level_alpha_margin[0, 0])
-    alpha = run.higher[:, 0, 0] - run.e_higher[:, 0, 0]
+    alpha = run.x[:, 2, 0] - run.e[:, 2, 0]
     first = float(run.t[jnp.argmax(jnp.abs(alpha) >= 2.0)])
     assert f"left the bounds by up to {worst:.3g} A, first at t = {first:.4g} s" in text
     assert "Alpha_2, the virtual control for level 3" in text
     assert "Alpha_1" not in text  # it stays inside the bounds of level 2
-    assert "widen state_bounds or lower controller.k" in text
+    assert "widen the bounds of the level or lower controller.k" in text
 
 
 @pytest.mark.slow
@@ -70,10 +70,9 @@ def test_a_law_of_robots_is_told_who_keeps_the_bounds_of_levels():
         plant=plant,
         model=rigid.plant,
         reference=rigid.reference,
-        bounds=rigid.bounds,
+        bounds=(rigid.bounds[0], None, None, symmetric(0.5)),
         controller=rigid.controller,
         initial=rigid.initial,
-        state_bounds=(None, None, symmetric(0.5)),
     )
     text = message_of(scenario, duration=0.05, dt=2e-4)
     assert "Level 4 (motor velocity) of joint" in text
@@ -91,7 +90,7 @@ def test_a_gain_that_becomes_singular_is_named():
     )
     scenario = pendulum(
         plant=plant,
-        state_bounds=(),
+        bounds=ANGLES,
         controller=law(Mapping(), Quadratic(), Quadratic()),
         disturbance=ij.disturbances.Nothing(),
     )
@@ -134,8 +133,8 @@ def test_a_run_that_starts_outside_a_level_is_named_in_a_study():
 
 @pytest.mark.slow
 def test_a_robot_keeps_its_words():
-    bounds = symmetric(0.1)
-    robot = ij.with_parts(ij.presets.zhang_yan_2024(), velocity_bounds=bounds)
+    robot = ij.presets.zhang_yan_2024()
+    robot = ij.with_parts(robot, bounds=(robot.bounds[0], symmetric(0.1)))
     text = message_of(robot, duration=0.5)
     assert "a velocity bound was violated" in text
     assert "Joint 1 left its velocity bounds first" in text

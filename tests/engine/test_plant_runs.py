@@ -29,12 +29,12 @@ def test_names_and_a_solution_of_scipy(case):
     )
     run = ij.simulate(scenario, **SHORT)
     np.testing.assert_allclose(found.y[: scenario.n, -1], run.q[-1], atol=1e-9)
-    np.testing.assert_array_equal(field.unpack(found.y.T).higher.shape[1:], run.higher.shape[1:])
+    np.testing.assert_array_equal(field.unpack(found.y.T).x.shape[1:], run.x.shape[1:])
 
 
 LEAVES = {
     "user class": ("plant.D", "model.N", "controller.k[2]", "initial.higher"),
-    "electric drive": ("plant.inductance", "plant.robot.mass[1]", "state_bounds[1].upper.value"),
+    "electric drive": ("plant.inductance", "plant.robot.mass[1]", "bounds[2].upper.value"),
     "flexible joint": ("plant.stiffness", "model.motor_inertia", "initial.q"),
 }
 

@@ -21,12 +21,12 @@ def test_a_file_gives_the_same_scenario(tmp_path, case):
 
 
 def test_a_level_without_bounds_stays_without(tmp_path):
-    levels = (None, loops_of_plants.band(-60.0, 60.0))
+    levels = (loops_of_plants.band(0.1, 0.9), None, loops_of_plants.band(-60.0, 60.0))
     barriers = (ij.barriers.Mapping(), ij.barriers.Quadratic(), ij.barriers.Mapping())
     law = ij.controllers.BarrierBackstepping(k=(3.0, 20.0, 60.0), barriers=barriers)
-    scenario = loops_of_plants.electric_drive(state_bounds=levels, controller=law)
+    scenario = loops_of_plants.electric_drive(bounds=levels, controller=law)
     ij.save_scenario(scenario, tmp_path / "scenario.toml")
-    assert ij.load_scenario(tmp_path / "scenario.toml").state_bounds[0] is None
+    assert ij.load_scenario(tmp_path / "scenario.toml").bounds[1] is None
 
 
 def test_a_users_class_is_saved_once_it_has_a_name(tmp_path, monkeypatch):

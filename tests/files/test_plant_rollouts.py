@@ -17,8 +17,8 @@ def test_signals_of_levels_have_dimensions_and_units(run):
     data = run.to_xarray()
     assert data.disturbance.dims == ("time", "level", "joint")
     assert data.disturbance.attrs["units"] == "rad/s; rad/s^2; A/s"
-    assert data.higher.dims == ("time", "higher_level", "joint")
-    assert data.higher.attrs["units"] == "A"
+    assert data.x.dims == ("time", "level", "joint")
+    assert data.x.attrs["units"] == "rad; rad/s; A"
     assert data.tau.attrs == {"units": "V", "description": "input: input"}
     assert data.level_margin.dims == ("higher_level", "joint")
     assert data.estimate_rmse.dims == ("level", "joint")

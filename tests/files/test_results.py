@@ -387,7 +387,7 @@ def test_an_unknown_class_in_a_result_is_refused(run, tmp_path):
         with pytest.raises(ValueError, match=r"Rollout.measured"):
             odd.save(tmp_path / "odd")
     with pytest.raises(ValueError, match="traced"):
-        jax.jit(lambda x: dataclasses.replace(run, q=x).save(tmp_path / "odd"))(run.q)
+        jax.jit(lambda x: dataclasses.replace(run, x=x).save(tmp_path / "odd"))(run.x)
     assert not list(tmp_path.iterdir())
 
 
@@ -475,15 +475,15 @@ CHANGES: dict[str, tuple[Callable, str]] = {
         _set(steps={"member": "barriers.none", "fields": {}}),
         r'result.steps: got .barriers.none.*barriers.MEMBERS\["none"\]',
     ),
-    "no array": (_set(q={"jax": 999, "type": "float64", "shape": [1]}), "result.q: .*999.npy"),
+    "no array": (_set(x={"jax": 999, "type": "float64", "shape": [1]}), "result.x: .*999.npy"),
     "another type": (
-        lambda d, f: _fields(d)["q"].update(type="int32"),
-        "result.q: got an array of type float.*expected type int32",
+        lambda d, f: _fields(d)["x"].update(type="int32"),
+        "result.x: got an array of type float.*expected type int32",
     ),
-    "another shape": (lambda d, f: _fields(d)["q"].update(shape=[3]), "result.q: .*shape"),
+    "another shape": (lambda d, f: _fields(d)["x"].update(shape=[3]), "result.x: .*shape"),
     "objects": (
-        lambda d, f: f.update({f"{_fields(d)['q']['jax']}.npy": _npy(np.array([print], object))}),
-        "result.q: got no array that can be read",
+        lambda d, f: f.update({f"{_fields(d)['x']['jax']}.npy": _npy(np.array([print], object))}),
+        "result.x: got no array that can be read",
     ),
     "another version": (lambda d, f: d.update(version=2), "version: got 2, expected 1"),
     "another format": (lambda d, f: d.update(format="MATLAB"), "format: got 'MATLAB'"),
@@ -560,8 +560,8 @@ def test_no_flipped_byte_passes_unnoticed(run, tmp_path):
 def test_the_archive_can_be_read_by_numpy(run, tmp_path):
     with np.load(run.save(tmp_path / "run.npz"), allow_pickle=False) as archive:
         description = json.loads(archive["result.json"])
-        number = _fields(description)["q"]["jax"]
-        np.testing.assert_array_equal(archive[str(number)], run.q)
+        number = _fields(description)["x"]["jax"]
+        np.testing.assert_array_equal(archive[str(number)], run.x)
 
 
 def test_scenarios_and_earlier_tunings_are_loaded_too(tmp_path):

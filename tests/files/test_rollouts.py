@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import tomli_w
 import xarray
 from conftest import SHORT
 from made_up_runs import ALWAYS
@@ -20,6 +21,7 @@ import iblf_jax as ij
 from iblf_jax.files import rollouts
 from iblf_jax.files import scenario as scenario_file
 from iblf_jax.files.rollouts import load_datasets
+from iblf_jax.simulation.signals import VIEWS
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +40,9 @@ def batch(paper) -> ij.Rollout:
 def test_one_run(short_run):
     data = short_run.to_xarray()
     assert data.sizes == {"time": short_run.t.size, "joint": 2}
-    for name in set(ALWAYS) - {"t"}:
+    shown = {*ALWAYS, *VIEWS} & set(data)
+    assert set(VIEWS) - {"dq_lower", "dq_upper"} <= shown
+    for name in shown:
         np.testing.assert_array_equal(data[name], getattr(short_run, name))
     for name in short_run.metrics:
         np.testing.assert_array_equal(data[name], short_run.metrics[name])
@@ -101,6 +105,34 @@ def test_files_give_the_same_datasets_back(ending, short_run, batch, tmp_path):
     assert list(found) == list(runs)
     for name, run in runs.items():
         xarray.testing.assert_identical(found[name], run.to_xarray())
+
+
+@pytest.mark.parametrize("ending", [".nc", ".npz"])
+def test_batches_of_earlier_versions_load(ending, paper, tmp_path):
+    """Bounds of velocities had a field of their own; two bounds differ between the runs."""
+    speeds = ij.Bounds(lower=ij.bounds.Constant(-9.0), upper=ij.bounds.Constant(9.0))
+    scenario = ij.with_parts(paper, bounds=(paper.bounds[0], speeds))
+
+    def one(x):
+        changes = {"bounds[0].upper.offset": 0.9 + x, "bounds[1].upper.value": 8.0 + x}
+        changed = ij.with_parameters(scenario, changes)
+        return ij.simulate(changed, duration=0.01, record_every=5, method="euler")
+
+    batch = jax.vmap(one)(jnp.array([0.0, 0.1]))
+    names = {
+        "bounds[0].upper.offset": "bounds.upper.offset",
+        "bounds[1].upper.value": "velocity_bounds.upper.value",
+    }
+    data = batch.to_xarray().rename(names)
+    tables = tomllib.loads(data.attrs["scenario"])
+    tables["bounds"], tables["velocity_bounds"] = tables["bounds"]
+    data.attrs["scenario"] = tomli_w.dumps(tables)
+    write = {".nc": rollouts._write_netcdf, ".npz": rollouts._write_npz}[ending]
+    write(tmp_path / f"old{ending}", {"run": data})
+    loaded = ij.load(tmp_path / f"old{ending}")
+    assert jax.tree.structure(loaded.scenario) == jax.tree.structure(batch.scenario)
+    jax.tree.map(np.testing.assert_array_equal, loaded.scenario, batch.scenario)
+    np.testing.assert_array_equal(loaded.q, batch.q)
 
 
 def test_a_single_run_is_called_run(short_run, tmp_path):

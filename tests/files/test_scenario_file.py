@@ -60,8 +60,7 @@ def scenarios(draw) -> ij.Scenario:
         plant=plant,
         model=draw(st.sampled_from([plant, *TWO_JOINTS])),
         reference=one(members.REFERENCES),
-        bounds=both_sides(),
-        velocity_bounds=both_sides() if limited else None,
+        bounds=(both_sides(), both_sides() if limited else None),
         controller=law,
         observer=one(members.OBSERVERS),
         disturbance=one(members.DISTURBANCES),
@@ -112,6 +111,81 @@ def test_other_numbers_of_joints(robot, tmp_path):
     )
     ij.save_scenario(scenario, tmp_path / "a.toml")
     assert_equal(scenario, ij.load_scenario(tmp_path / "a.toml"))
+
+
+WALL = ij.Bounds(lower=ij.bounds.Constant(-1.5), upper=ij.bounds.Constant(2.0))
+
+
+def test_bounds_are_a_table_or_one_for_each_level(paper, tmp_path):
+    """A file with bounds of the first level alone has no list of tables."""
+    place = tmp_path / "a.toml"
+    for scenario, header in (
+        (paper, "\n[bounds.lower]\n"),
+        (ij.with_parts(paper, bounds=(paper.bounds[0], WALL)), "\n[[bounds]]\n"),
+        (ij.presets.flexible_joint_two_link(), '\n    "none",\n'),
+    ):
+        ij.save_scenario(scenario, place)
+        text = place.read_text()
+        assert header in text
+        assert ("[[bounds]]" in text) == (header == "\n[[bounds]]\n")
+        assert_equal(scenario, ij.load_scenario(place))
+
+
+def of_earlier_version(scenario: ij.Scenario) -> dict[str, Any]:
+    """The tables as versions wrote them that had the bounds of other levels in fields of their
+    own.
+    """
+    tables = scenario_file.scenario_to_dict(scenario)
+    first, *levels = tables["bounds"]
+    tables["bounds"] = first
+    if ij.plants.order_of(scenario.plant) > 2:
+        return tables | {"state_bounds": levels}
+    return tables | {"velocity_bounds": levels[0]}
+
+
+@pytest.mark.parametrize(
+    ("preset", "header"),
+    [
+        ("zhang_yan_2024_full_state", "\n[velocity_bounds.lower]\n"),
+        ("motor_driven_pendulum", "\n[[state_bounds]]\n"),
+        ("flexible_joint_two_link", "state_bounds = ["),
+    ],
+)
+def test_files_of_earlier_versions_load(preset, header, tmp_path):
+    scenario = ij.presets.PRESETS[preset]()
+    text = tomli_w.dumps(of_earlier_version(scenario))
+    assert header in text
+    (tmp_path / "a.toml").write_text(text)
+    assert_equal(scenario, ij.load_scenario(tmp_path / "a.toml"))
+
+
+def test_tables_of_earlier_versions_that_contradict_each_other_are_refused():
+    tables = of_earlier_version(ij.presets.zhang_yan_2024_full_state())
+    speeds = tables["velocity_bounds"]
+    same = scenario_file.from_dict(tables).scenario
+    for levels in ([], ["none"]):
+        assert_equal(scenario_file.from_dict(tables | {"state_bounds": levels}).scenario, same)
+    for levels, message in (
+        ([speeds], "state_bounds: .* either velocity_bounds or state_bounds"),
+        (3, "state_bounds: got 3, expected a list"),
+        (["none", speeds], "bounds: got '3 bounds', expected at most 2"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            scenario_file.from_dict(tables | {"state_bounds": levels})
+
+
+def test_parameters_of_a_file_have_short_and_earlier_paths():
+    text = """preset = "motor_driven_pendulum"
+[parameters]
+"bounds.lower.value" = -1.3
+"velocity_bounds.upper.value" = 2.7
+"state_bounds[1].lower.value" = -2.8
+"bounds[2].upper.value" = 2.9
+"""
+    found = scenario_file.from_dict(tomllib.loads(text)).scenario.bounds
+    assert float(found[0].lower.value[0]) == -1.3
+    assert float(found[1].upper.value[0]) == 2.7
+    assert [float(x[0]) for x in (found[2].lower.value, found[2].upper.value)] == [-2.8, 2.9]
 
 
 def test_the_same_robot_is_written_once(paper):
@@ -197,7 +271,7 @@ def test_none_where_the_default_is_something_else(paper, monkeypatch):
 
     monkeypatch.setitem(ij.bounds.MEMBERS, "limited", Limited)
     for upper in (Limited(), Limited(limit=1.0), Limited(word=None)):
-        mine = dataclasses.replace(paper, bounds=dataclasses.replace(paper.bounds, upper=upper))
+        mine = dataclasses.replace(paper, bounds=dataclasses.replace(paper.bounds[0], upper=upper))
         assert_equal(scenario_file.from_dict(scenario_file.scenario_to_dict(mine)).scenario, mine)
 
 

@@ -31,6 +31,7 @@ from iblf_jax.simulation.metrics import standard
 from iblf_jax.simulation.scenario import canonical
 
 PRESET = ij.presets.zhang_yan_2024()
+POSITIONS = PRESET.bounds[0]
 DT = 1e-3
 STANDARD = standard()
 SPECIAL = {
@@ -103,8 +104,8 @@ def with_member(family: str, name: str, cls):
         PRESET.reference if (family, name) == ("references", "sinusoid") else example(name, cls)
     )
     if family == "bounds":
-        upper = PRESET.bounds.upper if name == "sinusoid" else part
-        return dataclasses.replace(PRESET, bounds=ij.bounds.Bounds(PRESET.bounds.lower, upper))
+        upper = POSITIONS.upper if name == "sinusoid" else part
+        return dataclasses.replace(PRESET, bounds=ij.bounds.Bounds(POSITIONS.lower, upper))
     if family == "decays":
         law = ij.controllers.Backstepping(
             2.0, 20.0, barrier=ij.barriers.Mapping(), decays=example(name, cls)
@@ -116,7 +117,8 @@ def with_member(family: str, name: str, cls):
         if getattr(part, "needs_velocity_bounds", False)
         else None
     )
-    return dataclasses.replace(PRESET, velocity_bounds=speeds, **dict.fromkeys(fields, part))
+    parts = {"bounds": (POSITIONS, speeds), **dict.fromkeys(fields, part)}
+    return dataclasses.replace(PRESET, **parts)
 
 
 FAMILIES = (

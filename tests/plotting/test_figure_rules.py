@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import study_cases as cases
-from made_up_runs import chain, made_up, runaway
+from made_up_runs import chain, made_up, runaway, with_signals
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
@@ -39,7 +39,7 @@ def drawn(figure):
 def changed(run, joint, sample, value, field="q", flag=Status.BOUND_VIOLATED):
     """The run with one sample of one joint changed, and a flag."""
     values = getattr(run, field).at[sample, joint].set(value)
-    return dataclasses.replace(run, **{field: values}, status=jnp.int32(int(flag)))
+    return with_signals(run, **{field: values}, status=jnp.int32(int(flag)))
 
 
 # ---- peaks keep their sign and their joint
@@ -135,7 +135,7 @@ def test_a_relative_error_has_no_unit_in_words():
 def test_other_zooms_have_other_reasons():
     run = made_up(chain(2), duration=20.0)
     assert "first 0.1 s of a transient of " in zoom_titles(plotting.errors(run, zoom=0.1))[0]
-    still = dataclasses.replace(run, e1=0.0 * run.e1, xi=0.0 * run.xi)
+    still = dataclasses.replace(run, e=0.0 * run.e, xi=0.0 * run.xi)
     assert "no transient" in zoom_titles(plotting.errors(still))[0]
     bad = runaway(chain(2))
     assert "every run failed" in zoom_titles(plotting.positions(bad))[0]
@@ -285,8 +285,11 @@ def test_each_joint_is_marked_at_its_own_time():
 
 def test_a_velocity_that_left_its_bounds_is_not_marked_among_the_positions():
     run = made_up(chain(2))
-    wide = jnp.full_like(run.dq, 3.0)
-    run = dataclasses.replace(run, dq_lower=-wide, dq_upper=wide)
+    lower, upper = (
+        jnp.stack([row, jnp.full_like(row, limit)], axis=1)
+        for row, limit in ((run.lower, -3.0), (run.upper, 3.0))
+    )
+    run = dataclasses.replace(run, level_lower=lower, level_upper=upper)
     run = changed(run, 0, 30, 5.0, "dq", Status.VELOCITY_VIOLATED)
     assert [crosses_of(axes) for axes in plotting.velocities(run).axes[::2]] == [[0.3], []]
     assert not any(crosses_of(axes) for axes in plotting.positions(run).axes)
@@ -297,7 +300,7 @@ def test_a_run_that_diverged_inside_its_bounds_is_marked_in_every_panel():
     stopped = {
         name: getattr(run, name).at[100:].set(getattr(run, name)[100]) for name in ("q", "dq")
     }
-    run = dataclasses.replace(run, **stopped)
+    run = with_signals(run, **stopped)
     assert [crosses_of(axes) for axes in plotting.torques(run).axes[::2]] == [[1.0], [1.0]]
 
 

@@ -120,7 +120,8 @@ def test_runs_are_told_apart_without_colour(runs):
 
 def test_shared_bounds_and_uncertain_terms_are_drawn_once_others_each():
     one, same, wider = made_up(chain(2)), made_up(chain(2), shift=0.02), made_up(chain(2))
-    wider = dataclasses.replace(wider, upper=wider.upper + 0.2, disturbance=2 * wider.disturbance)
+    upper = wider.level_upper + 0.2
+    wider = dataclasses.replace(wider, level_upper=upper, disturbance=2 * wider.disturbance)
     for pair, sides, terms in (
         ({"a": one, "b": same}, 1, ["$f$"]),
         ({"a": one, "b": wider}, 2, ["a $f$", "b $f$"]),

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from plant_cases import body, pendulum, symmetric
+from plant_cases import ANGLES, body, pendulum, symmetric
 
 import iblf_jax as ij
 from iblf_jax import plotting
@@ -56,7 +56,7 @@ def test_the_overview_has_a_row_for_every_level(run):
 def test_a_level_is_drawn_with_its_bounds_and_virtual_control(run):
     current = run.plot().axes[2]
     guide = line_of(current, r"virtual control $\alpha_{i-1}$")
-    alpha = np.asarray(run.higher - run.e_higher)[:, 0, 0]
+    alpha = np.asarray(run.x - run.e)[:, 2, 0]
     assert np.allclose(guide.get_ydata(), alpha[: len(guide.get_ydata())])
     assert np.allclose(line_of(current, "bounds").get_ydata(), -20.0)
     low, high = current.get_ylim()
@@ -81,7 +81,7 @@ def test_regions_are_named_by_the_robot_inside_a_plant(flexible_run):
 @pytest.mark.slow
 def test_a_level_without_bounds_shows_none_and_keeps_its_virtual_control_in_view():
     law = ij.controllers.BarrierBackstepping(k=(3.0, 10.0, 30.0))
-    only_third = pendulum(controller=law, state_bounds=(None, symmetric(20.0)))
+    only_third = pendulum(controller=law, bounds=(ANGLES, None, symmetric(20.0)))
     speed = ij.simulate(only_third, duration=0.5, dt=1e-3).plot().axes[1]
     assert not [line for line in speed.get_lines() if line.get_label() == "bounds"]
     guide = line_of(speed, r"virtual control $\alpha_{i-1}$").get_ydata()
@@ -136,7 +136,7 @@ def _ones(t, x):
 
 _ORDER_2 = {
     "controller": ij.controllers.BarrierBackstepping(k=(3.0, 10.0)),
-    "state_bounds": (),
+    "bounds": ANGLES,
     "initial": ij.Initial(x=[[0.3], [0.0]]),
     "disturbance": ij.disturbances.Nothing(),
 }
@@ -144,11 +144,11 @@ _ORDER_2 = {
 
 def test_bounds_of_levels_mark_where_a_run_failed():
     law = ij.controllers.BarrierBackstepping(k=(3.0, 10.0, 30.0))
-    scenario = pendulum(controller=law, state_bounds=(None, symmetric(2.0)))
+    scenario = pendulum(controller=law, bounds=(ANGLES, None, symmetric(2.0)))
     with pytest.warns(UserWarning, match="Level 3"):
         run = ij.simulate(scenario, duration=0.3, dt=1e-3)
     (curve,) = curves_of(run)
-    first = int(np.argmax(np.abs(np.asarray(run.higher)[:, 0, 0]) >= 2.0))
+    first = int(np.argmax(np.abs(np.asarray(run.x)[:, 2, 0]) >= 2.0))
     assert curve.exit_index("level_3", 0) == curve.exit_index("tau", 0) == first
     assert curve.exit_index("q", 0) is None
 
@@ -172,7 +172,7 @@ def test_a_flexible_arm_is_animated_with_its_motors(flexible_run, tmp_path):
     scene = Scene(curves, *motions_of(curves, t))
     scene.move_to(1)
     motors = scene.motors[0].get_xdata()
-    assert np.allclose(motors, flexible_run.higher[100, 0], atol=1e-12)
+    assert np.allclose(motors, flexible_run.x[100, 2], atol=1e-12)
     assert not np.allclose(motors, flexible_run.q[100], atol=1e-3)
     assert plotting.animate(flexible_run, tmp_path / "arm.gif", fps=5).exists()
 

@@ -212,7 +212,7 @@ def with_part(**parts):
     return lambda: ij.simulate(dataclasses.replace(ij.presets.zhang_yan_2024(), **parts), **SHORT)
 
 
-TUBE = ij.presets.zhang_yan_2024().bounds
+TUBE = ij.presets.zhang_yan_2024().bounds[0]
 CHAIN3 = robots.PlanarChain(mass=[1.0, 1.0, 1.0], length=0.3, centre=0.1, inertia=0.1)
 SCENARIOS = {
     "plant-none": (with_part(plant=None), "Scenario.plant", "component"),
@@ -260,7 +260,7 @@ SCENARIOS = {
     ),
     "bounds-wrong-n": (
         with_part(bounds=bounds.Bounds(bounds.Constant([0.1] * 3), TUBE.upper)),
-        "bounds.lower.value",
+        "bounds[0].lower.value",
         "2 (one a joint)",
     ),
     "controller-object": (with_part(controller=object()), "Scenario.controller", "check_law"),
@@ -747,7 +747,7 @@ def test_misspelt_parts_and_fields_get_a_suggestion():
         "'contoller'",
         "Did you mean controller?",
     )
-    refuses(lambda: ij.with_parts(WEAK, velocity_bound=None), "Did you mean velocity_bounds?")
+    refuses(lambda: ij.with_parts(WEAK, bound=None), "Did you mean bounds?")
     refuses(lambda: ij.with_parts(WEAK, zzz=None), "'zzz'", "robot, plant")
     refuses(
         lambda: dataclasses.replace(WEAK, refrence=WEAK.reference),

@@ -111,7 +111,7 @@ def shaw_cortez(runs):
     assert int(run.status) == int(ij.Status.TORQUE_SATURATED)
     assert np.min(run.metrics.margin) > 0
     # The reference leaves the bounds, and is no fault of a filter's run.
-    assert np.any(run.q_d > run.scenario.bounds.upper.value)
+    assert np.any(run.q_d > run.scenario.bounds[0].upper.value)
     evidence = entry.execute(entry.ENTRIES / "shaw_cortez_2022").evidence
     assert evidence["without_term"] > 3 * evidence["with_term"]
 

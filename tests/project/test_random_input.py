@@ -688,7 +688,7 @@ def test_anything_in_the_place_of_the_arguments_of_a_part(part, paper, monkeypat
         monkeypatch.setattr(f"iblf_jax.testing.{checker}.shape_of", entered)
     function, arguments, names = PARTS[part]
     if "tube" in arguments:
-        arguments = {**arguments, "tube": bounds.tube_at(paper.reference, paper.bounds, 0.1)}
+        arguments = {**arguments, "tube": bounds.tube_at(paper.reference, paper.bounds[0], 0.1)}
     refused = set()
     for name in names:
         for label, value in {

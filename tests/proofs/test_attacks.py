@@ -204,7 +204,7 @@ def test_nothing_is_claimed_about_bounds_without_a_barrier():
     assert not any("Nothing is claimed" in sentence for sentence in claimed)
     mixed = pendulum_with_motor((Mapping(), Quadratic(), Quadratic()))
     assert any("the bounds of x_2, x_3" in x for x in chain_problem(mixed, {}).assumptions)
-    free = dataclasses.replace(mixed, state_bounds=())
+    free = dataclasses.replace(mixed, bounds=mixed.bounds[0])
     assert not any("Nothing" in x for x in chain_problem(free, {}).assumptions)
 
 

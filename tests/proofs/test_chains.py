@@ -57,10 +57,10 @@ def lever(*law_barriers, kappa=(0.0, 40.0), **fields) -> ij.Scenario:
     scenario = ij.Scenario(
         plant=Lever(J=1.2, b=0.3, m=2.0),
         reference=SinusoidalReference(offset=0.1, amplitude=0.4, frequency=1.0),
-        bounds=Bounds(
-            lower=Constant(-0.8), upper=Sinusoid(offset=0.9, amplitude=0.1, frequency=2.0)
+        bounds=(
+            Bounds(lower=Constant(-0.8), upper=Sinusoid(offset=0.9, amplitude=0.1, frequency=2.0)),
+            Bounds(lower=Constant(-2.0), upper=Constant(2.5)),
         ),
-        state_bounds=(Bounds(lower=Constant(-2.0), upper=Constant(2.5)),),
         disturbance=disturbances.Levels((None, disturbances.Sinusoids(0.3, 2.0))),
         controller=law,
         observer=observers.LevelObserver(gain=kappa),

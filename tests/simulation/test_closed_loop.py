@@ -190,7 +190,7 @@ def test_plant_error_is_the_uncertain_term(rng):
         rate, sample = step(
             scenario,
             np.asarray(0.3),
-            LoopState(*map(jax.numpy.asarray, (q, v)), (), jax.numpy.asarray(eta)),
+            LoopState(jax.numpy.stack([q, v]), (), jax.numpy.asarray(eta)),
         )
         tau = np.asarray(sample.tau)
         M, C, G, _ = loaded.arm(q)

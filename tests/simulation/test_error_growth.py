@@ -258,7 +258,7 @@ def test_the_error_of_the_held_command_moves_the_threshold(distance, jumped):
     zero = jnp.zeros(())
     growth = error_growth.begin(scenario, state, jnp.eye(1))
     part, *others = growth.error
-    growth = growth._replace(error=(part._replace(q=jnp.full(2, 1e-6)), *others))
+    growth = growth._replace(error=(part._replace(x=part.x.at[0].set(1e-6)), *others))
     normal = jnp.zeros(scenario.sensor.draws)
     always = ij.with_parts(scenario, sampling=ij.Sampling(period=4e-3))
 

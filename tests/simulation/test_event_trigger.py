@@ -42,7 +42,7 @@ def free_scenario(case, law=lambda inner: inner, **trigger):
     return chain_cases.scenario(
         "pendulum",
         controller=law(inner),
-        state_bounds=(),
+        bounds=chain_cases.bounds_of(case),
         disturbance=ij.disturbances.Nothing(),
         sampling=ij.Sampling(PERIOD, trigger=ij.EventTrigger(**trigger)),
     )
@@ -171,9 +171,7 @@ def test_commands_are_held_within_the_threshold():
     step = jax.jit(run_sampled_law)
     noise = jnp.zeros((free.sensor.draws, free.n))
     for k in np.flatnonzero(~sent)[:5] + 1:
-        state = initial_state(free)._replace(
-            q=run.q[k], dq=run.dq[k], observer=run.observer_state[k - 1]
-        )
+        state = initial_state(free)._replace(x=run.x[k], observer=run.observer_state[k - 1])
         # The observer's state of a record is the one after its sample.
         wanted = np.asarray(step(free, run.t[k], state, noise).sampled.commands[0])
         threshold = 0.1 * np.abs(tau[k]) + [0.3, 0.1]

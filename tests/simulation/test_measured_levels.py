@@ -61,7 +61,7 @@ def test_a_current_sensor_in_the_loop():
     step = 2.0 * np.pi / 65536
     counts = np.asarray(run.measured.q[::2]) / step
     np.testing.assert_allclose(counts, np.round(counts), atol=1e-6)
-    error = np.asarray(run.measured.higher - run.higher)[::2]
+    error = np.asarray(run.measured.higher - run.x[:, 2:])[::2]
     assert 0.8 * 0.02 < error.std() < 1.2 * 0.02 and abs(error.mean()) < 5e-3
 
 
@@ -71,7 +71,7 @@ def test_the_same_sensor_as_a_part_and_alone_give_the_same_run():
     alone = simulated(loop(DRIVE, sensor=FILTERED), duration=0.1)
     part = simulated(loop(DRIVE, sensor=Levels((FILTERED, Direct()))), duration=0.1)
     np.testing.assert_allclose(part.x, alone.x, rtol=1e-12)
-    np.testing.assert_array_equal(alone.measured.higher[::2], alone.higher[::2])
+    np.testing.assert_array_equal(alone.measured.higher[::2], alone.x[::2, 2:])
 
 
 @pytest.mark.parametrize(
@@ -116,7 +116,7 @@ def test_unmeasured_levels_of_a_flexible_joint(motor):
     errors = [float(np.max(np.abs(r.e1[late]))) for r in (reference, run)]
     assert errors[1] < 2.0 * errors[0] and errors[1] < 2e-3, errors
     np.testing.assert_allclose(run.measured.dq[late], run.dq[late], atol=5e-4)
-    theta = run.higher[late, 0]
+    theta = run.x[late, 2]
     if motor is None:
         inertia = np.asarray(LINK.mass_matrix(jnp.zeros(1)))[0]
         theta = theta + inertia * run.disturbance[late, 1] / 300.0

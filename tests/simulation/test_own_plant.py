@@ -41,16 +41,15 @@ class Tanks:
         return jnp.stack([flow, 1.0 / (2.0 * self.area * x[1])])
 
 
+TUBE = ij.Bounds(lower=ij.bounds.Funnel(-0.01, -0.01, 0.0), upper=ij.bounds.Funnel(0.01, 0.01, 0.0))
+
+
 def tanks(**parts: Any) -> ij.Scenario:
-    tube = ij.Bounds(
-        lower=ij.bounds.Funnel(-0.01, -0.01, 0.0), upper=ij.bounds.Funnel(0.01, 0.01, 0.0)
-    )
     root = ij.Bounds(lower=ij.bounds.Constant(0.1), upper=ij.bounds.Constant(0.6))
     own: dict[str, Any] = {
         "plant": Tanks(a1=5e-5, a2=7e-5),
         "reference": ij.references.Sinusoid(offset=0.12, amplitude=0.02, frequency=0.02),
-        "bounds": tube,
-        "state_bounds": (root,),
+        "bounds": (TUBE, root),
         "controller": ij.controllers.BarrierBackstepping(
             k=(0.03, 0.1), barriers=(ij.barriers.Mapping(),) * 2, weights=(1e4, 400.0)
         ),
@@ -63,7 +62,7 @@ def tanks(**parts: Any) -> ij.Scenario:
 def test_a_start_without_the_second_level_is_named(bounded):
     parts: dict[str, Any] = {"initial": ij.Initial(q=0.125)}
     if not bounded:
-        parts["state_bounds"] = ()
+        parts["bounds"] = TUBE
     with pytest.raises(ValueError, match=r"x_2 is 0 if Initial has no dq: Initial\(x=\.\.\.\)"):
         ij.simulate(tanks(**parts), **SHORT)
 
@@ -73,13 +72,6 @@ def test_a_start_at_a_singular_gain_is_shown_with_its_levels():
     with pytest.raises(ValueError, match=r"The start is x = \[\[0.125\], \[0.2\]\]") as caught:
         ij.simulate(scenario, **SHORT)
     assert "dq" not in str(caught.value)
-
-
-def test_no_bounds_of_the_levels_are_an_empty_tuple():
-    with pytest.raises(
-        ValueError, match=r"state_bounds: got None, expected a tuple, \(\) for none"
-    ):
-        tanks(state_bounds=None)
 
 
 def test_weights_of_a_root_have_the_unit_of_its_square():

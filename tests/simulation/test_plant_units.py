@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from plant_cases import body, pendulum
+from plant_cases import ANGLES, body, pendulum
 
 import iblf_jax as ij
 from iblf_jax.presets.paper import customary_two_link as two_link
@@ -24,9 +24,10 @@ PENDULUM_UNITS = {
     "reference.amplitude": "rad",
     "reference.phase": "rad",
     "bounds.lower.value": "rad",
-    "state_bounds[0].lower.value": "rad/s",
-    "state_bounds[1].upper.value": "A",
-    "state_bounds[1].upper.value[0]": "A",
+    "bounds[0].lower.value": "rad",
+    "bounds[1].lower.value": "rad/s",
+    "bounds[2].upper.value": "A",
+    "bounds[2].upper.value[0]": "A",
     "disturbance.parts[1].amplitude": "rad/s^2",
     "disturbance.parts[1].frequency": "rad/s",
     "controller.k": "1/s",
@@ -120,7 +121,7 @@ def test_metrics_have_the_units_of_the_plant(pendulum_run, body_run):
 def test_signals_have_the_units_and_names_of_the_plant(pendulum_run):
     scenario = pendulum_run.scenario
     assert signal_unit(scenario, "tau") == "V"
-    assert signal_unit(scenario, "higher") == "A"
+    assert signal_unit(scenario, "x") == "rad; rad/s; A"
     assert signal_unit(body(), "e1", 2) == "rad"
     meanings = signal_meanings(scenario)
     assert meanings["q"] == "angle"
@@ -149,9 +150,9 @@ def test_the_violated_level_and_its_first_time():
     bounds = ij.Bounds(lower=ij.bounds.Constant(-2.0), upper=ij.bounds.Constant(2.0))
     with pytest.warns(UserWarning, match="level 3|Level 3"):
         run = ij.simulate(
-            pendulum(controller=plain, state_bounds=(None, bounds)), duration=0.5, dt=1e-3
+            pendulum(controller=plain, bounds=(ANGLES, None, bounds)), duration=0.5, dt=1e-3
         )
-    current = np.asarray(run.higher)[:, 0, 0]
+    current = np.asarray(run.x)[:, 2, 0]
     first = float(run.t[np.argmax(np.abs(current) >= 2.0)])
     assert run.metrics.first_level_violation_time == pytest.approx(first, abs=1e-9)
     assert run.metrics.first_level_violation_level == 3
@@ -169,10 +170,9 @@ def test_a_law_of_robots_has_no_margin_of_higher_virtual_controls():
         plant=plant,
         model=robot,
         reference=rigid.reference,
-        bounds=rigid.bounds,
+        bounds=(rigid.bounds[0], None, wide),
         controller=rigid.controller,
         initial=ij.Initial(q=[0.8, 0.8]),
-        state_bounds=(None, wide),
     )
     with pytest.warns(UserWarning, match="a bound was violated"):
         run = ij.simulate(scenario, duration=0.05, dt=2e-4)

@@ -416,10 +416,8 @@ def exits(rate: float, dt: float, level: int, **options) -> ij.Study:
     far, near = (
         bounds.Bounds(lower=bounds.Constant(-x), upper=bounds.Constant(x)) for x in (5.0, WALL)
     )
-    walls = {"bounds": near, "velocity_bounds": None}
-    if level == 2:
-        walls = {"bounds": far, "velocity_bounds": near}
-    scenario = ij.with_parts(scenario, initial=ij.Initial(q=[0.0], dq=[0.0]), **walls)
+    walls = (near, None) if level == 1 else (far, near)
+    scenario = ij.with_parts(scenario, initial=ij.Initial(q=[0.0], dq=[0.0]), bounds=walls)
     given = {"runs": EXIT_RUNS, "duration": 1.0, "dt": dt, "method": "stochastic_heun"}
     return ij.monte_carlo(scenario, {}, progress=False, **(given | options))
 

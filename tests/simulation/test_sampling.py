@@ -644,7 +644,7 @@ def test_ranges_end_where_a_count_is_more_than_the_drive_gives():
             state = jax.tree.map(lambda x, i=i: x[i], states)
             commands = [
                 run_sampled_law(
-                    changed, t, state._replace(q=q), jnp.zeros((0, 2))
+                    changed, t, state._replace(x=state.x.at[0].set(q)), jnp.zeros((0, 2))
                 ).sampled.commands[0]
                 for q in state.q + count * MOVED
             ]

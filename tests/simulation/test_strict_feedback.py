@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import chain_cases
 import independent_chains as other
 import jax
@@ -57,14 +59,68 @@ def test_a_flexible_joint_starts_at_the_equilibrium_of_its_springs():
     np.testing.assert_allclose(run.x[0, 3], [0.1, 0.0])
 
 
-def test_a_robot_keeps_its_bounds_of_velocities_by_either_name():
-    preset = ij.presets.zhang_yan_2024_full_state()
-    limits = preset.velocity_bounds
-    same = ij.with_parts(preset, velocity_bounds=None, state_bounds=(limits,))
-    assert same.velocity_bounds is limits
-    assert same.state_bounds == ()
-    with pytest.raises(ValueError, match="either velocity_bounds or state_bounds"):
-        ij.with_parts(preset, state_bounds=(limits,))
+def test_bounds_have_one_entry_for_each_level():
+    preset = ij.presets.motor_driven_pendulum()
+    first, second, third = preset.bounds
+    parts = {"controller": controllers.BarrierBackstepping(k=(2.0, 15.0, 60.0))}
+    for given, expected in (
+        ((first, None, third), (first, None, third)),
+        ([first, second], (first, second, None)),
+        ((first,), (first, None, None)),
+    ):
+        changed = ij.with_parts(preset, bounds=given, **parts)
+        assert changed.bounds == changed.context.bounds == expected
+    single = dataclasses.replace(preset, bounds=second, **parts)
+    assert single.bounds == (second, None, None)
+    arm = ij.presets.flexible_joint_two_link()
+    law = controllers.BarrierBackstepping(k=(2.0, 10.0))
+    robot = arm.plant.robot
+    rigid = ij.with_parts(arm, robot=robot, bounds=(*arm.bounds[:2], None, None), controller=law)
+    assert rigid.bounds == arm.bounds[:2]
+
+
+def test_a_single_bounds_replaces_that_of_the_first_level():
+    wide = ij.Bounds(lower=bounds.Constant(-3.0), upper=bounds.Constant(3.0))
+    for preset in (ij.presets.zhang_yan_2024_full_state(), ij.presets.motor_driven_pendulum()):
+        changed = ij.with_parts(preset, bounds=wide)
+        np.testing.assert_array_equal(changed.bounds[0].upper.value, 3.0)
+        assert changed.bounds[1:] == preset.bounds[1:]
+
+
+WALL = ij.Bounds(lower=bounds.Constant(-1.0), upper=bounds.Constant(1.0))
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ((WALL,) * 4, r"bounds: got '4 bounds', expected at most 3, for the levels 1 to 3"),
+        ((WALL, 2.0), r"bounds\[1\]: got 2\.0?, expected a Bounds, or None for a level without"),
+        ((None, WALL), r"bounds\[0\]: got None, expected the bounds of the first level"),
+        ((), r"bounds\[0\]: got None, expected the bounds of the first level"),
+        (2.0, r"bounds: got 2\.0?, expected a Bounds, .*, or a tuple of one for each level"),
+    ],
+)
+def test_bounds_that_are_refused(given, message):
+    with pytest.raises(ValueError, match=rf"Scenario\.{message}"):
+        ij.with_parts(ij.presets.motor_driven_pendulum(), bounds=given)
+
+
+def test_paths_of_earlier_versions_lead_to_the_bounds_of_levels():
+    preset = ij.presets.motor_driven_pendulum()
+    paths = {
+        "bounds.lower.value": "bounds[0].lower.value",
+        "velocity_bounds.upper.value": "bounds[1].upper.value",
+        "state_bounds[0].lower.value[0]": "bounds[1].lower.value[0]",
+        "state_bounds[1].upper.value": "bounds[2].upper.value",
+    }
+    for i, (earlier, path) in enumerate(paths.items()):
+        value = 3.0 + 0.1 * i
+        changed = ij.with_parameters(preset, {earlier: value})
+        assert float(jnp.ravel(ij.paths.get(changed, path))[0]) == value
+        assert ij.paths.get(changed, earlier) == ij.paths.get(changed, path)
+        assert ij.paths.unit_at(preset, earlier) == ij.paths.unit_at(preset, path)
+    with pytest.raises(ValueError, match=r"'bounds\.lower\.valu'.*Did you mean bounds\[0\]\.lower"):
+        ij.with_parameters(preset, {"bounds.lower.valu": 1.0})
 
 
 @pytest.mark.slow
@@ -127,13 +183,16 @@ def test_bounds_of_a_level_are_recorded_under_every_law():
     plant = stiff_arm(preset.plant)
     narrow = ij.Bounds(lower=bounds.Constant(-0.5), upper=bounds.Constant(0.5))
     scenario = ij.with_parts(
-        preset, plant=plant, state_bounds=(None, None, narrow), controller=preset.controller
+        preset,
+        plant=plant,
+        bounds=(preset.bounds[0], None, None, narrow),
+        controller=preset.controller,
     )
     with pytest.warns(ij.SimulationWarning):
         run = ij.simulate(scenario, duration=0.5, dt=2e-4)
     assert int(run.status) & ij.Status.STATE_BOUND_VIOLATED
-    np.testing.assert_array_equal(run.higher_upper[:, 1], 0.5)
-    assert np.all(np.isinf(run.higher_upper[:, 0]))
+    np.testing.assert_array_equal(run.level_upper[:, 3], 0.5)
+    assert np.all(np.isinf(run.level_upper[:, 2]))
 
 
 @pytest.mark.slow

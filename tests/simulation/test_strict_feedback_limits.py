@@ -32,7 +32,7 @@ def on(plant, law, model=None, disturbance=PAPER.disturbance, **parts):
         plant=plant,
         model=model,
         reference=PAPER.reference,
-        bounds=PAPER.bounds,
+        bounds=PAPER.bounds[0],
         controller=law,
         initial=PAPER.initial,
         disturbance=disturbance,

@@ -155,9 +155,9 @@ def test_bad_arguments(paper):
     for wrong in (
         3.0,
         None,
-        state._replace(q=np.zeros(3)),
+        state._replace(x=np.zeros((2, 3))),
         state._replace(controller=np.zeros(2)),
-        state._replace(q="ab"),
+        state._replace(x="ab"),
         (1, 2, 3, 4),
     ):
         with pytest.raises(ValueError, match="state: "):

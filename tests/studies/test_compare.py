@@ -161,9 +161,8 @@ def test_laws_for_other_constraints_have_names_and_margins():
     know of."""
     speeds = ij.Bounds(ij.bounds.Constant([-1.0, -0.6]), ij.bounds.Constant([0.6, 0.5]))
     wall = ij.regions.HalfSpace(normal=[-1.0, 0.0], offset=-0.245)
-    scenario = ij.with_parts(
-        ij.presets.zhang_yan_2024_full_state(), velocity_bounds=speeds, regions=(wall,)
-    )
+    preset = ij.presets.zhang_yan_2024_full_state()
+    scenario = ij.with_parts(preset, bounds=(preset.bounds[0], speeds), regions=(wall,))
     comparison = ij.compare(
         scenario, ["integral", "full_state", "reference_governor"], duration=0.1, dt=1e-3
     )
@@ -180,7 +179,7 @@ def test_laws_for_other_constraints_have_names_and_margins():
     )
     assert comparison.factors["full_state"] > 1.0
     assert "region margin [m]" in repr(comparison) and "region_margin" in comparison.to_pandas()
-    with pytest.raises(ValueError, match="velocity_bounds"):
+    with pytest.raises(ValueError, match=r"bounds\[1\]"):
         ij.compare(ij.presets.zhang_yan_2024(), ["integral", "full_state"], **RUN)
 
 

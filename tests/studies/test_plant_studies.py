@@ -95,11 +95,12 @@ def errors_below(size):
     ],
 )
 def test_a_settling_time_is_shown_where_the_bounds_do_not_settle_the_run(size, tolerance, shown):
-    scenario = plant_cases.pendulum(bounds=errors_below(size), initial=ij.Initial(x=[[0.0]] * 3))
+    scenario = plant_cases.pendulum(initial=ij.Initial(x=[[0.0]] * 3))
     # The rounded distances of these bounds are 0.01 to 0.010000000000000009.
     offset = ij.references.Sinusoid(offset=0.12, amplitude=0.02, frequency=0.5)
     start = ij.Initial(x=[[0.12], [0.0], [1.2]])
-    scenario = ij.with_parts(scenario, reference=offset, initial=start)
+    parts = {"bounds": errors_below(size), "reference": offset, "initial": start}
+    scenario = ij.with_parts(scenario, **parts)
     laws = {"mapping": scenario.controller}
     folds = (ij.metrics.Settling(tolerance=tolerance),)
     found = ij.compare(scenario, laws, duration=0.01, dt=1e-3, metrics=folds, equal_effort=False)

@@ -44,7 +44,7 @@ def test_the_counts_add_up(study):
 
 def test_starts_outside_are_told_from_violations_of_the_law(study):
     q = np.asarray(study.samples["initial.q"])
-    tube = ij.bounds.tube_at(study.scenario.reference, study.scenario.bounds, 0.0)
+    tube = ij.bounds.tube_at(study.scenario.reference, study.scenario.bounds[0], 0.0)
     outside = np.any((q <= np.asarray(tube.lower)) | (q >= np.asarray(tube.upper)), axis=1)
     assert outside.any()
     np.testing.assert_array_equal(study.started_outside, outside)

@@ -357,7 +357,7 @@ def test_joints_selects_joints_everywhere(joints, expected, three_joints):
     np.testing.assert_allclose(found[3:], [tau.max(), e1.max(), -np.min(inside)], rtol=1e-10)
     # The integrals are those of a run in which the other joints stand still.
     chosen = np.isin(np.arange(3), expected).astype(float)
-    others = dataclasses.replace(run, e1=run.e1 * chosen, tau=run.tau * chosen)
+    others = dataclasses.replace(run, e=run.e * chosen, tau=run.tau * chosen)
     separate = exact(o.tracking() + o.effort() + o.metric(ij.metrics.Tracking(), "iae"), others)
     np.testing.assert_allclose(found[:3], separate, rtol=1e-10)
 
@@ -385,7 +385,9 @@ def test_limits_of_single_joints_and_weights(three_joints):
         excesses(some + same, run), np.tile(np.max(1 / cases[:, [0, 2]], axis=1) - 1, 2), rtol=1e-9
     )
     # Margins, of positions that are inside their bounds.
-    kept = dataclasses.replace(run, lower=run.q - 0.2, upper=run.q + jnp.array([0.1, 0.3, 0.4]))
+    q = run.x[:, :1]
+    upper = q + jnp.array([0.1, 0.3, 0.4])
+    kept = dataclasses.replace(run, level_lower=q - 0.2, level_upper=upper)
     found = excesses(
         [
             o.margin_above([0.05, 0.1, 0.1]),

@@ -198,17 +198,17 @@ def test_numbers_of_a_plant_keep_the_loop_within_the_step():
 def test_bounds_of_levels_contain_the_start():
     drive = canonical(loops_of_plants.electric_drive())
     current = start_levels(drive)[2]
-    low, _, reasons = ends(drive, "state_bounds[1].upper.value")
+    low, _, reasons = ends(drive, "bounds[2].upper.value")
     assert reasons == (ranges.BY_LEVEL, ranges.UNLIMITED)
     np.testing.assert_allclose(low, current + ranges.LEAST_SHARE * (60.0 - current))
-    one = ends(drive, "state_bounds[1].upper.value[1]")[0]
+    one = ends(drive, "bounds[2].upper.value[1]")[0]
     np.testing.assert_allclose(one, low[1:])
-    _, high, reasons = ends(drive, "state_bounds[0].lower.value")
+    _, high, reasons = ends(drive, "bounds[1].lower.value")
     assert reasons == (ranges.UNLIMITED, ranges.BY_LEVEL)
     np.testing.assert_allclose(high, -4.0 * ranges.LEAST_SHARE)
     # A start outside its bounds is refused.
-    narrow = ij.with_parameters(drive, {"state_bounds[1].upper.value": low})
-    assert float(ij.simulate(narrow, **SHORT).higher[0, 0, 0]) < low[0]
+    narrow = ij.with_parameters(drive, {"bounds[2].upper.value": low})
+    assert float(ij.simulate(narrow, **SHORT).x[0, 2, 0]) < low[0]
 
 
 def test_a_period_says_that_it_has_no_derivative(lab):

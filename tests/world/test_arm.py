@@ -237,7 +237,8 @@ def scenario_with(plant, **parts) -> ij.Scenario:
 
 def accelerations(scenario, t: float) -> np.ndarray:
     scenario = canonical(scenario)
-    state = initial_state(scenario)._replace(dq=jnp.asarray([0.3, -0.4]))
+    start = initial_state(scenario)
+    state = start._replace(x=start.x.at[1].set(jnp.asarray([0.3, -0.4])))
     return np.asarray(evaluate(scenario, jnp.asarray(t), state)[0].dq)
 
 

@@ -91,7 +91,7 @@ def test_bounds_are_inside_the_joint_limits(scenario):
     q_d = jax.vmap(scenario.reference.position)(t)
     lower, upper = (
         np.asarray(jax.vmap(side.at)(t, q_d))
-        for side in (scenario.bounds.lower, scenario.bounds.upper)
+        for side in (scenario.bounds[0].lower, scenario.bounds[0].upper)
     )
     limits = scenario.plant.limits
     assert np.all(np.asarray(limits.lower) < lower)
@@ -204,7 +204,7 @@ def test_a_scenario_from_an_arm_alone():
         duration=2.0,
     )
     scenario = arms.arm_scenario(arm, reference)
-    np.testing.assert_array_equal(scenario.bounds.upper.value, arm.upper)
+    np.testing.assert_array_equal(scenario.bounds[0].upper.value, arm.upper)
     np.testing.assert_allclose(scenario.initial.q, reference.start)
     with pytest.raises(ValueError, match="reading"):
         arms.arm_scenario(arm, reference, reading="wrong")

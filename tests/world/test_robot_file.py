@@ -50,7 +50,7 @@ def written(folder, text):
 def test_what_the_file_leaves_out_follows_from_the_arm(folder):
     scenario = ij.load_scenario(written(folder, ROBOT + REFERENCE))
     arm = ij.robots.load(folder / "ur5.urdf", tip="tool0")
-    np.testing.assert_array_equal(scenario.bounds.lower.value, arm.lower)
+    np.testing.assert_array_equal(scenario.bounds[0].lower.value, arm.lower)
     assert isinstance(scenario.controller, Saturated)
     np.testing.assert_array_equal(scenario.controller.limit, arm.effort)
     np.testing.assert_allclose(scenario.initial.q, scenario.reference.position(np.zeros(())))

@@ -57,7 +57,7 @@ def independent_end(duration):
 def test_vector_field_against_an_independent_program():
     scenario = canonical(scenario_of(SWITCHED))
     field = jax.jit(
-        lambda t, q, dq: rate(scenario, t, initial_state(scenario)._replace(q=q, dq=dq))
+        lambda t, q, dq: rate(scenario, t, initial_state(scenario)._replace(x=jnp.stack([q, dq])))
     )
     rng = np.random.default_rng(3)
     for _ in range(30):

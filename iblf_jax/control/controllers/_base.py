@@ -46,11 +46,9 @@ class LawContext(NamedTuple):
 
     model: Robot
     reference: Reference
-    bounds: Bounds
-    velocity_bounds: Bounds | None = None
+    bounds: tuple[Bounds, Bounds | None, *tuple[Bounds | None, ...]]
+    """Of the levels x_1, x_2, ... of the plant; None for a level without."""
     regions: tuple[Region, ...] = ()
-    state_bounds: tuple[Bounds | None, ...] = ()
-    """Bounds of the levels from the second on of a plant in strict-feedback form."""
     shift: Shift | None = None
     """What a law that `takes_shift` adds to the virtual control of the last level, and to its
     rate."""
@@ -77,25 +75,15 @@ class LawContext(NamedTuple):
         upper, dupper = self.shifted(tube.upper, tube.dupper)
         return Tube(q_d, dq_d, lower, upper, dlower, dupper)
 
-    def level_bounds(self, level: int) -> Bounds | None:
-        """The bounds of a level, counted from 1; None where it has none."""
-        if level == 1:
-            return self.bounds
-        if level == 2 and self.velocity_bounds is not None:
-            return self.velocity_bounds
-        if len(self.state_bounds) < level - 1:
-            return None
-        return self.state_bounds[level - 2]
-
     def tube(self, t: jax.Array, *, acceleration: bool = True) -> Tube:
-        """Reference, bounds and their rates at time t [s]; arguments as `bounds.tube_at`."""
-        return _tube(self.reference, self.bounds, t, acceleration)
+        """Reference, bounds of x_1 and their rates at time t [s]; arguments as `bounds.tube_at`."""
+        return _tube(self.reference, self.bounds[0], t, acceleration)
 
     def speed_limits(self, t: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """The bounds on the velocities at time t [s], (n,) each [rad/s]; requires velocity
-        bounds.
+        """The bounds on the velocities of a robot at time t [s], (n,) each [rad/s]; requires
+        `bounds[1]`.
         """
-        return speed_limits_at(self.reference, self.velocity_bounds, t)  # type: ignore[arg-type]
+        return speed_limits_at(self.reference, self.bounds[1], t)  # type: ignore[arg-type]
 
     def regions_along(self, q: jax.Array, dq: jax.Array) -> Along:
         """Levels of all regions and their rates at q [rad] and dq [rad/s]; requires regions."""
@@ -149,7 +137,7 @@ class TrackingLaw(Timed):
     uses_observer: ClassVar[bool] = True
     """Whether it uses f_hat."""
     needs_velocity_bounds: ClassVar[bool] = False
-    """Whether it requires `LawContext.velocity_bounds`."""
+    """Whether it requires bounds of the second level, `LawContext.bounds[1]`."""
     includes_e2: ClassVar[bool] = False
     """Whether its V1 contains its term of e2, so that V2 adds no 1/2 e2^T M0 e2."""
     filters: ClassVar[bool] = False

@@ -219,7 +219,7 @@ def _curve_of_bounds(
     A level without bounds has a tube of constant width.  Its barrier is `Quadratic`, which does not
     use the width.
     """
-    bounds = context.level_bounds(level)
+    bounds = context.bounds[level - 1]
     if bounds is None:
         return [centre[0] - 1.0, *centre[1:]], [centre[0] + 1.0, *centre[1:]]
 
@@ -241,7 +241,7 @@ def _followed(context: LawContext, level: int) -> Callable | None:
     position = context.reference.position
     if level == 1:
         return position
-    if level == 2 and not plants.is_chain(context.model):
+    if level == 2 and plants.as_plant(context.model).reference_levels == 2:
         return lambda t: jax.jvp(position, (t,), (jnp.ones_like(t),))[1]
     return None
 

@@ -207,7 +207,7 @@ class BarrierBackstepping(Law):
         t = jnp.zeros((), x.dtype)
         ratios = [_ratio(self.barriers[0], context.tube(t), context.tube(t).q_d)]
         for i in range(1, self.order):
-            tube = _tube_at_rest(context.level_bounds(i + 1), t, jnp.zeros_like(x[i]))
+            tube = _tube_at_rest(context.bounds[i], t, jnp.zeros_like(x[i]))
             ratios.append(_ratio(self.barriers[i], tube, tube.q_d))
         return jnp.stack(ratios)
 
@@ -247,10 +247,10 @@ class BarrierBackstepping(Law):
 
     def _check_sides(self, context: LawContext, i: int) -> None:
         """Raises ValueError for bounds of level i + 1 with too few continuous derivatives."""
-        bounds = context.level_bounds(i + 1)
+        bounds = context.bounds[i]
         if self.filter is not None or bounds is None or isinstance(self.barriers[i], Quadratic):
             return
-        name = "bounds" if i == 0 else f"state_bounds[{i - 1}]"
+        name = f"bounds[{i}]"
         needed = self.order - i
         for side_name, side in (("lower", bounds.lower), ("upper", bounds.upper)):
             smooth = side.continuous_derivatives
@@ -269,9 +269,9 @@ class BarrierBackstepping(Law):
         name, kind = f"controller.barriers[{i}]", type(barrier).__name__
         if isinstance(barrier, Quadratic):
             return
-        bounds = context.level_bounds(i + 1)
+        bounds = context.bounds[i]
         if bounds is None:
-            field = f"state_bounds[{i - 1}]"
+            field = f"bounds[{i}]"
             expected = f"bounds of level {i + 1} for the barrier {kind}"
             remedy = "Or take barriers.Quadratic() for that level."
             raise checks.fail(field, None, expected, remedy)

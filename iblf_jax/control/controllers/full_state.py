@@ -94,7 +94,7 @@ class FullState(RobotLaw):
     """tau = C0 q' + G0 + M0 (a2 - w s1 e2/s2 - c s2) - f_hat,   a2 = alpha' - (K2 + kappa2) e2 for
     the integral barrier.
 
-    It keeps the scenario's `velocity_bounds` too, as long as alpha is inside them (`alpha_margin` >
+    It keeps the scenario's `bounds[1]` too, as long as alpha is inside them (`alpha_margin` >
     0); symbols at the head of this module.  Its V1 is that of e1 and that of e2.  Symmetric
     constant bounds with p = 1 logarithms on both are the barriers of the source.
 

@@ -47,6 +47,7 @@ from iblf_jax.core import checks
 from iblf_jax.core.linalg import matmul, matvec, solve_spd
 from iblf_jax.core.pytree import Leaf, component, leaf, static
 from iblf_jax.core.qp import Solution, quadratic_program
+from iblf_jax.world.bounds import bounds_at
 
 NEAREST = ("torque", "acceleration")
 SHAPES1 = ("linear", "atan")
@@ -68,8 +69,8 @@ class SafetyFilter(Wrapping):
       a1: first rate of the position's conditions, () or (n,) [1/s] ([rad/s] for "atan"), > 0; 10 if
         not given.
       a2: second rate of these, () or (n,) [1/s] ([s/rad^2] for "cubic"), > 0; 10 if not given.
-      a3: rate of the velocity's conditions, where the scenario has `velocity_bounds`, () or (n,)
-        [1/s], > 0; 20 if not given.
+      a3: rate of the velocity's conditions, where velocities have bounds, () or (n,) [1/s], > 0; 20
+        if not given.
       b1: first rate of the regions' conditions, where the scenario has `regions`, () [1/s], > 0; 10
         if not given.
       b2: second rate of these, () [1/s], > 0; 10 if not given.
@@ -115,7 +116,7 @@ class SafetyFilter(Wrapping):
         )
         if self.margin is not None:
             lowest, highest = lowest + self.margin, highest - self.margin
-        if context.velocity_bounds is not None:
+        if context.bounds[1] is not None:
             (slow, fast), (dslow, dfast) = jax.jvp(context.speed_limits, (t,), (jnp.ones_like(t),))
             lowest = jnp.maximum(lowest, dslow + self.a3 * (slow - dq))
             highest = jnp.minimum(highest, dfast + self.a3 * (fast - dq))
@@ -203,7 +204,7 @@ def _moving_bounds(
 
     def sides(t):
         q_d = context.reference.position(t)
-        return context.bounds.lower.at(t, q_d), context.bounds.upper.at(t, q_d)
+        return bounds_at(context.bounds[0], t, q_d)
 
     def rates(t):
         return jax.jvp(sides, (t,), (jnp.ones_like(t),))[1]

@@ -56,7 +56,7 @@ LAWS = (*BARRIERS, "adaptive_rbf", "dynamic_surface", *BASELINES)
 """Every system of the paper by the name that `law_by_name`, the presets and `compare` take."""
 KEEPERS = ("full_state", "reference_governor", "safety_filter")
 """Further names that `law_by_name`, the presets and `compare` take: full state (for scenarios with
-`velocity_bounds`; K2 in 1/s), a reference governor around "pd", and a safety filter around the
+`bounds[1]`; K2 in 1/s), a reference governor around "pd", and a safety filter around the
 unconstrained "backstepping"."""
 
 _WITHOUT_OBSERVER = ("adaptive_rbf", "pd", "reference_governor")

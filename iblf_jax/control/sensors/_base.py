@@ -40,6 +40,11 @@ class Measurement(NamedTuple):
         return state_of_levels(self.q, self.dq, self.higher)
 
 
+def measurement_of(x: jax.Array) -> Measurement:
+    """The measurement of the levels x, (r, n), without an error."""
+    return Measurement(x[0], x[1], x[2:] if len(x) > 2 else ())
+
+
 class AnySensor(Part):
     """What every sensor states: a `Sensor` of the state x, a `RobotSensor` of q and q', or a
     `LevelSensor` of one level.

@@ -61,7 +61,7 @@ def _replay(
 
     def one(state: LoopState, now: Any) -> tuple[LoopState, LoopState]:
         t, q, dq, due, applied = now
-        state = state._replace(q=q, dq=dq)
+        state = state._replace(x=jnp.stack([q, dq]))
         run = partial(run_sampled_law, scenario, t, normal=normal, applied=applied)
         state = jax.lax.cond(due, run, lambda state: state, state)
         return state, state

@@ -54,6 +54,9 @@ class Plant(Dynamics):
     robot: Robot | None = None
     """The robot inside a plant whose first two levels are its q and q'.  Disturbances, friction and
     observers of robots then act on it, as the torque that is added to it."""
+    reference_levels: ClassVar[int] = 1
+    """Number of first levels whose bounds follow the reference or its derivative; those of the
+    other levels follow the virtual controls."""
     needs_filters: ClassVar[bool] = False
     """Whether the drift depends on a later level whose derivatives no law may form.  Such a plant
     is the model of a law with filters, and never the plant of a scenario."""

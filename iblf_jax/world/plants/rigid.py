@@ -109,6 +109,8 @@ class RobotPlant(Rigid):
     Source: Zhang & Yan 2024, (2.1), (3.12).
     """
 
+    reference_levels: ClassVar[int] = 2
+
     @property
     def estimate_shape(self) -> tuple[int, ...]:
         """The shape of an estimate of the torque f of (2.1), (n,)."""

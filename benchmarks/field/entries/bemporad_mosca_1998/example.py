@@ -55,8 +55,7 @@ def task(k, barrier):
     return ij.Scenario(
         plant=Servo(inertia=INERTIA, stiffness=STIFFNESS),
         reference=ij.references.Sinusoid(offset=SET_POINT, amplitude=0.0),
-        bounds=between(-1.0, 4.0),
-        state_bounds=(None, between(-TORQUE, TORQUE), None),
+        bounds=(between(-1.0, 4.0), None, between(-TORQUE, TORQUE)),
         controller=ij.controllers.Saturated(law, limit=VOLTAGE),
         initial=ij.Initial(x=[[0.0]] * 4),
     )

@@ -102,8 +102,10 @@ def funnel(first, last):
 scenario = ij.Scenario(
     plant=RelativeMotion(),
     reference=Approach(),
-    bounds=ij.Bounds(lower=funnel(-9.0, -150.0), upper=funnel(9.0, 150.0)),
-    state_bounds=(ij.Bounds(ij.bounds.Constant(-V_MAX), ij.bounds.Constant(V_MAX)),),
+    bounds=(
+        ij.Bounds(lower=funnel(-9.0, -150.0), upper=funnel(9.0, 150.0)),
+        ij.Bounds(ij.bounds.Constant(-V_MAX), ij.bounds.Constant(V_MAX)),
+    ),
     controller=DockingProgramme(),
     initial=ij.Initial(x=[START, [0.0, 0.0]]),
 )

@@ -98,8 +98,10 @@ def arm(centre, inertia):
 scenario = ij.Scenario(
     plant=arm(0.35, 0.06125),
     reference=ij.references.Sinusoid(offset=0.0, amplitude=0.3, phase=[0.0, np.pi / 2]),
-    bounds=ij.Bounds(lower=Shrinking(-WIDTH), upper=Shrinking(WIDTH)),
-    velocity_bounds=ij.Bounds(ij.bounds.Constant(-SPEED), ij.bounds.Constant(SPEED)),
+    bounds=(
+        ij.Bounds(lower=Shrinking(-WIDTH), upper=Shrinking(WIDTH)),
+        ij.Bounds(ij.bounds.Constant(-SPEED), ij.bounds.Constant(SPEED)),
+    ),
     controller=SettlingTimeLaw(k1=4.0, k2=15.0, speed_factor=1.0),
     disturbance=ij.disturbances.Sinusoids([0.0, -0.1], 1.0, np.pi / 2, [UNKNOWN, 0.0]),
     initial=ij.Initial(q=[0.15, 0.4]),

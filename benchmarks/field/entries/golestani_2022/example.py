@@ -72,8 +72,8 @@ class ConstrainedPD:
         """The torque, and theta' = (|s| - 2 exp(-t/2) theta)/0.1."""
         q, w = x
         s, u = w + self.c * q, -40.0 * q - self.kd * w
-        near_q = self.growth(q / context.bounds.upper.at(t, q))
-        near_w = self.growth(w / context.state_bounds[0].upper.at(t, w))
+        near_q = self.growth(q / context.bounds[0].upper.at(t, q))
+        near_w = self.growth(w / context.bounds[1].upper.at(t, w))
         u -= (1.5 * near_q + 1.2 * near_w) * s + state * jnp.clip(s / 0.01, -1.0, 1.0)
         u = jnp.clip(u, -self.limit, self.limit)
         rate = 10.0 * (jnp.sqrt(s @ s + 1e-12) - 2.0 * jnp.exp(-0.5 * t) * state)
@@ -86,8 +86,10 @@ def task(T, law, q=(0.2, -0.15, -0.25), w=(0.0, 0.0, 0.0), r0=0.3):
         plant=Spacecraft(INERTIA, [0.05, 0.1, 0.15]),
         model=Spacecraft(INERTIA, 0.0),
         reference=ij.references.Sinusoid(0.0, 0.0),
-        bounds=ij.Bounds(FiniteTime(-r0, -0.008, T), FiniteTime(r0, 0.008, T)),
-        state_bounds=(ij.Bounds(FiniteTime(-0.4, -0.005, T), FiniteTime(0.4, 0.005, T)),),
+        bounds=(
+            ij.Bounds(FiniteTime(-r0, -0.008, T), FiniteTime(r0, 0.008, T)),
+            ij.Bounds(FiniteTime(-0.4, -0.005, T), FiniteTime(0.4, 0.005, T)),
+        ),
         controller=law,
         initial=ij.Initial(x=[q, w]),
     )
@@ -108,7 +110,7 @@ runs = {name: ij.simulate(case, duration=20.0, dt=2e-3) for name, case in cases.
 
 def share(run):
     """The largest ratios of attitude and rates to their bounds."""
-    sides = (run.scenario.bounds.upper, run.scenario.state_bounds[0].upper)
+    sides = [level.upper for level in run.scenario.bounds]
     bounds = [jax.vmap(lambda t, s=s: s.at(t, jnp.zeros(3)))(run.t) for s in sides]
     return jnp.abs(run.x / jnp.stack(bounds, axis=1)).max(axis=(0, 2))
 

@@ -87,8 +87,10 @@ GAINS = {"k1": [22.0, 505.0], "k2": [20.0, 50.0], "k3": [10.0, 5.0]}
 scenario = ij.Scenario(
     plant=ij.robots.TwoLink(**NUMBERS, **RODS),
     reference=ij.references.Sinusoid(**REFERENCE),
-    bounds=ij.Bounds(ij.bounds.Constant(Q_MIN), ij.bounds.Constant(Q_MAX)),
-    velocity_bounds=ij.Bounds(ij.bounds.Constant(V_MIN), ij.bounds.Constant(V_MAX)),
+    bounds=(
+        ij.Bounds(ij.bounds.Constant(Q_MIN), ij.bounds.Constant(Q_MAX)),
+        ij.Bounds(ij.bounds.Constant(V_MIN), ij.bounds.Constant(V_MAX)),
+    ),
     controller=ExogenousStates(**GAINS),
     initial=ij.Initial(q=[0.0, 0.0]),
 )

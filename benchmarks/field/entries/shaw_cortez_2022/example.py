@@ -20,7 +20,7 @@ unfiltered = ij.simulate(
 )
 runs = {"filtered": run, "without filter": unfiltered}
 published = np.loadtxt(here.with_name("published.csv"), delimiter=",", skiprows=1)
-lower, upper = scenario.bounds.lower.value, scenario.bounds.upper.value
+lower, upper = scenario.bounds[0].lower.value, scenario.bounds[0].upper.value
 figure, axes = plt.subplots(2, 2, figsize=(9, 5.0), sharex=True, layout="constrained")
 for joint, (above, below) in enumerate(axes.T):
     above.plot(unfiltered.t, unfiltered.q[:, joint], color="0.7", label="without filter")

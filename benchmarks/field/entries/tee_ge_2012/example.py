@@ -44,8 +44,7 @@ def law(**fields):
 scenario = ij.Scenario(
     plant=Plant(),
     reference=ij.references.Sinusoid(offset=0.0, amplitude=0.2, frequency=2.5),
-    bounds=within(1.0),
-    state_bounds=(within(2.5),),
+    bounds=(within(1.0), within(2.5)),
     controller=law(),
     initial=ij.Initial(x=[[0.5], [2.0]]),
 )

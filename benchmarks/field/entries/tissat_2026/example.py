@@ -115,8 +115,11 @@ def between(lower, upper):
 scenario = ij.Scenario(
     plant=ij.plants.StrictFeedback(drift, gain, n=1, order=3),
     reference=ij.references.Sinusoid(offset=0.0, amplitude=3.0, frequency=0.5),
-    bounds=ij.Bounds(lower=Shrinking(-30.0, -10.0), upper=Shrinking(28.0, 10.0)),
-    state_bounds=(between(-30.0, 20.0), between(-180.0, 150.0)),
+    bounds=(
+        ij.Bounds(lower=Shrinking(-30.0, -10.0), upper=Shrinking(28.0, 10.0)),
+        between(-30.0, 20.0),
+        between(-180.0, 150.0),
+    ),
     controller=PrescribedTime(time=1.55, k=[0.1, 0.1, 10.0]),
     initial=ij.Initial(x=[[7.5], [5.0], [-10.0]]),
 )

@@ -1,0 +1,99 @@
+"""Files of earlier versions, as this version reads them.
+
+Earlier versions had the bounds of levels above the first in `Scenario.velocity_bounds` and
+`Scenario.state_bounds`, and recorded the levels of a run as `q`, `dq` and `higher`, their errors
+and bounds likewise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax.core import checks
+from iblf_jax.files.values import NONE, Words
+from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.simulation.signals import VIEWS
+
+FIELDS_OF_BOUNDS = ("velocity_bounds", "state_bounds")
+LEVEL_SIGNALS = {
+    signal: tuple(name for name, view in VIEWS.items() if view.signal == signal)
+    for signal in ("x", "e", "level_lower", "level_upper")
+}
+"""Signal of the levels -> the views of its first rows, which files contain."""
+LEVELS_ABOVE = {
+    "x": "higher",
+    "e": "e_higher",
+    "level_lower": "higher_lower",
+    "level_upper": "higher_upper",
+}
+"""Signal of the levels -> the earlier variable with the rows from the third on."""
+
+
+def with_bounds_of_levels(data: Mapping[str, Any]) -> dict[str, Any]:
+    """The tables of a scenario with all bounds in `bounds`."""
+    data = dict(data)
+    velocities, above = data.pop("velocity_bounds", NONE), data.pop("state_bounds", [])
+    if not isinstance(above, list):
+        raise checks.fail("state_bounds", above, "a list")
+    second, *others = above or [NONE]
+    if velocities != NONE and second != NONE:
+        expected = "either velocity_bounds or state_bounds[0]"
+        remedy = "Both are the bounds of the second level."
+        raise checks.fail("state_bounds", Words("bounds of the second level"), expected, remedy)
+    levels = [second if velocities == NONE else velocities, *others]
+    if levels == [NONE] or "bounds" not in data:
+        return data
+    return {**data, "bounds": [data["bounds"], *levels]}
+
+
+def order_of_leaves(tables: Mapping[str, Any], scenario: Scenario) -> list[int]:
+    """The numbers of a scenario's leaves in the order in which a file with these tables has them.
+
+    Earlier versions had the bounds of the levels above the first behind the actuator, those of a
+    robot before the regions and those of another plant after them.
+    """
+    places: list[Any] = [path for path, _ in jax.tree_util.tree_leaves_with_path(scenario)]
+    numbers = list(range(len(places)))
+    if not any(field in tables for field in FIELDS_OF_BOUNDS):
+        return numbers
+    fields = list(Scenario.__dataclass_fields__)
+    is_of_robot = "velocity_bounds" in tables
+    behind = fields.index("regions") + (-0.5 if is_of_robot else 0.5)
+
+    def position(number: int) -> float:
+        field, index = places[number][0].name, getattr(places[number][1], "idx", 0)
+        is_above = field == "bounds" and index > 0
+        return behind if is_above else float(fields.index(field))
+
+    return sorted(numbers, key=position)
+
+
+def levels(found: Mapping[str, Any], signal: str) -> np.ndarray:
+    """A signal of the levels, (..., r, n), of those that a file contains."""
+    if signal in found:
+        return np.asarray(found[signal])
+    given = [found.get(name, ()) for name in LEVEL_SIGNALS[signal]]
+    rows = [np.asarray(x) for x in given if np.size(x)]
+    stacked = np.stack(rows, axis=-2)
+    above = found.get(LEVELS_ABOVE[signal], ())
+    if not np.size(above):
+        return stacked
+    if len(rows) == 1:  # bounds of the first level and of some from the third on
+        infinite = np.full_like(stacked, -np.inf if signal == "level_lower" else np.inf)
+        stacked = np.concatenate([stacked, infinite], axis=-2)
+    return np.concatenate([stacked, np.asarray(above)], axis=-2)
+
+
+def fields_of_run(stored: dict[str, Any]) -> dict[str, Any]:
+    """The fields of a stored Rollout."""
+    if "x" in stored:
+        return stored
+    earlier = {*VIEWS, *LEVELS_ABOVE.values()}
+    others = {name: x for name, x in stored.items() if name not in earlier}
+    as_stored = jnp.asarray if isinstance(stored["q"], jax.Array) else np.asarray
+    return {**others, **{signal: as_stored(levels(stored, signal)) for signal in LEVEL_SIGNALS}}
