@@ -79,7 +79,9 @@ def outcome_of(
 
 
 def _bounds_of_growth(inputs: Inputs, carry: Carry, instants: Linearization) -> jax.Array:
-    """The largest bound (A.4) of the position error, (n,) [rad]; infinite for a continuous loop."""
+    """The largest `error_growth.bound` of the position error, (n,) [rad]; infinite for a continuous
+    loop.
+    """
     sampling: Any = inputs.scenario.sampling
     if sampling is None:
         return jnp.full_like(carry.accuracy.error, jnp.inf)
@@ -87,7 +89,7 @@ def _bounds_of_growth(inputs: Inputs, carry: Carry, instants: Linearization) -> 
     periods = inputs.dt * inputs.steps / sampling.period
     bound = partial(error_growth.bound, inputs.scenario, carry.accuracy.growth, carry.state)
     found = jax.vmap(bound, in_axes=(0, None))(derivatives, periods)
-    return jax.lax.stop_gradient(jnp.max(found, axis=0))  # type: ignore[no-any-return]
+    return jnp.max(found, axis=0)
 
 
 def _sampling_radii(

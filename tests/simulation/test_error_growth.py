@@ -131,6 +131,62 @@ def test_the_stated_error_holds(name, rng):
 
 
 @pytest.mark.slow
+def test_a_fine_encoder_on_an_arm_of_six_joints_is_no_fault():
+    """At 500 Hz, where a code may differ: 131,072 counts are accurate, and 1,024 are so stated."""
+    velocity = ij.sensors.FilteredDifference(cutoff=400.0)
+    arm = ij.with_parts(
+        ij.presets.ur5(),
+        sampling=ij.Sampling(period=2e-3),
+        sensor=ij.sensors.Encoder(counts=131072.0, velocity=velocity),
+    )
+    found, error = assess(arm, duration=6.0)
+    assert found.ok
+    assert error < float(found.metrics[RELATIVE]) < TOLERANCE
+    coarse, error = assess(ij.with_parameters(arm, {"sensor.counts": 1024.0}), duration=6.0)
+    stated = float(coarse.metrics[RELATIVE])
+    assert error < stated
+    assert is_flagged(coarse) == (not stated <= TOLERANCE)
+    print(stated, error, coarse.metrics[error_growth.BOUND], found.metrics[error_growth.BOUND])
+
+
+@pytest.mark.slow
+def test_a_coarse_encoder_whose_codes_differ_is_covered():
+    """1,024 counts: one more or less changes the motion by up to 5e-3 rad."""
+    found, error = assess(LOOPS["difference"]())
+    assert float(found.metrics[error_growth.BOUND]) > 0.0
+    assert float(found.metrics[RELATIVE]) > error
+
+
+LIMIT_CYCLE = {
+    "controller.K2": [5.41514, 1.61418],
+    "controller.k1": [2.82538, 0.94105],
+    "controller.weight": [0.06931, 0.24189],
+    "observer.kf": [1.48999, 20.43248],
+    "reference.frequency": [1.24512, 0.84695],
+    "reference.amplitude": 1e-5,
+    "initial.q": np.array([0.74958, 0.76142]),
+    "sensor.counts": [298.0, 11409.0],
+    "sensor.velocity.cutoff": 38.2525,
+}
+"""At rest a code of joint 1 alternates, and joint 2 swings by ten of its counts in resonance."""
+
+
+@pytest.mark.slow
+def test_a_limit_cycle_in_which_rounding_is_no_noise_is_covered():
+    """The worst of a search: the difference is 6.5 times the root of the sum of squares."""
+    scenario = ij.with_parameters(LOOPS["difference"](), LIMIT_CYCLE)
+    found = run(scenario, 6.4, 2e-3)
+    stated = np.asarray(found.metrics.numerical_error)
+    for k in range(4):
+        moved = LIMIT_CYCLE["initial.q"] + np.array([1.0, -0.5]) * 2e-6 * (k + 1)
+        other = run(ij.with_parameters(scenario, {"initial.q": moved}), 6.4, 2e-3)
+        difference = np.max(np.abs(found.q - other.q), axis=0)
+        print(difference / stated)
+        assert np.all(difference < stated)
+        assert difference[1] > 4.0 * 2 * np.pi / 11409.0
+
+
+@pytest.mark.slow
 def test_a_loop_whose_codes_are_certain_has_the_error_of_the_open_loop():
     """At an eighth of the step no code can differ, and the estimate falls with the fourth power."""
     scenario = LOOPS["quantiser"]()
@@ -169,8 +225,8 @@ def test_the_executors_agree(name):
         np.testing.assert_allclose(found[0].metrics[of], found[1].metrics[of], rtol=1e-4)
 
 
-def test_the_bound_is_that_of_the_worst_rounding_errors():
-    """The sum over periods, against one in NumPy, over a run of few periods and a long one."""
+def test_the_bounds_are_those_of_the_worst_and_of_random_rounding_errors():
+    """The sums over periods, against some in NumPy, over a run of few periods and a long one."""
     scenario = canonical(LOOPS["both"]())
     state = initial_state(scenario)
     derivative = stability.jacobian(scenario, jnp.zeros(()), state)
@@ -182,16 +238,24 @@ def test_the_bound_is_that_of_the_worst_rounding_errors():
     law = np.asarray(derivative[plant:, :2])
     by_reading = np.concatenate([by_torque @ law[:2], law[2:]]) * 2 * np.pi / 1024
     by_level = np.concatenate([by_torque, np.zeros_like(law[2:])]) * 1.5
-    term, sums = np.concatenate([by_reading, by_level], axis=1), []
-    for _ in range(5000):
-        sums.append(np.abs(term[:2]).sum(axis=1))
+    term, terms = np.concatenate([by_reading, by_level], axis=1), []
+    for _ in range(8192):
+        terms.append(term[:2])
         term = Phi @ term
-    found = partial(error_growth.bound, scenario, growth, state, derivative)
-    np.testing.assert_allclose(found(jnp.asarray(20.0)), np.sum(sums[:20], axis=0), rtol=1e-9)
-    exact = np.sum(sums, axis=0)
-    long = np.asarray(found(jnp.asarray(5000.0)))
-    assert np.all(long >= exact * (1 - 1e-9))
-    assert np.all(long < 2.0 * exact)
+    terms = np.array(terms)
+    found = partial(error_growth._bounds, scenario, growth, state, derivative)
+    worst = np.abs(terms).sum(axis=2)
+    np.testing.assert_allclose(found(jnp.asarray(20.0))[0], worst[:20].sum(axis=0), rtol=1e-9)
+    rigorous, probable = (np.asarray(x) for x in found(jnp.asarray(5000.0)))
+    exact = worst[:5000].sum(axis=0)
+    assert np.all(rigorous >= exact * (1 - 1e-9))
+    assert np.all(rigorous < 2.0 * exact)
+    constant = np.abs(terms.sum(axis=0)).sum(axis=1)
+    deviations = np.sqrt((terms**2).sum(axis=(0, 2)))
+    likely = np.sqrt(2 * np.log(2 * 2 * 5000 / error_growth.PROBABILITY)) * deviations
+    np.testing.assert_allclose(probable, constant + likely, rtol=1e-9)
+    lower = error_growth.bound(scenario, growth, state, derivative, jnp.asarray(5000.0))
+    np.testing.assert_array_equal(lower, np.minimum(rigorous, probable))
 
 
 @pytest.mark.parametrize("periods", [2.0**15, 2.0**20, 2.0**31])

@@ -253,7 +253,7 @@ def test_a_reference_needs_two_derivatives_and_no_third():
         rate = jax.eval_shape(
             lambda s: closed_loop.rate(s, jnp.asarray(0.3), closed_loop.initial_state(s)), scenario
         )
-        assert rate.dq.shape == (2,)
+        assert rate.x.shape == (2, 2)
 
 
 def test_funnel_shrinks_onto_the_reference():
