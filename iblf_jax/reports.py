@@ -13,7 +13,7 @@ import html
 import io
 import platform
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -22,21 +22,23 @@ import numpy as np
 
 from iblf_jax.core import checks, notices, tables
 from iblf_jax.core.attributes import has_members
+from iblf_jax.core.presentation import Content, Result
 from iblf_jax.core.progress import announced
 from iblf_jax.core.pytree import wrapped_field
+from iblf_jax.core.tables import Table, number
 from iblf_jax.core.units import as_text
 from iblf_jax.simulation.paths import get, parameters, unit_at
 from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.simulation.signals import PER_REGION
+from iblf_jax.studies.statistics import worst_joint
 from iblf_jax.world import plants
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from iblf_jax.certificates import Certificate
-    from iblf_jax.identification import Identification
     from iblf_jax.proofs import Proof
     from iblf_jax.simulation.results import Rollout
-    from iblf_jax.studies.comparison import Comparison
     from iblf_jax.studies.study import Study
     from iblf_jax.tuning import TuneResult
 
@@ -69,13 +71,18 @@ class Shown(NamedTuple):
     on_card: int = 1
 
 
+def _contents(result: Any) -> Content:
+    """What a result prints; that of another object of this package is its text."""
+    return result._content() if isinstance(result, Result) else repr(result).splitlines()
+
+
 def _described(result: Any) -> list[str]:
-    """The lines of a result's `repr` without the name of its class, which is in the title."""
-    first, *rest = repr(result).splitlines()
-    match = re.fullmatch(rf"{type(result).__name__}(?:\((.*)\)| of (.*))", first)
+    """The lines of a result without the name of its class, which is in the title."""
+    lines = [line for line in _contents(result) if isinstance(line, str)]
+    match = re.fullmatch(rf"{type(result).__name__}(?:\((.*)\)| of (.*)|: (.*))", lines[0])
     if match:
-        first = match[1] or match[2]
-    return [first, *rest]
+        lines[0] = next(filter(None, match.groups()))
+    return lines
 
 
 def _parts_of(scenario: Scenario) -> str:
@@ -142,15 +149,46 @@ def _levels_in_words(plant: Any) -> str:
     return f"{plants.order_of(plant)} levels: {', '.join(texts[:-1])}; input: {texts[-1]}"
 
 
-def _entries(values: Any, n: int) -> list[str]:
-    """The columns of a metric: one number, or one for each of n components; the numbers of several
-    levels in one column are joined by "; ".
-    """
-    array = np.asarray(values)
-    if array.ndim < 2:
-        numbers = [f"{x:.4g}" for x in np.ravel(array)[:n]]
-        return numbers + [""] * (n - len(numbers))
-    return ["; ".join(f"{x:.4g}" for x in column) for column in array.T]
+NUMBERED = tuple(f"violation_{what}" for what in ("joint", "region", "level", "component"))
+"""Ends of the names of metrics that are a number of something, -1 for none."""
+
+
+def metrics_table(runs: Mapping[str, Rollout]) -> Table:
+    """Metrics of runs side by side, one column per joint, with units."""
+    first = next(iter(runs.values()))
+    n = first.n
+    heading = ["metric", "unit", *plants.component_names(first.scenario.plant) * len(runs)]
+    rows: list[list[str]] = []
+    for name, unit in first.metrics.units.items():
+        if name not in first.metrics:
+            continue
+        values = [np.ravel(run.metrics[name]) for run in runs.values()]
+        size = values[0].size
+        if name.endswith(NUMBERED):
+            values = [np.where(x < 0, np.nan, x) for x in values]  # -1: no violation
+        # A row has the joints of one level, or one region: there can be more regions than joints.
+        width = 1 if name in PER_REGION or size % n else n
+        labels, units = [name], [unit]
+        if size > width or name in PER_REGION:
+            labels = [f"{name}[{i}]" for i in range(size // width)]
+            units = [*unit.split("; "), *[unit] * len(labels)]
+        for i, label in enumerate(labels):
+            row = [label, units[i]]
+            for x in values:
+                row += _padded(map(number, x[i * width : (i + 1) * width]), n)
+            rows.append(row)
+    if any(runs):  # the name of each run above its first joint
+        rows.insert(0, heading)
+        heading = ["", ""]
+        for name in runs:
+            heading += _padded([name], n)
+    return Table(heading, rows, left=(0, 1))
+
+
+def _padded(cells: Iterable[str], size: int) -> list[str]:
+    """The cells of one run, filled up with empty ones."""
+    cells = list(cells)
+    return cells + [""] * (size - len(cells))
 
 
 def _rollout(run: Rollout) -> Shown:
@@ -158,11 +196,7 @@ def _rollout(run: Rollout) -> Shown:
 
     if not checks.is_concrete(run) or run.is_batch:
         return Shown("Run", _described(run))
-    rows = []
-    for name, value in run.metrics.items():
-        rows.append((name, run.metrics.units.get(name, ""), *_entries(value, run.n)))
     plant = run.scenario.plant
-    table = tables.as_html(("metric", "unit", *plants.component_names(plant)), rows)
     figures: dict[str, Callable[[], Figure]] = {
         f"{plants.level_names(plant)[0].capitalize()}s": lambda: plotting.positions(run),
         "Overview": lambda: plotting.overview(run),
@@ -170,7 +204,7 @@ def _rollout(run: Rollout) -> Shown:
         f"{plants.input_name(plant).capitalize()}s": lambda: plotting.torques(run),
         "Uncertain terms": lambda: plotting.uncertain_terms(run),
     }
-    contents = {"Metrics": table, "Peaks with their signs": _peaks(run)}
+    contents = {"Metrics": metrics_table({"": run}).html(), "Peaks with their signs": _peaks(run)}
     return Shown("Run", _described(run), contents, figures, run.scenario)
 
 
@@ -192,24 +226,25 @@ def _perturbation(drawn: Any) -> str:
     return ", ".join(filter(None, parts))
 
 
+def quantiles_table(study: Study) -> Table:
+    """Quantiles of each metric over the runs, a run counted by its worst joint."""
+    rows = []
+    for name in study.metrics if study.made.any() else ():
+        numbers = worst_joint(study.metrics, name)[study.made]
+        levels = np.quantile(numbers, (0.05, 0.5, 0.95), method="inverted_cdf")
+        rows.append((name, study.metrics.units.get(name, ""), *map(number, levels)))
+    return Table(("metric, worst joint", "unit", "5 %", "50 %", "95 %"), rows, left=(0,))
+
+
 def _study(study: Study) -> Shown:
     from iblf_jax import plotting
     from iblf_jax.plotting._studies import start_notes
-    from iblf_jax.studies.statistics import SMALLER_IS_WORSE
 
     if not checks.is_concrete(study):
         return Shown("Monte-Carlo study", _described(study))
-    quantiles = study.quantiles((0.05, 0.5, 0.95))
-    rows = []
-    for name in map(str, quantiles.data_vars):
-        values = np.asarray(quantiles[name]).reshape(3, -1)
-        worst = np.argmin(values[1]) if name in SMALLER_IS_WORSE else np.argmax(values[1])
-        entries = [f"{x:.4g}" for x in values[:, worst]]
-        rows.append((name, study.metrics.units.get(name, ""), *entries))
-    header = ("metric, of the worst joint", "unit", "5 %", "median", "95 %")
     perturbed = [(path, _perturbation(x)) for path, x in study.perturbations.items()]
     content = {
-        "Metrics": tables.as_html(header, rows),
+        "Metrics": quantiles_table(study).html(),
         "Perturbed": tables.as_html(("path", "perturbation"), perturbed),
     }
     first = "margin" if "margin" in study.metrics else next(iter(study.metrics))
@@ -228,12 +263,6 @@ def _certificate(found: Certificate) -> Shown:
     return Shown(f"Certificate: {found.headline}", [found.subject], table, figure)
 
 
-def _comparison(found: Comparison) -> Shown:
-    scenario = next(iter(found.rollouts.values())).scenario
-    words, figures = _described(found)[:1], {"Side by side": found.plot}
-    return Shown("Comparison", words, found.tables_html(), figures, scenario, on_card=2)
-
-
 def _tuning(found: TuneResult) -> Shown:
     rows = [
         (path, unit_at(found.start, path), _short(get(found.start, path)), _short(value))
@@ -244,11 +273,6 @@ def _tuning(found: TuneResult) -> Shown:
     figures = {"The search, and runs before and after": found.plot}
     title = f"Tuning: {found.report.headline}"
     return Shown(title, words, {"Gains": gains}, figures, found.scenario)
-
-
-def _identification(found: Identification) -> Shown:
-    contents, figures = found.tables_html(), {"Numbers and residuals": found.plot}
-    return Shown("Identification", found.words(), contents, figures, found.scenario, on_card=2)
 
 
 def _proof(found: Proof) -> Shown:
@@ -270,13 +294,15 @@ KINDS: dict[str, Callable[[Any], Shown]] = {
     "Rollout": _rollout,
     "Study": _study,
     "Certificate": _certificate,
-    "Comparison": _comparison,
     "TuneResult": _tuning,
-    "Identification": _identification,
     "Proof": _proof,
 }
 """Name of a result's class -> the function that makes the content.  Names in place of classes avoid
 the import of modules that are not used."""
+
+
+FIGURES = {"Comparison": "Side by side", "Identification": "Numbers and residuals"}
+"""Name of a result's class -> heading of its figure."""
 
 
 def shown(result: Any) -> Shown:
@@ -284,11 +310,13 @@ def shown(result: Any) -> Shown:
     maker = KINDS.get(type(result).__name__)
     if maker is not None:
         return maker(result)
+    name = type(result).__name__
+    found = {part.title: part.html() for part in _contents(result) if isinstance(part, Table)}
     figures = {}
     if has_members(result, "plot"):
-        figures["Figure"] = result.plot
+        figures[FIGURES.get(name, "Figure")] = result.plot
     scenario = getattr(result, "scenario", None)
-    return Shown(type(result).__name__, _described(result), {}, figures, scenario)
+    return Shown(name, _described(result), found, figures, scenario, on_card=len(found))
 
 
 def _image(figure: Figure, dpi: int, words: str) -> str:

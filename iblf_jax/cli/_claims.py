@@ -61,14 +61,9 @@ def paper_claims(runs: Pair) -> list[PaperClaim]:
 
 def each_joint(values: Any, unit: str) -> str:
     """One number per joint as text, such as 0.99 / 0.71 s."""
-    shown = " / ".join(map(_or_never, np.ravel(np.asarray(values, float))))
+    numbers = np.ravel(np.asarray(values, float))
+    shown = " / ".join(f"{x:.3g}" if np.isfinite(x) else "never" for x in numbers)
     return f"{shown} {unit}".rstrip()
-
-
-def _or_never(value: float) -> str:
-    if not np.isfinite(value):
-        return "never"
-    return f"{value:.3g}"
 
 
 def _versus(by_name: Mapping[str, Any], unit: str) -> str:

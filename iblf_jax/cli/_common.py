@@ -7,15 +7,11 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import os
 import re
 import tomllib
-from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-import numpy as np
 
 if TYPE_CHECKING:
     from iblf_jax.files.scenario import ScenarioFile
@@ -214,54 +210,3 @@ def status_and_metrics(run: Rollout) -> dict[str, Any]:
             for name, value in run.metrics.items()
         },
     }
-
-
-def number(value: Any) -> str:
-    """A number in four significant digits; a dash for NaN and infinity (no event)."""
-    value = float(value)
-    if not math.isfinite(value):
-        return "-"
-    return f"{value:.4g}"
-
-
-NUMBERED = tuple(f"violation_{what}" for what in ("joint", "region", "level", "component"))
-"""Ends of the names of metrics that are a number of something, -1 for none."""
-
-
-def metrics_table(runs: Mapping[str, Rollout]) -> str:
-    """Metrics of runs side by side, one column per joint, with units."""
-    from iblf_jax.core import tables
-    from iblf_jax.simulation.signals import PER_HIGHER_LEVEL, PER_LEVEL, PER_REGION
-    from iblf_jax.world import plants
-
-    first = next(iter(runs.values()))
-    n = first.n
-    rows = [["metric", "unit", *plants.component_names(first.scenario.plant) * len(runs)]]
-    for name, unit in first.metrics.units.items():
-        values = [np.ravel(run.metrics[name]) for run in runs.values()]
-        if name.endswith(NUMBERED):
-            values = [np.where(x < 0, np.nan, x) for x in values]  # -1: no violation
-        lines, units = {name: values}, {name: unit}
-        if values[0].size > n and name in (*PER_LEVEL, *PER_HIGHER_LEVEL):
-            rows_of = range(values[0].size // n)
-            lines = {f"{name}[{i}]": [x[i * n : (i + 1) * n] for x in values] for i in rows_of}
-            units = dict(zip(lines, unit.split("; "), strict=False))
-        if name in PER_REGION:  # one row per region: there can be more regions than joints
-            lines = {f"{name}[{i}]": [x[i : i + 1] for x in values] for i in range(values[0].size)}
-        for label, numbers in lines.items():
-            row = [label, units.get(label, unit)]
-            for x in numbers:
-                row += _padded(map(number, x), n)
-            rows.append(row)
-    if any(runs):  # the name of each run above its first joint
-        head = ["", ""]
-        for name in runs:
-            head += _padded([name], n)
-        rows.insert(0, head)
-    return "\n".join(tables.as_text(rows, left=(0, 1)))
-
-
-def _padded(cells: Iterable[str], size: int) -> list[str]:
-    """The cells of one run, filled up with empty ones."""
-    cells = list(cells)
-    return cells + [""] * (size - len(cells))

@@ -6,7 +6,7 @@ import argparse
 from typing import TYPE_CHECKING, Any
 
 from iblf_jax.cli._studies import STUDY_EPILOG, add_study_arguments, run_study, write_netcdf
-from iblf_jax.core.tables import as_text
+from iblf_jax.core.tables import as_text, number
 
 if TYPE_CHECKING:
     from iblf_jax.studies.study import Study
@@ -51,30 +51,17 @@ def run(args: argparse.Namespace) -> int:
 
 def report(study: Study) -> str:
     """The results of a study as text."""
-    import numpy as np
+    from iblf_jax.reports import quantiles_table
 
-    from iblf_jax.cli._common import number
-    from iblf_jax.studies.statistics import worst_joint
-
-    rows = [["metric, worst joint", "unit", "5 %", "50 %", "95 %"]]
-    names: list[str] = []
-    if study.made.any():
-        names = list(study.metrics)
-    for name in names:
-        numbers = worst_joint(study.metrics, name)[study.made]
-        levels = np.quantile(numbers, (0.05, 0.5, 0.95), method="inverted_cdf")
-        rows.append([name, study.metrics.units.get(name, ""), *map(number, levels)])
-    worst = study.worst(5)
+    found = study.correlations(["margin"]).correlation.sel(metric="margin")
+    correlations = [(str(p), number(found.sel(parameter=p))) for p in found.parameter.values]
     lines = [
         repr(study),
         "",
-        *as_text(rows, left=(0,)),
+        *quantiles_table(study).lines(),
         "",
-        f"worst runs (smallest margin first): {', '.join(map(str, worst))}",
+        f"worst runs (smallest margin first): {', '.join(map(str, study.worst(5)))}",
+        "",
+        *as_text([("parameter", "rank correlation with the margin"), *correlations], left=(0,)),
     ]
-    found = study.correlations(["margin"]).correlation.sel(metric="margin")
-    rows = [
-        ["parameter", "rank correlation with the margin"],
-        *([str(p), number(found.sel(parameter=p))] for p in found.parameter.values),
-    ]
-    return "\n".join([*lines, "", *as_text(rows, left=(0,))])
+    return "\n".join(lines)

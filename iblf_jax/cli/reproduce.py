@@ -7,7 +7,7 @@ import textwrap
 import time
 from typing import TYPE_CHECKING, Any
 
-from iblf_jax.cli._common import metrics_table, output_folder, status_and_metrics, write_json
+from iblf_jax.cli._common import output_folder, status_and_metrics, write_json
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -61,6 +61,7 @@ def run(args: argparse.Namespace) -> int:
     from iblf_jax.cli._claims import assumed, assumed_briefly, remark
     from iblf_jax.cli._paper_figures import as_markdown, peaks, peaks_table
     from iblf_jax.core.status import FAILED, describe, has_flag
+    from iblf_jax.reports import metrics_table
 
     begin = time.perf_counter()
     folder = output_folder(args.out)
@@ -72,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
     print("; ".join(f"{name}: {describe(int(one.status))}" for name, one in runs.items()) + "\n")
     assumption = assumed(runs)
     print(textwrap.fill(f"Assumed: {assumption}", 118) + "\n")
-    print(metrics_table(runs) + "\n")
+    print(*metrics_table(runs).lines(), "", sep="\n")
     claims = check_claims(runs)
     note = remark(runs)
     peaks_text = peaks_table(runs)

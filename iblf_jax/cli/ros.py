@@ -175,7 +175,8 @@ def run_robot(args: argparse.Namespace) -> int:
         folder = output_folder(args.out)
     plant, joints = plant_of(scenario, args.plant, args.joints)
     options = _robot_options(args, scenario)
-    node = robot_node(plant, joints, **options, ros_args=_ros_arguments(args.ros_args))
+    ros_arguments = ["--ros-args", *args.ros_args] if args.ros_args else []
+    node = robot_node(plant, joints, **options, ros_args=ros_arguments)
     periods = round((args.duration or ENDLESS) / options["period"])
     try:
         with node, _stopped_by_signals(node.stop):
@@ -259,12 +260,6 @@ def _numbers(option: str, text: str) -> list[float]:
         return [float(word) for word in text.split(",")]
     except ValueError:
         raise checks.fail(option, text, "numbers separated by commas") from None
-
-
-def _ros_arguments(words: list[str] | None) -> list[str]:
-    if not words:
-        return []
-    return ["--ros-args", *words]
 
 
 @contextmanager

@@ -9,7 +9,6 @@ from iblf_jax.cli._common import (
     FAILURES,
     add_run_arguments,
     add_scenario_arguments,
-    metrics_table,
     optional_folder,
     run_options,
     scenario_of,
@@ -46,6 +45,7 @@ def run(args: argparse.Namespace) -> int:
     """Runs the command."""
     from iblf_jax.core.status import FAILED, describe, has_flag
     from iblf_jax.engine.simulate import simulate
+    from iblf_jax.reports import metrics_table
     from iblf_jax.simulation.units import status_words
 
     file = scenario_of(args)
@@ -57,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
         f"{args.scenario}: {options['duration']:g} s, dt = {options['dt']:g} s, {options['method']}"
     )
     print(f"status: {describe(int(result.status), status_words(result.scenario))}")
-    print("\n" + metrics_table({"": result}))
+    print("", *metrics_table({"": result}).lines(), sep="\n")
     if folder is not None:
         _write(folder, args.scenario, result, options, args.seed)
     return int(failed)

@@ -6,7 +6,7 @@ import argparse
 from typing import TYPE_CHECKING, Any
 
 from iblf_jax.cli._studies import STUDY_EPILOG, add_study_arguments, run_study, write_netcdf
-from iblf_jax.core.tables import as_text
+from iblf_jax.core.tables import as_text, number
 
 if TYPE_CHECKING:
     import xarray
@@ -72,7 +72,6 @@ def report(data: xarray.Dataset) -> str:
 
     import numpy as np
 
-    from iblf_jax.cli._common import number
     from iblf_jax.core.status import FAILED, has_flag
 
     config = json.loads(data.attrs["config"])

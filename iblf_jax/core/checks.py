@@ -119,17 +119,10 @@ def one_line(text: str, part: str = "words") -> str:
     """
     most = LONGEST_TEXT[part]
     text = re.sub(r"\s*\n\s*", " ", text[: 4 * most])
-    text = "".join(map(_printable, text))
+    text = "".join(x if x.isprintable() else ascii(x)[1:-1] for x in text)
     if len(text) > most:
         return text[: most - 3] + "..."
     return text
-
-
-def _printable(character: str) -> str:
-    """A character, or its escape sequence if it cannot be printed."""
-    if character.isprintable():
-        return character
-    return ascii(character)[1:-1]
 
 
 def shown(value: Any) -> str:

@@ -54,7 +54,7 @@ class VerifiedCache:
 
     def get(self, key: str) -> bytes | None:
         """The entry of a key; None, after its removal, if it is not what was put there."""
-        path = self._entry(key)
+        path = self._path / f"{key}{JAX_SUFFIX}"
         try:
             is_file = stat.S_ISREG(path.lstat().st_mode)
         except OSError:
@@ -73,9 +73,6 @@ class VerifiedCache:
     def put(self, key: str, value: bytes) -> None:
         """Keeps an entry."""
         self._base.put(key, value + entry_digest(key, value))
-
-    def _entry(self, key: str) -> Path:
-        return self._path / f"{key}{JAX_SUFFIX}"
 
 
 def entry_digest(key: str, image: bytes) -> bytes:
@@ -193,7 +190,11 @@ def _trim(folder: Path) -> None:
     for x, _ in top:
         if x.name.startswith("xla-") and x.is_dir(follow_symlinks=False):
             entries += _entries(Path(x.path))
-    kept = [(_last_use(status), status.st_size, x.path) for x, status in entries if _is_ours(x)]
+    kept = [
+        (max(status.st_atime, status.st_mtime), status.st_size, x.path)
+        for x, status in entries
+        if x.name.endswith(SUFFIXES)
+    ]
     size = sum(bytes_of_one for _, bytes_of_one, _ in kept)
     for last_use, bytes_of_one, path in sorted(kept):
         if size <= MAX_BYTES or last_use > time.time() - IN_USE:
@@ -201,11 +202,3 @@ def _trim(folder: Path) -> None:
         with contextlib.suppress(OSError):
             os.unlink(path)
             size -= bytes_of_one
-
-
-def _last_use(status: os.stat_result) -> float:
-    return max(status.st_atime, status.st_mtime)
-
-
-def _is_ours(entry: os.DirEntry) -> bool:
-    return entry.name.endswith(SUFFIXES)

@@ -184,7 +184,7 @@ class Division(NamedTuple):
     @staticmethod
     def of(module: Any) -> Division:
         """The division of a module that holds numbers."""
-        values, treedef = jax.tree.flatten(module, is_leaf=_is_none)
+        values, treedef = jax.tree.flatten(module, is_leaf=lambda x: x is None)
         return Division(treedef, tuple(not _is_leaf(x) for x in values))
 
     def __reduce__(self) -> Any:
@@ -209,10 +209,6 @@ def _division_from(module: Any) -> Division:
     """The division of which a module with truth values is the pickled form."""
     values, treedef = jax.tree.flatten(module)
     return Division(treedef, tuple(values))
-
-
-def _is_none(value: Any) -> bool:
-    return value is None
 
 
 def _is_leaf(value: Any) -> bool:

@@ -1,4 +1,5 @@
-"""Reaches figures, reports and files from results without importing them.
+"""The base class of results, which print as text and HTML and can be saved; it reaches figures,
+reports and files without importing them.
 
 Results lie below `plotting`, `reports` and `files` in the layers of the package. Their methods
 `plot`, `save`, `to_xarray` and `_repr_html_` call the functions of this table by name, and Python
@@ -8,9 +9,13 @@ imports the module at the first call. A new presentation is one entry of the tab
 from __future__ import annotations
 
 import importlib
+import itertools
 import os
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
+
+from iblf_jax.core.tables import Table
 
 PRESENTATIONS = {
     "certificate figure": ("iblf_jax.plotting.certificates", "certificate"),
@@ -47,10 +52,29 @@ def present(name: str, result: Any, *args: Any, **options: Any) -> Any:
     return getattr(importlib.import_module(module), function)(result, *args, **options)
 
 
+Content: TypeAlias = Sequence[str | Table]
+"""A result as lines and tables, in the order in which it prints."""
+
+
 class Result:
-    """What a study, a search or a proof finds: it can be saved."""
+    """What a study, a search or a proof finds: it prints, is a card in a notebook, and can be
+    saved.
+
+    A subclass has `_content` (and `repr=False`, where it is a dataclass), or its own `__repr__`.
+    """
 
     __slots__ = ()
+
+    def _content(self) -> Content:
+        """Its lines and tables, of which this class makes the text, and `reports` the HTML."""
+        return repr(self).splitlines()
+
+    def __repr__(self) -> str:
+        lines = (x.lines() if isinstance(x, Table) else [x] for x in self._content())
+        return "\n".join(itertools.chain.from_iterable(lines))
+
+    def _repr_html_(self) -> str:
+        return present("card", self)
 
     def save(self, path: str | os.PathLike) -> Path:
         """Writes everything to one file, from which `ij.load` returns an equal result.

@@ -32,18 +32,14 @@ def program_digest(traced: Any) -> str:
     Raises:
       CallsPythonError: the program contains a callback.
     """
-    callbacks = sorted(filter(_calls_python, jaxprs.primitives(traced.jaxpr)))
+    primitives = jaxprs.primitives(traced.jaxpr)
+    callbacks = sorted(x for x in primitives if "callback" in x or x == "debug_print")
     if callbacks:
         raise CallsPythonError(callbacks[0])
     found = hashlib.sha256()
     hash_constants(found, traced.jaxpr)
     found.update(traced.lower().as_text().encode())
     return found.hexdigest()
-
-
-def _calls_python(primitive: str) -> bool:
-    """Whether a primitive of this name calls a function of Python while a program runs."""
-    return "callback" in primitive or primitive == "debug_print"
 
 
 def hash_constants(found: Any, function: Any) -> None:

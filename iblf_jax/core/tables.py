@@ -6,7 +6,7 @@ import html
 import json
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -52,6 +52,39 @@ def as_html(
             + "</tr>"
         )
     return f"<table><tr>{head}</tr>{''.join(body)}</table>"
+
+
+def number(value: Any) -> str:
+    """A number in four significant digits; a dash for NaN and infinity (no event)."""
+    value = float(value)
+    if not math.isfinite(value):
+        return "-"
+    return f"{value:.4g}"
+
+
+class Table(NamedTuple):
+    """A table of a result."""
+
+    heading: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    title: str = ""
+    """Printed above it, after an empty line; a table without one follows the line before it."""
+    notes: Sequence[str] = ()
+    """Lines below it."""
+    left: Collection[int] | None = None
+    """As in `as_text`."""
+    bold: Collection[int] = ()
+    """As in `as_html`."""
+
+    def lines(self) -> list[str]:
+        """Title, columns and notes as lines of text."""
+        head = ["", self.title] if self.title else []
+        return [*head, *as_text([self.heading, *self.rows], self.left), *self.notes]
+
+    def html(self) -> str:
+        """Columns and notes as HTML."""
+        notes = "".join(f"<p>{html.escape(note)}</p>" for note in self.notes)
+        return as_html(self.heading, self.rows, self.bold) + notes
 
 
 def for_json(value: Any) -> Any:

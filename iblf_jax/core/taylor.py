@@ -135,11 +135,6 @@ def _of_one_shape(coefficients: Coefficients) -> Coefficients:
     ]
 
 
-def _is_constant(coefficients: Coefficients) -> bool:
-    """Whether all coefficients above the first are zero."""
-    return all(x is None for x in coefficients[1:])
-
-
 def _evaluated(function: Any, inputs: list[Coefficients], order: int) -> list:
     """The coefficients of the outputs of a traced function.
 
@@ -167,7 +162,7 @@ def _evaluated(function: Any, inputs: list[Coefficients], order: int) -> list:
 def _evaluated_equation(equation: Any, inputs: list[Coefficients], order: int) -> list:
     """The coefficients of the outputs of one equation."""
     primitive, params = equation.primitive, equation.params
-    if all(_is_constant(x) for x in inputs):
+    if all(x is None for coefficients in inputs for x in coefficients[1:]):
         values = primitive.bind(*[x[0] for x in inputs], **params)
         if not primitive.multiple_results:
             values = [values]
@@ -273,16 +268,6 @@ def _termwise(operation: Callable, inputs: list[Coefficients]) -> Coefficients:
     return found
 
 
-def _add(inputs: list[Coefficients], params: dict) -> Coefficients:
-    a, b = inputs
-    return [_total([x, y]) for x, y in zip(a, b, strict=True)]
-
-
-def _subtract(inputs: list[Coefficients], params: dict) -> Coefficients:
-    a, b = inputs
-    return [_difference(x, y) for x, y in zip(a, b, strict=True)]
-
-
 def _bilinear(primitive: Any, inputs: list[Coefficients], params: dict) -> Coefficients:
     first, second = inputs
     return _product_of(first, second, partial(primitive.bind, **params))
@@ -350,10 +335,6 @@ def _logarithm(argument: Coefficients, value: jax.Array) -> Coefficients:
     return [value, *[_integrated(rate, argument, k) for k in range(1, len(argument))]]
 
 
-def _log(inputs: list[Coefficients], params: dict) -> Coefficients:
-    return _logarithm(inputs[0], jnp.log(inputs[0][0]))
-
-
 def _log1p(inputs: list[Coefficients], params: dict) -> Coefficients:
     x = inputs[0]
     return _logarithm([1.0 + x[0], *x[1:]], jnp.log1p(x[0]))
@@ -368,10 +349,6 @@ def _sqrt(inputs: list[Coefficients], params: dict) -> Coefficients:
         rest = _total([_product(root[j], root[k - j]) for j in range(1, k)])
         root.append(_product(_difference(x[k], rest), half))
     return root
-
-
-def _square(inputs: list[Coefficients], params: dict) -> Coefficients:
-    return _product_of(inputs[0], inputs[0])
 
 
 def _integer_power(inputs: list[Coefficients], params: dict) -> Coefficients:
@@ -420,8 +397,8 @@ def _chosen(first: jax.Array, a: Coefficients, b: Coefficients) -> Coefficients:
 
 
 RULES: dict[Any, Callable[[list[Coefficients], dict], Coefficients]] = {
-    lax.add_p: _add,
-    lax.sub_p: _subtract,
+    lax.add_p: lambda inputs, _: [_total([x, y]) for x, y in zip(*inputs, strict=True)],
+    lax.sub_p: lambda inputs, _: [_difference(x, y) for x, y in zip(*inputs, strict=True)],
     lax.mul_p: partial(_bilinear, lax.mul_p),
     lax.dot_general_p: partial(_bilinear, lax.dot_general_p),
     lax.div_p: _divide,
@@ -429,10 +406,10 @@ RULES: dict[Any, Callable[[list[Coefficients], dict], Coefficients]] = {
     lax.cos_p: lambda inputs, params: _sine_and_cosine(inputs[0])[1],
     lax.exp_p: _exp,
     lax.expm1_p: _expm1,
-    lax.log_p: _log,
+    lax.log_p: lambda inputs, _: _logarithm(inputs[0], jnp.log(inputs[0][0])),
     lax.log1p_p: _log1p,
     lax.sqrt_p: _sqrt,
-    lax.square_p: _square,
+    lax.square_p: lambda inputs, _: _product_of(inputs[0], inputs[0]),
     lax.integer_pow_p: _integer_power,
     lax.select_n_p: _select,
     lax.max_p: _larger,

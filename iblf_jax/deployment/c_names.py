@@ -120,7 +120,8 @@ class Parameters(NamedTuple):
             if read.isdisjoint(range(len(numbers), len(numbers) + size)):
                 numbers += [""] * size
                 continue
-            names = tuple(_field_name(token) for token in parse(leaf.path))
+            tokens = parse(leaf.path)
+            names = tuple(f"part_{x}" if isinstance(x, int) else identifier(x) for x in tokens)
             fields.append(Field(leaf.path, names, leaf.shape, leaf.unit, np.asarray(leaf.value)))
             numbers += [f"p->{fields[-1].place}{_index(place)}" for place in np.ndindex(leaf.shape)]
         assert len(numbers) == sum(np.size(x) for x in jax.tree.leaves(scenario))
@@ -140,12 +141,6 @@ class Parameters(NamedTuple):
         if not self.fields:
             return "{0}"
         return _initialiser(_nested(self.fields), is_float)
-
-
-def _field_name(token: str | int) -> str:
-    if isinstance(token, int):
-        return f"part_{token}"
-    return identifier(token)
 
 
 def _index(place: tuple[int, ...]) -> str:

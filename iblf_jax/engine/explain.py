@@ -12,8 +12,9 @@ import numpy as np
 
 from iblf_jax.core import checks, notices
 from iblf_jax.core.devices import threads
-from iblf_jax.core.presentation import Result
+from iblf_jax.core.presentation import Content, Result
 from iblf_jax.core.progress import announced
+from iblf_jax.core.tables import Table
 from iblf_jax.engine import thresholds
 from iblf_jax.engine.adjoint import ReverseRun
 from iblf_jax.engine.batch import Batch, carry_shapes
@@ -41,7 +42,7 @@ NAMES = {
 }
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class Explanation(Result):
     """Operations of one step, by how often they are executed; prints as a table."""
 
@@ -62,16 +63,18 @@ class Explanation(Result):
     """What computes the derivatives of `simulate` under `jax.grad`, `jacfwd` or `hessian`, and the
     reason if it is no compiled kernel."""
 
-    def __repr__(self) -> str:
-        lines = ["operations done        number  which"]
+    def _content(self) -> Content:
+        rows = []
         for name, counter in self.counts.items():
             which = ", ".join(f"{op} {n}" for op, n in counter.most_common(8))
-            lines.append(f"{name:22s} {sum(counter.values()):6d}  {which}")
-        lines.append(f"about {self.slots:.0f} vector instructions a step for {self.width} runs")
-        lines.append(f"two a cycle on every core would be {self.limit:.3g} steps/s")
-        lines.append(f"a batch runs on {self.backend}")
-        lines.append(f"derivatives of simulate: {self.derivatives}")
-        return "\n".join(lines)
+            rows.append((name, str(sum(counter.values())), which))
+        return [
+            Table(("operations done", "number", "which"), rows, left=(0, 2)),
+            f"about {self.slots:.0f} vector instructions a step for {self.width} runs",
+            f"two a cycle on every core would be {self.limit:.3g} steps/s",
+            f"a batch runs on {self.backend}",
+            f"derivatives of simulate: {self.derivatives}",
+        ]
 
 
 @notices.each_warning_once

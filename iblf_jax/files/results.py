@@ -348,12 +348,9 @@ def _fields_of(value: Any) -> dict[str, Any]:
 def _computed_names(cls: type) -> list[str]:
     """The properties of a class that are computed once and kept, without those of MADE_AGAIN."""
     owners = reversed(cls.__mro__)
-    names = [name for owner in owners for name, x in vars(owner).items() if _is_cached(x)]
+    members = [member for owner in owners for member in vars(owner).items()]
+    names = [name for name, x in members if isinstance(x, cached_property)]
     return [name for name in names if (cls.__name__, name) not in MADE_AGAIN]
-
-
-def _is_cached(member: Any) -> bool:
-    return isinstance(member, cached_property)
 
 
 def _name_of_member(cls: type) -> str | None:

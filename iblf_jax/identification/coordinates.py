@@ -173,7 +173,8 @@ def coordinates(
         if is_inertia(scenario, own, value) and path not in limits:
             count = value.size // 6
             bodies += [start + 6 * i for i in range(count)]
-            value = _positive_definite(value, _masses(scenario, own, count))
+            bodies_of_leaf = zip(value.reshape(-1, 6), _masses(scenario, own, count), strict=True)
+            value = np.reshape([_rigid_body(J, mass) for J, mass in bodies_of_leaf], value.shape)
         places.append(LeafSlice(own, value.shape, start, value.size))
         parts.append((value.ravel(), low.ravel(), high.ravel()))
         names += [path + "".join(f"[{i}]" for i in index) for index in np.ndindex(value.shape)]
@@ -223,12 +224,6 @@ def _masses(scenario: Scenario, path: str, count: int) -> np.ndarray:
     owner = "".join(f"[{x}]" if isinstance(x, int) else f".{x}" for x in place[:where]).lstrip(".")
     rest = "".join(f"[{x}]" for x in place[where + 1 :])
     return np.broadcast_to(np.asarray(paths.get(scenario, f"{owner}.mass{rest}"), float), (count,))
-
-
-def _positive_definite(value: np.ndarray, masses: np.ndarray) -> np.ndarray:
-    """Inertias from which the search can start, for a leaf of them."""
-    rows = zip(value.reshape(-1, 6), masses, strict=True)
-    return np.array([_rigid_body(J, mass) for J, mass in rows]).reshape(value.shape)
 
 
 def _rigid_body(J: np.ndarray, mass: float) -> np.ndarray:

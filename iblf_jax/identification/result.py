@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from iblf_jax.core import tables
-from iblf_jax.core.presentation import Result, present
+from iblf_jax.core.presentation import Content, Result, present
+from iblf_jax.core.tables import Table, for_json
 from iblf_jax.identification.coordinates import plant_path
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.scenario import Scenario
@@ -109,7 +109,7 @@ class Fit(NamedTuple):
         return self.white >= COLOURED_PROBABILITY or self.correlation < MIN_AUTOCORRELATION
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Identification(Result):
     """Parameters from a log: values, standard errors, and what the log does not identify."""
 
@@ -224,40 +224,23 @@ class Identification(Result):
                     found[plant_path(number.name)] = value(draws)
         return found
 
-    def __repr__(self) -> str:
-        numbers = tables.as_text([HEADING, *self._rows()])
-        fit = tables.as_text([FIT, *self._fits()])
-        return "\n".join([self._heading(), *numbers, "", *fit, *self._lines()])
-
-    def _repr_html_(self) -> str:
-        return present("card", self)
-
-    def words(self) -> list[str]:
-        """The text besides the tables, line by line."""
-        return [self._heading(), *(line.strip() for line in self._lines())]
-
-    def tables_html(self) -> dict[str, str]:
-        """Its tables as HTML, with parameters that are not identifiable or biased in bold."""
-        bold = [
-            i
-            for i, number in enumerate(self.numbers)
-            if number.verdict in (NOT_IDENTIFIABLE, BIASED)
-        ]
-        return {
-            "Numbers": tables.as_html(HEADING, self._rows(), bold),
-            "Fit": tables.as_html(FIT, self._fits()),
-        }
-
-    def _heading(self) -> str:
+    def _content(self) -> Content:
         W, back = int(np.sum(self.kept)), int(np.sum(~self.kept))
         length = float(np.mean(self.times[:, -1] - self.times[:, 0]))
         estimated = [number for number in self.numbers if number.verdict != NOT_ESTIMATED]
         count = sum(number.value is not None for number in estimated)
         windows = f"{W} windows of {length:.3g} s fitted, {back} held back"
-        return (
+        verdicts = [number.verdict for number in self.numbers]
+        bold = [i for i, verdict in enumerate(verdicts) if verdict in (NOT_IDENTIFIABLE, BIASED)]
+        return [
             f"Identification: {count} of {len(estimated)} numbers told; {windows};"
-            f" {self.steps} steps, {self.seconds:.3g} s"
-        )
+            f" {self.steps} steps, {self.seconds:.3g} s",
+            Table(HEADING, self._rows(), "Numbers", bold=bold),
+            Table(FIT, self._fits(), "Fit"),
+            *(f"  cannot be told: {words}" for words in self.untold),
+            f"  the logged torque {self._delay_in_words()}",
+            *(f"  {note}" for note in self.notes),
+        ]
 
     def _rows(self) -> list[tuple[str, ...]]:
         rows: list[tuple[str, ...]] = []
@@ -282,11 +265,6 @@ class Identification(Result):
             for f in self.fit
         ]
 
-    def _lines(self) -> list[str]:
-        lines = [f"  cannot be told: {words}" for words in self.untold]
-        delay = f"  the logged torque {self._delay_in_words()}"
-        return [*lines, delay, *(f"  {note}" for note in self.notes)]
-
     def _delay_in_words(self) -> str:
         if self.delay_error == math.inf:
             return "has a delay that the log does not identify"
@@ -301,7 +279,7 @@ class Identification(Result):
         """Everything but the residuals as plain numbers, strings and lists, for strict JSON (no
         NaN, no infinity).
         """
-        return tables.for_json({
+        return for_json({
             "what": "iblf_jax identification",
             "logs": self.logs,
             "numbers": [number._asdict() for number in self.numbers],

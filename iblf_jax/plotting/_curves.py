@@ -301,7 +301,8 @@ class Curve:
             exits += outside[:1].tolist()
         if exits:
             return min(exits)
-        if self.diverged and not self._has_exit():
+        has_exit = any(self._outside(name).any() for name in self._bounded_signals())
+        if self.diverged and not has_exit:
             return self.samples - 1
         return None
 
@@ -334,9 +335,6 @@ class Curve:
         low_field, high_field = BOUNDS_OF.get(field, (f"{field}_lower", f"{field}_upper"))
         low, high = self[low_field][: self.samples], self[high_field][: self.samples]
         return (values <= low) | (values >= high)
-
-    def _has_exit(self) -> bool:
-        return any(self._outside(name).any() for name in self._bounded_signals())
 
     def largest(self, field: str) -> float:
         """The largest finite size of a signal over time and joints; 0 if there is none."""

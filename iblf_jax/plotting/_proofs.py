@@ -58,7 +58,8 @@ def guaranteed_tube(found: Proof, *, runs: int = RUNS) -> Figure:
         axes.set_ylabel(f"{escaped(names[i])}\n{_style.label(quantity.symbol, quantity.unit)}")
         axes.margins(x=0)
     panels[-1].set_xlabel(_style.label("$t$", "s"))
-    _style.set_heading(figure, [_heading(found)], color=_colour(found))
+    colour = _style.text_colour() if found.violation is None else _style.failure()
+    _style.set_heading(figure, [_heading(found)], color=colour)
     _style.legend_below(figure, 3)
     return figure
 
@@ -70,12 +71,6 @@ def _heading(found: Proof) -> str:
         ranges = [f"{len(ranges)} uncertain parameters"]
     words = escaped(", ".join([*ranges, str(found.verdict)]))
     return f"{level}: {words}"
-
-
-def _colour(found: Proof) -> str:
-    if found.violation is not None:
-        return _style.failure()
-    return _style.text_colour()
 
 
 def _draw_tube(axes: Axes, tube: GuaranteedTube, i: int) -> None:

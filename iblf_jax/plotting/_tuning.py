@@ -114,7 +114,7 @@ def _peaks(axes: Axes, curves: list[Curve]) -> None:
             axes.annotate(signed(y), (x, y), **style, **beyond)
         values += peaks
     sizes = np.abs(values)
-    if _spans_decades(sizes):
+    if np.all(np.isfinite(sizes)) and sizes.min() > 0 and sizes.max() > 10 * sizes.min():
         axes.set_yscale("symlog", linthresh=float(sizes.min()))
     axes.axhline(0.0, color=_style.bound(), linewidth=0.8)
     axes.margins(y=margin)
@@ -136,11 +136,6 @@ def _torque(axes: Axes, curves: list[Curve], window: Window) -> None:
     name = f"{quantity.name} of {curves[0].joint_label(joint)}"
     axes.set_ylabel(_style.label(name, quantity.unit))
     _style.time_axis(axes, window)
-
-
-def _spans_decades(x: np.ndarray) -> bool:
-    """Whether numbers need a logarithmic axis: all are positive and span more than a decade."""
-    return bool(np.all(np.isfinite(x)) and np.all(x > 0) and x.max() > 10 * x.min())
 
 
 def _accepted(result: TuneResult) -> np.ndarray:

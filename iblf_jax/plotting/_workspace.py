@@ -234,16 +234,11 @@ def draw_paths(figure: Figure, where: SubplotSpec, curves: Sequence[Curve]) -> A
         name = "path" if has_outline(plant) else "tip"
         axes.plot(*skeleton[:, -1].T, **(style | {"label": curve.name or name, "linewidth": 1.6}))
         if has_outline(plant):
-            _draw_outlines(axes, skeleton, pale)
+            for index in np.linspace(0, len(skeleton) - 1, OUTLINES).astype(int):
+                axes.plot(*skeleton[index].T, color=pale, linewidth=1.0, label="_")
         else:
             axes.plot(*skeleton[-1].T, color=pale, **arm)
     return axes
-
-
-def _draw_outlines(axes: Any, outlines: np.ndarray, colour: str) -> None:
-    """Draws the outline of a plant at times that are evenly spread over its run."""
-    for index in np.linspace(0, len(outlines) - 1, OUTLINES).astype(int):
-        axes.plot(*outlines[index].T, color=colour, linewidth=1.0, label="_")
 
 
 def _times(curve: Curve) -> np.ndarray:

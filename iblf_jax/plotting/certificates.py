@@ -53,7 +53,8 @@ def certificate(
     traces = _until(shown.traces, until)
     if isinstance(traces, LevelTraces):
         figure = _level_panels(shown, traces)
-        _title(figure, shown, traces, title, _level_subject(shown))
+        subject = "The law's own claim" if shown.is_of_own_claim else "The claim (S.3)"
+        _title(figure, shown, traces, title, subject)
         return figure
     subject, V = "Theorem 2", Bounded("Lyapunov function", "$V_2$", "1")
     if shown.is_of_own_claim:
@@ -63,8 +64,9 @@ def certificate(
     figure = _style.new_figure(WIDTH, HEIGHT)
     panels = figure.subplots(2, 3)
     _draw_bounded(panels[0, 0], traces.t, traces.V, traces.envelope, V)
-    _inequality(panels[0, 1], traces)
-    _relative_error(panels[0, 2], traces, shown.joints)
+    _draw_inequality(panels[0, 1], traces, traces.dropped, "dropped terms")
+    _draw_errors(panels[0, 2], traces.t, traces.xi, traces.xi_bound, shown.joints)
+    _finish_relative_error(panels[0, 2], traces.t, shown.joints)
     _draw_bounded(panels[1, 0], traces.t, traces.e2, traces.e2_bound, e2)
     _draw_bounded(panels[1, 1], traces.t, traces.f_tilde, traces.f_tilde_bound, f_tilde)
     _verdicts(panels[1, 2], shown)
@@ -96,11 +98,6 @@ def _verdict_colour(verdict: str) -> str:
     if verdict == "fails":
         return _style.failure()
     return _style.text_colour()
-
-
-def _level_subject(shown: Certificate) -> str:
-    """What the figure of a plant in strict-feedback form is about."""
-    return "The law's own claim" if shown.is_of_own_claim else "The claim (S.3)"
 
 
 def _level_panels(shown: Certificate, traces: LevelTraces) -> Figure:
@@ -219,11 +216,6 @@ def _rate(t: np.ndarray, values: np.ndarray) -> np.ndarray:
     return np.diff(values, axis=0) / steps
 
 
-def _inequality(axes: Axes, traces: Traces) -> None:
-    """The left side of the inequality of Theorem 2, and the terms that the printed proof drops."""
-    _draw_inequality(axes, traces, traces.dropped, "dropped terms")
-
-
 def _draw_inequality(
     axes: Axes, traces: Traces | LevelTraces, terms: np.ndarray, name: str
 ) -> None:
@@ -250,12 +242,6 @@ def _draw_inequality(
     axes.set_ylim(low, max(high, -0.02 * low))
     axes.axhspan(0.0, axes.get_ylim()[1], color=_style.forbidden(), linewidth=0, zorder=0)
     axes.legend(loc="best", **LEGEND)
-
-
-def _relative_error(axes: Axes, traces: Traces, joints: tuple[str, ...]) -> None:
-    """The relative error xi of every joint, its claimed bounds, and the bounds -1 and 1."""
-    _draw_errors(axes, traces.t, traces.xi, traces.xi_bound, joints)
-    _finish_relative_error(axes, traces.t, joints)
 
 
 def _draw_errors(

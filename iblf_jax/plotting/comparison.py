@@ -79,7 +79,9 @@ def comparison(result: Comparison, joint: int = 0, *, zoom: float | None = None)
     for column, (title, curves) in zip(table.T, columns.items(), strict=True):
         column[0].set_title(title)
         _errors(column[0], curves, order, joint, (start, end))
-        _mark_tolerance(column[0], result, joint)
+        tolerance = np.broadcast_to(result.settling.tolerance, result.scenario.n)[joint]
+        line = {"color": _style.bound(), "linewidth": 0.8, "zorder": 1, "label": "settled"}
+        column[0].axhline(tolerance, **line)
         _name_window(column[0], curves, error, end, zoom_reason(curves, [error], end))
         reason = zoom_reason(curves, [torque], end)
         torque_end = end
@@ -135,12 +137,6 @@ def _errors(axes: Axes, curves: list[Curve], order: list[str], joint: int, windo
         start = max(start, error[0])
     axes.set_ylim(SMALLEST, 3.0 * max(start, 10.0 * SMALLEST))
     _style.time_axis(axes, window)
-
-
-def _mark_tolerance(axes: Axes, result: Comparison, joint: int) -> None:
-    """A line at the error of one joint below which a law has settled."""
-    tolerance = np.broadcast_to(result.settling.tolerance, result.scenario.n)[joint]
-    axes.axhline(tolerance, color=_style.bound(), linewidth=0.8, zorder=1, label="settled")
 
 
 def _torques(

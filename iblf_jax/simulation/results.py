@@ -167,9 +167,6 @@ class Rollout(Result, Signals):
         status = describe(int(self.status), status_words(self.scenario))
         return f"Rollout({shape}; status: {status}{accuracy})"
 
-    def _repr_html_(self) -> str:
-        return present("card", self)
-
     def to_xarray(self):
         """An `xarray.Dataset` with named dimensions, units, and the scenario's parameters in its
         attributes.

@@ -5,7 +5,6 @@ both.
 from __future__ import annotations
 
 import dataclasses
-import html
 import itertools
 import math
 from typing import Any, NamedTuple
@@ -14,10 +13,10 @@ import jax
 import numpy as np
 
 from iblf_jax.control.barriers import Integral
-from iblf_jax.core import tables
-from iblf_jax.core.presentation import Result, present
+from iblf_jax.core.presentation import Content, Result, present
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.status import FAILED, describe
+from iblf_jax.core.tables import Table, number
 from iblf_jax.core.units import INPUT, POSITION, VELOCITY
 from iblf_jax.simulation.levels import stated_steady_input
 from iblf_jax.simulation.metrics import Settling
@@ -156,7 +155,7 @@ def _is_closest_at_start(run: Rollout) -> bool:
     return np.allclose(found, (margin, 1.0 - np.max(np.abs(xi))), rtol=1e-6, atol=0.0)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Comparison(Result):
     """Several laws on one scenario.  Prints as two tables, each with what is equal in it."""
 
@@ -286,34 +285,30 @@ class Comparison(Result):
                 lines.append(f"{name}: factor {self.factors[name]:.4g}; {found.in_words()}.")
         return lines
 
-    def __repr__(self) -> str:
+    def _content(self) -> Content:
         run = next(iter(self.rollouts.values()))
         noun = plants.component_noun(run.scenario.plant)
-        parts = [
+        headline = (
             f"Comparison of {len(self.rollouts)} laws, {float(run.t[-1]):g} s, dt ="
             f" {float(run.dt):g} s, {run.method}; worst {noun}"
+        )
+        notes = self.notes
+        return [
+            headline,
+            *(self._as_table(kind, rows, notes[kind]) for kind, rows in self.table.items()),
         ]
-        for kind, rows in self.table.items():
-            lines = _columns(rows, self.scenario)
-            parts += [
-                "",
-                TITLES[kind],
-                *tables.as_text(lines, left=(0, len(lines[0]) - 1)),
-                *self.notes[kind],
-            ]
-        return "\n".join(parts)
 
-    def _repr_html_(self) -> str:
-        return present("card", self)
-
-    def tables_html(self) -> dict[str, str]:
-        """What is held equal -> its HTML table and notes."""
-        found = {}
-        for kind, rows in self.table.items():
-            notes = "".join(f"<p>{html.escape(note)}</p>" for note in self.notes[kind])
-            heading, *lines = _columns(rows, self.scenario)
-            found[TITLES[kind]] = tables.as_html(heading, lines) + notes
-        return found
+    def _as_table(self, kind: str, rows: tuple[Row, ...], notes: list[str]) -> Table:
+        """One of both tables, without the columns of constraints that the scenario lacks."""
+        shown = [
+            name not in OPTIONAL or any(math.isfinite(row._asdict()[name]) for row in rows)
+            for name in Row._fields
+        ]
+        heading, *lines = (
+            tuple(itertools.compress(line, shown))
+            for line in [headings(self.scenario), *(map(_cell, row) for row in rows)]
+        )
+        return Table(heading, lines, TITLES[kind], notes, left=(0, len(heading) - 1))
 
     def to_pandas(self):
         """A `pandas.DataFrame` (pandas comes with xarray), one line a law and table, columns as
@@ -334,21 +329,7 @@ class Comparison(Result):
         return present("comparison figure", self, joint, **options)
 
 
-def _columns(rows: tuple[Row, ...], scenario: Scenario) -> list[tuple[str, ...]]:
-    """Headings and lines, without the columns of constraints that the scenario does not have."""
-    shown = [
-        name not in OPTIONAL or any(math.isfinite(row._asdict()[name]) for row in rows)
-        for name in Row._fields
-    ]
-    lines = [headings(scenario), *(tuple(map(_cell, row)) for row in rows)]
-    return [tuple(itertools.compress(line, shown)) for line in lines]
-
-
 def _cell(value: Any) -> str:
     if isinstance(value, str):
         return value
-    if math.isfinite(value):
-        return f"{value:.4g}"
-    if value > 0:
-        return "never"
-    return "-"
+    return "never" if value == math.inf else number(value)

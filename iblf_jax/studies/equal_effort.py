@@ -27,6 +27,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from iblf_jax.core.status import FAILED, WORDS, Status, describe, has_flag
+from iblf_jax.core.tables import for_json
 
 FINE_POINTS = 16
 """Grid points an octave (a factor of two) for factors from 1/4 to 4."""
@@ -185,21 +186,18 @@ class EffortSearch:
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain numbers and strings for strict JSON."""
         factor, effort = self.nearest
-        return {
+        trials = {"factor": self.factors, "effort": self.efforts, "status": self.status}
+        return for_json({
             "target": self.target,
-            "factor": _number_or_none(self.factor),
-            "crossings": list(self.crossings),
-            "searched": [float(self.factors[0]), float(self.factors[-1])],
+            "factor": self.factor,
+            "crossings": self.crossings,
+            "searched": [self.factors[0], self.factors[-1]],
             "accepts_inaccurate": self.accepts_inaccurate,
-            "nearest": {"factor": _number_or_none(factor), "effort": _number_or_none(effort)},
-            "trials": {
-                "factor": self.factors.tolist(),
-                "effort": [_number_or_none(x) for x in self.efforts.tolist()],
-                "status": self.status.tolist(),
-            },
+            "nearest": {"factor": factor, "effort": effort},
+            "trials": trials,
             "failed": [{"factor": factor, "why": why} for factor, why in self.failed.items()],
             "smaller_dt": self.smaller_dt,
-        }
+        })  # fmt: skip
 
 
 def invalid_flags(accepts_inaccurate: bool) -> int:
@@ -403,7 +401,3 @@ def _reasons(status: Sequence[int], texts: Mapping[Status, str]) -> str:
         elif count:
             words.append(f"{text} (in {count} of them)")
     return "; ".join(words) or "the effort is not finite"
-
-
-def _number_or_none(x: float) -> float | None:
-    return float(x) if math.isfinite(x) else None

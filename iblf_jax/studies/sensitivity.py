@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from iblf_jax.core import checks, notices, tables
-from iblf_jax.core.presentation import Result
+from iblf_jax.core.presentation import Content, Result
 from iblf_jax.core.progress import announced, bar
 from iblf_jax.core.pytree import field_values
 from iblf_jax.core.status import FAILED, has_flag
@@ -46,7 +46,7 @@ TAILS = (0.025, 0.975)
 """Ends of an interval of 95 %."""
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Sensitivity(Result):
     """Sobol indices, one for each number that is perturbed."""
 
@@ -86,21 +86,14 @@ class Sensitivity(Result):
             {"output": self.output, "runs": self.runs, "failed": self.failed},
         )
 
-    def __repr__(self) -> str:
+    def _content(self) -> Content:
         rows = []
         for i in np.argsort(-self.total_order):
             low, high = self.total_order_interval[i]
             total = f"total {self.total_order[i]:6.3f} ({low:.3f} to {high:.3f})"
             rows.append(("", self.parameters[i], total, f"first {self.first_order[i]:6.3f}"))
-        return "\n".join(
-            [
-                (
-                    f"Sensitivity of {self.output} ({self.runs} runs, {self.failed} failed and part"
-                    " of it)"
-                ),
-                *tables.as_text(rows),
-            ]
-        )
+        runs = f"{self.runs} runs, {self.failed} failed and part of it"
+        return [f"Sensitivity of {self.output} ({runs})", *tables.as_text(rows)]
 
 
 @notices.each_warning_once

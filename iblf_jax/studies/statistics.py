@@ -51,12 +51,10 @@ class Probability(Result):
     method: str
     """The method of the interval, or why there is none."""
 
-    def __str__(self) -> str:
-        ends = (
-            f"no interval ({self.method})"
-            if self.low is None
-            else f"{self.confidence:.0%} interval {self.low:.3g} to {self.high:.3g}"
-        )
+    def __repr__(self) -> str:
+        ends = f"no interval ({self.method})"
+        if self.low is not None:
+            ends = f"{self.confidence:.0%} interval {self.low:.3g} to {self.high:.3g}"
         return f"{self.estimate:.4g} ({self.count} of {self.runs} runs; {ends})"
 
 

@@ -22,7 +22,7 @@ import jax
 import numpy as np
 
 from iblf_jax.core import checks, notices
-from iblf_jax.core.presentation import Result, present
+from iblf_jax.core.presentation import Content, Result, present
 from iblf_jax.core.progress import announced
 from iblf_jax.core.status import FAILED, Status, describe, has_flag
 from iblf_jax.core.status import VIOLATED as CONSTRAINT_VIOLATED
@@ -69,7 +69,7 @@ class OneRun(Result):
 
 
 @jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Study(Result):
     """Many runs of one scenario with drawn parameters; arrays have N runs first.  `study[i]` is one
     run.
@@ -464,9 +464,9 @@ class Study(Result):
             SimulationWarning,
         )
 
-    def __repr__(self) -> str:
+    def _content(self) -> Content:
         if not checks.is_concrete(self):
-            return "Study(being traced)"
+            return ["Study(being traced)"]
         counts = self.status_counts
         lines = [
             f"Study({self.runs} runs of {self.duration:g} s, dt = {self.dt:g} s, seed {self.seed},"
@@ -490,7 +490,7 @@ class Study(Result):
         ]
         if flags:
             lines.append(f"  flags, of which a run may have several: {'; '.join(flags)}")
-        return "\n".join([*lines, *self._remarks(), f"  {self.included}"])
+        return [*lines, *self._remarks(), f"  {self.included}"]
 
     def _remarks(self) -> list[str]:
         """What is remarkable although no flag says it, in words."""
@@ -515,6 +515,3 @@ class Study(Result):
                     " study.correlations() says with which parameters it grows"
                 )
         return lines
-
-    def _repr_html_(self) -> str:
-        return present("card", self)

@@ -113,9 +113,6 @@ class FailedRuns:
         return found is not None and self.count >= FEWEST_FAILURES and found.p_value <= SIGNIFICANCE
 
     def __str__(self) -> str:
-        return f"{self._count_in_words()}; {self.cause_in_words()}"
-
-    def _count_in_words(self) -> str:
         event = "left their bounds"
         if self.requirement is not None:
             event = f"broke {self.requirement}"
@@ -125,7 +122,9 @@ class FailedRuns:
             details.append(f"{self.started_outside} of them started outside")
         if self.diverged:
             details.append(f"{self.diverged} of them diverged")
-        return f"{text} ({'; '.join(details)})" if details else text
+        if details:
+            text += f" ({'; '.join(details)})"
+        return f"{text}; {self.cause_in_words()}"
 
     def cause_in_words(self) -> str:
         """The most influential perturbation, or why none is named."""

@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.core.presentation import Result
+from iblf_jax.core.presentation import Content, Result
 from iblf_jax.core.status import Status, has_flag
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.scenario import Scenario
@@ -164,11 +164,11 @@ class Verdict:
 
 LEAST_MULTIPLIER = 1e-6
 """Smallest change of the objective by a unit of a limit that the report mentions."""
-WORST_FIRST = ("fail", "undecided", "pass")
-"""Verdicts in the order of a report."""
+WORST_FIRST = {"fail": "FAILED", "undecided": "undecided", "pass": "passed"}
+"""Verdicts in the order of a report -> the word in its headline."""
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class TuningReport(Result):
     """Changes and verdicts, on fresh runs or on the nominal one; prints as text."""
 
@@ -237,43 +237,25 @@ class TuningReport(Result):
     @property
     def headline(self) -> str:
         """Bounds and requirements in a few words, what failed first."""
-        words = [*self._bounds_in_few_words(), *self._requirements_in_few_words()]
+        left = self.violation[1]
+        words = ["bounds kept"]
+        if left.count:
+            words = ["bounds VIOLATED"]
+            if self.seed is not None:
+                words = [f"bounds VIOLATED in {left.count} of {left.runs} runs"]
+        elif not self.bounds_kept:
+            words = ["bounds VIOLATED in the runs of the tuning"]
+        for kind, text in WORST_FIRST.items():
+            count = sum(v.verdict == kind for v in self.verdicts)
+            if count:
+                words.append(f"{count} of {len(self.verdicts)} requirements {text}")
+        if self.step_check is not None and self.step_check.newly_broken:
+            words.append("a requirement is BROKEN at dt / 2")
         if self.unstable[1]:
             words.append(f"the sampled loop is UNSTABLE in {self._unstable_in_words()}")
         return "; ".join(words)
 
-    def _bounds_in_few_words(self) -> list[str]:
-        """Whether bounds are kept."""
-        left = self.violation[1]
-        if left.count and self.seed is None:
-            return ["bounds VIOLATED"]
-        if left.count:
-            return [f"bounds VIOLATED in {left.count} of {left.runs} runs"]
-        if not self.bounds_kept:
-            return ["bounds VIOLATED in the runs of the tuning"]
-        return ["bounds kept"]
-
-    def _requirements_in_few_words(self) -> list[str]:
-        """How many requirements failed, are undecided, passed, or are broken in the tuning's
-        runs.
-        """
-        if not self.verdicts:
-            return []
-        total = len(self.verdicts)
-        counts = {kind: sum(v.verdict == kind for v in self.verdicts) for kind in WORST_FIRST}
-        words = []
-        if counts["fail"]:
-            words.append(f"{counts['fail']} of {total} requirements FAILED")
-        if counts["undecided"]:
-            words.append(f"{counts['undecided']} of {total} requirements undecided")
-        if counts["pass"]:
-            words.append(f"{counts['pass']} of {total} requirements passed")
-        if self.step_check is not None and self.step_check.newly_broken:
-            words.append("a requirement is BROKEN at dt / 2")
-        return words
-
-    def __str__(self) -> str:
-        """Bounds first, then requirements, the objective, and the rest."""
+    def _content(self) -> Content:
         shown = self.quantities
         heading = "Report on one nominal run: no statistics"
         of_all = ""
@@ -296,7 +278,7 @@ class TuningReport(Result):
             rows += self.at_limits or ["gains at an end of their range: none"]
         if self.step_check is not None:
             rows.append(self.step_check.numbers_in_words())
-        return "\n  ".join([heading, *rows, *self.notes])
+        return [heading, *(f"  {row}" for row in (*rows, *self.notes))]
 
     def _bounds_in_words(self) -> list[str]:
         """Violated bounds with their explanation, those of the tuning's runs, smallest margin."""
@@ -337,7 +319,7 @@ class TuningReport(Result):
         then those that the tuning's runs break.
         """
         rows = []
-        for verdict in sorted(self.verdicts, key=lambda v: WORST_FIRST.index(v.verdict)):
+        for verdict in sorted(self.verdicts, key=lambda v: list(WORST_FIRST).index(v.verdict)):
             rows.append(f"requirement {verdict}")
             own = [x for x in self.failures if x.requirement == verdict.name]
             rows += [f"  {x.cause_in_words()}" for x in own]
@@ -354,8 +336,6 @@ class TuningReport(Result):
         if objective.after > objective.before:
             return ["The objective went up."]
         return []
-
-    __repr__ = __str__
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as numbers and strings."""
@@ -420,7 +400,9 @@ def make_report(request: ReportRequest) -> TuningReport:
         violation=each(lambda x: _probability(x.left_bounds(), x, confidence)),
         margin=each(lambda x: float(x.margin[x.admissible].min())),
         peak_torque=each(lambda x: tuple(x.torque[x.admissible].max(axis=0).tolist())),
-        sampling_radius=each(_largest_radius) if request.after.sampling is not None else None,
+        sampling_radius=None
+        if request.after.sampling is None
+        else each(lambda x: float(x.sampling_radius[x.admissible].max())),
         unstable=each(lambda x: int(np.sum(x.is_sampled_too_slowly()))),
         quantities=ReportedQuantities.of(request.before),
         at_limits=request.at_limits,
@@ -428,11 +410,6 @@ def make_report(request: ReportRequest) -> TuningReport:
         notes=request.notes,
         failures=_failures(request, draws, after) if fresh else (),
     )
-
-
-def _largest_radius(sample: Sample) -> float:
-    """The largest spectral radius of the one-period map of all runs."""
-    return float(sample.sampling_radius[sample.admissible].max())
 
 
 def _failures(

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks, notices, programs
-from iblf_jax.core.presentation import Result, present
+from iblf_jax.core.presentation import Content, Result, present
 from iblf_jax.core.progress import announced
 from iblf_jax.core.status import UNTRUSTED
 from iblf_jax.engine import RunRequest, points_per_batch, run_batch, run_rollout
@@ -86,7 +86,7 @@ class TuneSetup(TuningRunOptions):
     """Why the ranges end there, in words, (p, 2); empty in results that were saved without."""
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class TuneResult(Result):
     """A tuned scenario, the history of its search, and its report.
 
@@ -406,7 +406,7 @@ class TuneResult(Result):
         """
         return present("tuning figure", self, **options)
 
-    def __repr__(self) -> str:
+    def _content(self) -> Content:
         probes = f", {self.probes} probes" if self.probes else ""
         steps = len(self.history["evaluations"])
         lines = [
@@ -421,8 +421,7 @@ class TuneResult(Result):
         peaks = [np.max(np.asarray(run.metrics.peak_torque)) for run in self.nominal]
         shown = ReportedQuantities.of(self.scenario)
         peak_change = f"{peaks[0]:.5g} -> {peaks[1]:.5g} {shown.input_unit}"
-        lines.append(f"  peak {shown.input} of the nominal run: {peak_change}")
-        return "\n".join(lines)
+        return [*lines, f"  peak {shown.input} of the nominal run: {peak_change}"]
 
     def _bounds_and_requirements(self) -> list[str]:
         """Bounds and requirements on the runs of the tuning, and on fresh runs if a report on them
@@ -438,6 +437,3 @@ class TuneResult(Result):
         if report is None:
             return [*rows, "fresh runs: not made yet; `.report` makes them"]
         return [f"{report.runs} fresh runs: {report.headline}", *rows]
-
-    def _repr_html_(self) -> str:
-        return present("card", self)

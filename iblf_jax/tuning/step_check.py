@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.control.actuators import Ideal, Motor
-from iblf_jax.core.presentation import Result
+from iblf_jax.core.presentation import Content, Result
 from iblf_jax.core.units import INPUT, POSITION
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.scenario import Scenario
@@ -125,7 +125,7 @@ class WorstExcess(NamedTuple):
         return self.excess > STEP_TOLERANCE
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class StepCheck(Result):
     """The runs of a tuning with the tuned gains, at dt and at dt / 2; prints as text.
 
@@ -241,10 +241,9 @@ class StepCheck(Result):
             return text
         return f"WARNING: {text}; more than {LARGEST_DIFFERENCE:.0%} apart: {self.remedy}"
 
-    def __str__(self) -> str:
-        """Bounds, then requirements, then the numbers."""
+    def _content(self) -> Content:
         requirements = [f"requirement {r}" for r in self.requirements]
-        return "\n".join([self.bounds_in_words(), *requirements, self.numbers_in_words()])
+        return [self.bounds_in_words(), *requirements, self.numbers_in_words()]
 
 
 def has_rate_of_held_torque(scenario: Scenario, objective: Objective) -> bool:

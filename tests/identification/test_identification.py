@@ -36,6 +36,7 @@ from iblf_jax.identification.standstill import (
     friction_pairs,
     no_free_torques,
 )
+from iblf_jax.reports import shown
 from iblf_jax.simulation.scenario import canonical
 
 MASS, VISCOUS, COULOMB, WIDTH = (
@@ -414,7 +415,7 @@ def test_coulomb_friction_that_was_left_out_is_found_and_what_makes_up_for_it_is
             assert 0.3 < number.bias / (number.value - truth) < 3.0
     assert any(number.verdict == "biased" for number in known.numbers)
     assert "biased" in repr(known) and "compensate for missing terms" in repr(known)
-    assert "biased" in known.tables_html()["Numbers"]
+    assert "biased" in shown(known).tables["Numbers"]
     assert not any("viscous" in path for path in known.perturbations)
     assert json.dumps(known.to_dict(), allow_nan=False)
 

@@ -247,7 +247,7 @@ def _description(law: Law, generated: GeneratedLaw, options: RosOptions) -> dict
     return {
         "name": law.name,
         "version": __version__,
-        "joints": list(_joints(law)),
+        "joints": list(law.joints or (f"joint_{i + 1}" for i in range(law.scenario.n))),
         "has_joint_names": bool(law.joints),
         "period": float(scenario.sampling.period),  # type: ignore[union-attr]
         "reads_velocity": "dq" not in law.unread_levels,
@@ -257,11 +257,6 @@ def _description(law: Law, generated: GeneratedLaw, options: RosOptions) -> dict
         "hold_damping": damping,
         "gains": [_gain_row(scenario, generated.parameters, gain) for gain in options.gains],
     }
-
-
-def _joints(law: Law) -> tuple[str, ...]:
-    """The names of the joints; numbered ones for a model without names."""
-    return law.joints or tuple(f"joint_{i + 1}" for i in range(law.scenario.n))
 
 
 def _gain_row(scenario: Scenario, parameters: Parameters, gain: GainOption) -> dict[str, Any]:

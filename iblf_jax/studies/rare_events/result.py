@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
-from iblf_jax.core import checks, tables
-from iblf_jax.core.presentation import Result, present
+from iblf_jax.core import checks
+from iblf_jax.core.presentation import Content, Result, present
 from iblf_jax.core.status import describe
+from iblf_jax.core.tables import as_text
 from iblf_jax.engine import RunRequest, run_rollout
 from iblf_jax.simulation.metrics import as_folds
 from iblf_jax.simulation.results import Rollout
@@ -28,7 +29,7 @@ NUMBERS_SHOWN = 8
 """Numbers of the most likely failure that the text lists."""
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class LikelyFailure(Result):
     """The most likely draw that was found to fail: the failure nearest to the origin of standard
     normal coordinates.
@@ -71,14 +72,17 @@ class LikelyFailure(Result):
         folds = as_folds(None, self.dt.dtype, self.scenario)
         return run_rollout(self.scenario, folds, self.dt, request, self.noise)
 
-    def __repr__(self) -> str:
+    def _content(self) -> Content:
         order = np.argsort(-np.abs(self.z))[:NUMBERS_SHOWN]
         rows = [("", self.names[i], f"{self.z[i]:+.2f} standard deviations") for i in order]
         left_out = len(self.z) - len(order)
         more = [f"  and {left_out} numbers that deviate less"] if left_out else []
+        return [f"LikelyFailure({self.run_in_words()})", *as_text(rows, left=(0, 1)), *more]
+
+    def run_in_words(self) -> str:
+        """Distance, margin and flags of the run."""
         flags = describe(self.status, status_words(self.scenario))
-        first = f"LikelyFailure(distance {self.distance:.3f}, margin {self.margin:.3g}; {flags})"
-        return "\n".join([first, *tables.as_text(rows, left=(0, 1)), *more])
+        return f"distance {self.distance:.3f}, margin {self.margin:.3g}; {flags}"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -98,7 +102,7 @@ class FailureSamples:
         return len(self.margins)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class FailureProbability(Result):
     """The probability that a run fails, with its interval; printed as sentences."""
 
@@ -220,7 +224,7 @@ class FailureProbability(Result):
         }
         return xarray.Dataset(variables, coordinates, attributes)
 
-    def __repr__(self) -> str:
+    def _content(self) -> Content:
         low, high = self.interval
         confidence = f"{100 * self.confidence:g}%"
         if self.margins_stagnate:
@@ -245,17 +249,16 @@ class FailureProbability(Result):
             lines[1:1] = notes
             notes = []
         if self.most_likely_failure is not None:
-            text = repr(self.most_likely_failure).splitlines()
-            head = text[0].removeprefix("LikelyFailure(").removesuffix(")")
-            lines.append(f"  The most likely failure found: {head}")
-            lines += [f"    {line.strip()}" for line in text[1:]]
+            found = self.most_likely_failure
+            lines.append(f"  The most likely failure found: {found.run_in_words()}")
+            lines += [f"  {line}" for line in repr(found).splitlines()[1:]]
         counts = {
             "draws could not be run and are excluded": self.excluded,
             "runs diverged and count as failures": self.diverged,
             "of the sampled failures started outside their bounds": self.started_outside,
         }
         lines += [f"  {count} {words}." for words, count in counts.items() if count]
-        return "\n".join([*lines, *notes])
+        return [*lines, *notes]
 
     def _method_in_words(self) -> str:
         if self.method == "importance":
@@ -266,8 +269,4 @@ class FailureProbability(Result):
                 f"Subset simulation with {len(self.levels)} levels, at margins {thresholds}"
                 f" {self.unit}."
             )
-        count = len(self.failures)
-        return f"{count} failures among independent draws."
-
-    def _repr_html_(self) -> str:
-        return present("card", self)
+        return f"{len(self.failures)} failures among independent draws."

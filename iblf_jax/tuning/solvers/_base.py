@@ -178,13 +178,9 @@ def _optimiser(name: str, value: Any) -> Any:
     return value
 
 
-def _batch(name: str, value: Any) -> int | None:
-    return None if value is None else checks.positive_integer(name, value, most=MAX_RUNS)
-
-
 CHECKS: dict[str, Any] = {
     "optimiser": _optimiser,
-    "batch": _batch,
+    "batch": lambda name, x: x if x is None else checks.positive_integer(name, x, most=MAX_RUNS),
     "mode": lambda name, x: _word(name, x, MODES),
     "resample": checks.boolean,
     "starts": lambda name, x: None if x is None else checks.positive_integer(name, x),

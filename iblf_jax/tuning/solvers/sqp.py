@@ -579,7 +579,10 @@ def _advance(space: SearchSpace, state: SQPState, found: Point, tolerance: float
     is_accepted = ratio > RATIO_TO_ACCEPT
     state.rejections = 0 if is_accepted else state.rejections + 1
     if state.rejections >= MOST_REJECTIONS:
-        _reset_curvatures(state)
+        # The model has failed repeatedly.
+        state.correction[:] = 0.0
+        state.curvatures[:] = 0.0
+        state.rejections = 0
     if is_accepted:
         _accept(space, state, found)
     elif valid:
@@ -601,13 +604,6 @@ def _is_comparable(state: SQPState, found: Point) -> bool:
     largest = LARGEST_LOSS_FACTOR * (1.0 + float(np.max(state.here.pieces, initial=0.0)))
     rise = found.loss - state.here.loss
     return rise <= LARGEST_LOSS_FACTOR * state.size and worst <= largest
-
-
-def _reset_curvatures(state: SQPState) -> None:
-    """Sets A and every C_j to zero, because their model has failed repeatedly."""
-    state.correction[:] = 0.0
-    state.curvatures[:] = 0.0
-    state.rejections = 0
 
 
 def _merit(space: SearchSpace, state: SQPState, loss: float, pieces: np.ndarray) -> float:
