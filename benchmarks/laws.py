@@ -127,7 +127,9 @@ CHOICES = {
     ),
     "Backstepping, no bounds": Choice("backstepping"),
     "BarrierBackstepping(Mapping)": Choice(controllers.BarrierBackstepping(k=(2.0, 20.0))),
-    "FullState": Choice("full_state", {"bounds": (POSITIONS, _box(3.0))}),
+    "BarrierBackstepping(Integral, Integral)": Choice(
+        "full_state", {"bounds": (POSITIONS, _box(3.0))}
+    ),
     "DynamicSurface": Choice("dynamic_surface"),
     "SurfaceBarrier": Choice(controllers.SurfaceBarrier(a=2.0, K=K2, surface=_box(9.0))),
     "SafetyFilter": Choice("safety_filter"),

@@ -77,7 +77,7 @@ ADVICE = {
         " of the laws that keep bounds",
         "the sensor is noisy: its ripple is more than twice that of `Backstepping(Integral)`",
     ),
-    "FullState": Advice(
+    "BarrierBackstepping(Integral, Integral)": Advice(
         "positions and velocities have bounds",
         "the masses are uncertain: with masses that are 30 % wrong its error is six times as large",
     ),

@@ -236,7 +236,8 @@ CASES: dict[str, Case] = {
         lambda: _run(_slow()),
         "A joint exceeded its velocity bound. The law of this example does not use velocity"
         " bounds.",
-        "Use `controllers.FullState`, which bounds positions and velocities, or reduce `k1`.",
+        "Use `controllers.BarrierBackstepping` with two barriers, which bounds positions and"
+        " velocities, or reduce `k1`.",
         plotting.velocities,
     ),
     "ALPHA_INFEASIBLE": Case(

@@ -5,6 +5,8 @@ Whoever adds a member adds it here; `test_contracts.test_every_member_is_listed`
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax.numpy as jnp
 from arm_cases import random_arm
 
@@ -24,6 +26,7 @@ from iblf_jax import (
     robots,
     sensors,
 )
+from iblf_jax.core.pytree import unwrapped
 from iblf_jax.simulation import metrics
 
 TWO_LINK = ij.presets.customary_two_link()
@@ -256,6 +259,31 @@ SURFACE = bounds.Bounds(
     lower=bounds.Funnel(initial=-9.0, final=-0.5, rate=1.5), upper=bounds.Constant([8.0, 6.0])
 )
 
+
+def two_barriers(
+    k1: Any = 2.0,
+    K2: Any = 20.0,
+    c: Any = 1.0,
+    first: Any = None,
+    second: Any = None,
+    weight: Any = 1.0,
+    **fields: Any,
+) -> controllers.BarrierBackstepping:
+    """The law of a robot with a barrier on the positions and one on the velocities, integral ones
+    if not given; K2 in 1/s.
+    """
+    both = tuple(barriers.Integral() if x is None else x for x in (first, second))
+    weights = (weight, 1.0)
+    return controllers.BarrierBackstepping(
+        k=(k1, K2), barriers=both, c=(0.0, c), weights=weights, **fields
+    )
+
+
+def keeps_velocities(law: Any) -> bool:
+    """Whether a law has a barrier on the second level of a plant."""
+    return any(not isinstance(x, barriers.Quadratic) for x in unwrapped(law).barriers[1:2])
+
+
 LAWS = {
     "backstepping": controllers.Backstepping(k1=2.0, K2=20.0, o=0.1),
     "backstepping_corrected_log": controllers.Backstepping(
@@ -275,14 +303,9 @@ LAWS = {
         reading="corrected",
         decays=(DECAYS["finite_time"], decays.PrescribedTime(T=1.0)),
     ),
-    "full_state": controllers.FullState(k1=2.0, K2=[20.0, 15.0], c=1.0, o=0.1),
-    "full_state_mixed": controllers.FullState(
-        k1=2.0,
-        K2=20.0,
-        c=1.0,
-        barrier=barriers.Tan(),
-        velocity_barrier=barriers.PrescribedPerformance(),
-        weight=[0.5, 2.0],
+    "barrier_backstepping_velocities": two_barriers(K2=[20.0, 15.0], o=0.1),
+    "barrier_backstepping_mixed": two_barriers(
+        first=barriers.Tan(), second=barriers.PrescribedPerformance(), weight=[0.5, 2.0]
     ),
     "dynamic_surface": controllers.DynamicSurface(
         k1=2.0, K2=[20.0, 15.0], filter=[0.02, 0.03], o=0.1, weight=[0.5, 2.0]

@@ -104,8 +104,8 @@ SPECIAL: dict[str, Callable[[Any], ij.Scenario]] = {
     "sensor levels": lambda part: sampled(CHAIN, sensor=part),
     "sensor levels_encoders": lambda part: sampled(FLEXIBLE, sensor=part),
     "sensor levels_unmeasured": estimated,
-    "law full_state": with_velocity_bounds,
-    "law full_state_mixed": with_velocity_bounds,
+    "law barrier_backstepping_velocities": with_velocity_bounds,
+    "law barrier_backstepping_mixed": with_velocity_bounds,
     "law with_drive": lambda part: ij.with_parts(CHAIN, controller=part, model=part.drive.robot),
 }
 """Members that fit into a loop of their own."""

@@ -226,7 +226,6 @@ def numbers_of(
             "span_ddq": 3.0 * rate * speed,
         },
         controllers.BarrierBackstepping: {"k": geometric_gains(rate, 2)},
-        controllers.FullState: {"k1": rate, "K2": 10.0 * rate},
         controllers.SurfaceBarrier: {
             "a": rate,
             "K": damping * surface**2,

@@ -1,14 +1,12 @@
-"""Certificates: the claims of Theorem 2, or of (S.3), about a loop, checked inequality by
-inequality (`certify`), and a search for states that break them (`counterexample`).
+"""Certificates: the claims about a closed loop, checked inequality by inequality (`certify`), and a
+search for states that break them (`counterexample`).
 
-    certify -> run_summary.summarise -> reconstruction.steps_of -> proof_terms, engine
-            -> rate_lines, theorem_lines, decay_lines, law_claim_lines -> lines
+    certify -> claims.claims_of -> summary.summarise -> reconstruction.steps_of -> terms, engine
+            -> the lines of each claim (`claims`) -> lines
             -> result.Certificate
 
-Laws that receive the levels of a plant in strict-feedback form have the claim (S.3):
-
-    certify -> _level_certificate -> level_summary -> reconstruction.steps_of -> level_terms
-                                  -> level_lines, law_claim_lines -> lines
+The claims are objects, and so are the terms that they have in common (`terms.Terms`): one record
+for a plant of any order, with an entry for each claim.
 """
 
 from iblf_jax.certificates._certify import certify as certify

@@ -1,9 +1,8 @@
-"""`certify`: checks one run, a batch of runs or a study against Theorem 2, or against (S.3).
+"""`certify`: checks one run, a batch of runs or a study against the claims about its loop.
 
 `certify` checks what the caller passed and lists the runs. `_certificate_of` takes one run through
-its summary and its segments (`run_summary`, which runs the engine), the lines about them
-(`rate_lines`, `theorem_lines`, `decay_lines`, `law_claim_lines`) and the traces. `_over_runs`
-combines the certificates of many runs.
+its summary and its segments (`summary`, which runs the engine), the lines of its claims (`claims`)
+and the traces. `_over_runs` combines the certificates of many runs.
 """
 
 from __future__ import annotations
@@ -15,25 +14,14 @@ from typing import Any
 import jax
 import numpy as np
 
-from iblf_jax.certificates import (
-    decay_lines,
-    law_claim_lines,
-    lines,
-    rate_lines,
-    settling,
-    theorem_lines,
-)
-from iblf_jax.certificates._level_certificate import (
-    heading_of,
-    level_certificate,
-    unclaimed_level_traces,
-)
-from iblf_jax.certificates.claims import own_claim
-from iblf_jax.certificates.level_terms import is_about_levels
+from iblf_jax.certificates import lines
+from iblf_jax.certificates.claims import claims_of, shown_claim
+from iblf_jax.certificates.claims.own import OWN, is_about_torque
 from iblf_jax.certificates.lines import FAILS, NOT_APPLICABLE, Line, Statement, not_applicable
 from iblf_jax.certificates.reconstruction import is_valid, time_grid
-from iblf_jax.certificates.result import Certificate, LevelTraces, Traces
-from iblf_jax.certificates.run_summary import THEOREM, WEIGHTED, RunSummary, Segment, summarise
+from iblf_jax.certificates.result import Certificate
+from iblf_jax.certificates.summary import Summary, summarise
+from iblf_jax.certificates.terms import adaptive_law
 from iblf_jax.control import actuators, sensors
 from iblf_jax.control.controllers import EventCompensated
 from iblf_jax.control.controllers.event_compensated import excess
@@ -129,7 +117,7 @@ def certify(
         steps), or arguments of the wrong kind.
 
     Source: Zhang & Yan 2024, Theorem 2 and its proof, (3.16)-(3.31); (S.3) as at the head of
-      `iblf_jax.certificates.level_terms`, (D.2) at that of `iblf_jax.certificates.settling`.
+      `iblf_jax.certificates.claims.levels`, (D.2) as at that of `claims.settling` there.
     """
     if isinstance(scenario, Rollout | Study):
         remedy = "Pass certify(scenario, run) or certify(scenario, study)."
@@ -138,7 +126,7 @@ def certify(
     if not checks.is_concrete(scenario):
         remedy = "certify works on the host: call it outside jit, vmap and grad."
         raise checks.fail("scenario", "traced values", "numbers", remedy)
-    own_claim(scenario)  # refuses half of a claim before a run is made
+    OWN.why_not(scenario)  # refuses half of a claim before a run is made
     if run is None:
         every = 1 + checks.whole_steps(duration, dt) // MAX_RECORDED
         run = simulate(scenario, duration=duration, dt=dt, method=method, record_every=every)
@@ -246,126 +234,58 @@ def _checked_claims(run: Rollout) -> Certificate:
         return _certificate_by_comparison(run, "sampled", SAMPLED)
     if run.scenario.actuator.input_delay is not None:
         return _certificate_by_comparison(run, "delayed", DELAYED)
-    if is_about_levels(run.scenario):
-        return level_certificate(run)
-    summary, segments = summarise(run)
-    checked: list[Line] = []
-    weighted: list[Line] = []
-    shares: dict[str, float] = {}
+    scenario, shown = run.scenario, shown_claim(run.scenario)
+    summary, segments = summarise(run, claims_of(scenario))
+    assumptions: list[Line] = []
+    at_steps: dict[str, list[Line]] = {claim.key: [] for claim in summary.claims}
+    gathered: dict[str, list[Any]] = {claim.key: [] for claim in summary.claims}
     traces = []
-    courses: list[settling.Course] = []
-    has_settling = settling.has_settling_claim(run.scenario)
-    why_no_settling = settling.why_no_settling(summary)
     for segment in segments:
-        about_theorem, segment_shares = theorem_lines.segment_lines(segment)
-        checked += [*law_claim_lines.own_segment_lines(segment), *about_theorem]
-        if not summary.claims.why_no_weights:
-            weighted += decay_lines.decay_lines(segment, WEIGHTED)
-        if has_settling:
-            courses.append(settling.robot_course(segment))
-        if has_settling and not summary.claims.bounds_velocities:
-            checked.append(settling.decay_line(segment, why_no_settling))
-        for name, share in segment_shares.items():
-            shares[name] = max(share, shares.get(name, 0.0))
-        traces.append(_traces(segment))
-    by_name = lines.merged(checked)
-    for name, share in shares.items():
-        note = f"at most {100 * share:.3g} % of that margin at one instant"
-        by_name[name] = dataclasses.replace(by_name[name], note=note)
-    names = [statement.name for statement in theorem_lines.ASSUMPTIONS]
-    assumptions = [by_name.pop(name) for name in names if name in by_name]
-    all_lines = (
-        *assumptions,
-        *rate_lines.rate_lines(summary),
-        *by_name.values(),
-        *rate_lines.weighted_rate_lines(summary),
-        *lines.merged(weighted).values(),
-        *settling.settling_lines(summary, courses, why_no_settling, summary.mu),
-    )
+        for claim in summary.claims:
+            assumptions += claim.assumptions(segment)
+            at_steps[claim.key] += claim.lines(segment)
+            gathered[claim.key].append(claim.gathered(segment))
+        traces.append(shown.traces(segment))
+    by_name = lines.merged(assumptions)
+    for claim in summary.claims:
+        by_name |= {line.name: line for line in claim.gains(summary)}
+    by_name |= lines.merged([line for claim in summary.claims for line in at_steps[claim.key]])
+    for claim in summary.claims:
+        concluded = list(claim.conclusions(summary, gathered[claim.key], by_name))
+        by_name |= {line.name: line for line in concluded}
     return Certificate(
-        heading_of(run.scenario),
-        all_lines,
+        _heading_of(scenario),
+        tuple(by_name.values()),
         _numbers(summary),
-        Traces(*map(np.concatenate, zip(*traces, strict=True))),
-        joints=plants.component_names(run.scenario.plant),
+        type(traces[0])(*map(np.concatenate, zip(*traces, strict=True))),
+        joints=plants.component_names(scenario.plant),
+        claim=shown.in_words,
+        levels=shown.labels(scenario),
     )
 
 
-def _numbers(summary: RunSummary) -> dict[str, Any]:
+def _heading_of(scenario: Scenario) -> str:
+    """Law, barriers, reading and observer, in words."""
+    law = unwrapped(scenario.controller)
+    adaptive = adaptive_law(scenario)
+    parts = [type(law).__name__]
+    if adaptive is not None:
+        parts.insert(0, f"{type(adaptive).__name__} of {len(adaptive.parameters)}")
+    if law.barrier is not None:
+        parts.append(f"barrier {type(law.barrier).__name__}")
+    if law.barriers:
+        parts.append("barriers " + " ".join(type(x).__name__ for x in law.barriers))
+    if law.reading:
+        parts.append(f"reading {law.reading}")
+    return ", ".join([*parts, f"observer {type(scenario.observer).__name__}"])
+
+
+def _numbers(summary: Summary) -> dict[str, Any]:
     """The constants of the claims."""
-    rho = {f"rho_{domain}_case_{case}": value for (case, domain), value in summary.rho.items()}
-    weighted = {
-        f"{name}_weighted_case_{case}": value
-        for case, chosen in summary.weighted_constants.items()
-        for name, value in chosen._asdict().items()
-    }
-    return {
-        **rho,
-        "case": summary.case,
-        "F_m": summary.F_m,
-        "F_d": summary.F_d,
-        "rho2": summary.F_d**2 / 2,
-        "V2_start": summary.V_ends[0],
-        "V2_end": summary.V_ends[1],
-        "lambda_min_run": summary.lambda_min,
-        "lambda_max_run": summary.lambda_max,
-        "lambda_min_box": summary.over_box.lambda_min,
-        "lambda_max_box": summary.over_box.lambda_max,
-        "lambda_searched": summary.over_box.searched,
-        "q_of_lambda_max_box": summary.over_box.q_max,
-        "jump_times": summary.jumps,
-        "lambda_min_K2_over_M0_run": summary.mu,
-        **weighted,
-        "samples": summary.samples,
-        "samples_left_out": summary.excluded,
-    }
-
-
-def _traces(segment: Segment) -> Traces:
-    """The curves of the figure along a segment, at its recorded samples; NaN where there is no
-    claim.
-
-    For a law that has only a claim about itself, V and the left side are those of that claim.
-    """
-    summary, sample, proof = segment.summary, segment.sample, segment.proof
-    case = summary.theorem_case
-    traces = _unclaimed_traces(segment.t, proof.V, sample.xi, proof.e2, proof.f_tilde)
-    traces = traces._replace(dropped=proof.dropped_e2 + proof.dropped_f, excluded=proof.excluded)
-    left = traces.left
-    if case is not None:
-        envelope = segment.envelopes[THEOREM, case].bound
-        left = decay_lines.left_side(segment, THEOREM, case)
-        bounds = decay_lines.bounds_along(segment, envelope)
-        traces = traces._replace(
-            envelope=envelope,
-            xi_bound=bounds["xi, by V1"],
-            e2_bound=bounds["e2"],
-            f_tilde_bound=bounds["f_tilde"],
-        )
-    elif summary.claims.own is not None and not law_claim_lines.why_not_own(summary):
-        left = law_claim_lines.own_left_side(proof)
-        traces = traces._replace(V=proof.own.V, dropped=np.zeros_like(left))
-    traces = traces._replace(left=np.where(proof.excluded, np.nan, left))
-    return Traces(*(x[segment.recorded] for x in traces))
-
-
-def _unclaimed_traces(t: Any, V: Any, xi: Any, e2: Any, f_tilde: Any) -> Traces:
-    """The curves of samples of which nothing is claimed."""
-    nan = np.full(t.shape, np.nan)
-    return Traces(
-        t=t,
-        V=V,
-        envelope=nan,
-        left=nan,
-        dropped=nan,
-        xi=xi,
-        xi_bound=np.full(xi.shape, np.nan),
-        e2=np.linalg.norm(e2, axis=1),
-        e2_bound=nan,
-        f_tilde=np.linalg.norm(f_tilde, axis=1),
-        f_tilde_bound=nan,
-        excluded=np.ones(t.shape, bool),
-    )
+    found: dict[str, Any] = {}
+    for claim in summary.claims:
+        found |= claim.numbers(summary)
+    return found | {"samples": summary.samples, "samples_left_out": summary.excluded}
 
 
 # --- one run of a sampled or delayed loop --------------------------------------------------------
@@ -409,16 +329,8 @@ def _certificate_by_comparison(run: Rollout, kind: str, reason: str) -> Certific
     return dataclasses.replace(
         certificate,
         lines=(*unclaimed, *_compared(run, continuous, kind), *_trigger_lines(run)),
-        traces=_traces_without_claim(run),
+        traces=shown_claim(scenario).unclaimed_traces(run),
     )
-
-
-def _traces_without_claim(run: Rollout) -> Traces | LevelTraces:
-    """The curves of a run of which nothing is claimed."""
-    if is_about_levels(run.scenario):
-        return unclaimed_level_traces(run)
-    f_tilde = run.disturbance - run.disturbance_estimate
-    return _unclaimed_traces(run.t, run.V, run.xi, run.e2, f_tilde)
 
 
 def _compared(run: Rollout, continuous: Rollout, kind: str) -> tuple[Line, Line]:
@@ -463,7 +375,7 @@ def _trigger_lines(run: Rollout) -> tuple[Line, ...]:
         line = not_applicable(COMPENSATED, AT_CHECKS, counts=False)
         return (dataclasses.replace(line, value=float(excess(law))),)
     inner = unwrapped(law)
-    if is_about_levels(scenario) or law is not inner or inner.includes_e2:
+    if not is_about_torque(scenario) or law is not inner or inner.includes_e2:
         return ()
     if not isinstance(scenario.actuator, actuators.Ideal) or sampling.queue > 0:
         return ()  # the torque of the run is not the command that the trigger holds

@@ -33,15 +33,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.certificates import claims
+from iblf_jax.certificates.claims.levels import LEVELS
+from iblf_jax.certificates.claims.own import is_about_torque
+from iblf_jax.certificates.claims.theorem import LOWEST_K2, LOWEST_KF, THEOREM
+from iblf_jax.certificates.claims.two_cases import gains_of
 from iblf_jax.certificates.eigenvalues import maximise
-from iblf_jax.certificates.level_summary import why_no_level_claim
-from iblf_jax.certificates.level_terms import is_about_levels, level_terms_at
-from iblf_jax.certificates.proof_terms import terms_at
-from iblf_jax.control.controllers import Backstepping
+from iblf_jax.certificates.terms import terms_and_sample
 from iblf_jax.core import checks
 from iblf_jax.core.presentation import Result
-from iblf_jax.core.pytree import unwrapped
 from iblf_jax.simulation.closed_loop import initial_state
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.scenario import Scenario, canonical
@@ -68,19 +67,19 @@ def _growth(scenario: Scenario) -> tuple[jax.Array, jax.Array]:
     (3.24), (S.3)
     """
     t, state = jnp.zeros((), scenario.initial.q.dtype), initial_state(scenario)
-    if is_about_levels(scenario):
-        terms = level_terms_at(scenario, t, state)
-        claim = terms.claim
-        growth = claim.dV - claim.disturbance_terms - claim.lag
+    if not is_about_torque(scenario):
+        terms, _ = terms_and_sample(scenario, t, state, (LEVELS,))
+        claim = terms.claims[LEVELS.key]
+        growth = terms.dV - claim.disturbance_terms - claim.lag
         return growth / (claim.decay + claim.by_slopes), terms.excluded
-    proof = terms_at(scenario, t, state)
-    constants: Any = claims.constants_of(scenario)
-    M0 = scenario.model.mass_matrix(scenario.initial.q)
-    V1 = proof.V - 0.5 * (proof.e2 @ (M0 @ proof.e2) + proof.f_tilde @ proof.f_tilde)
-    by_e2 = proof.e2 @ ((constants.K2 - claims.LOWEST_K2) * proof.e2)
-    by_f = proof.f_tilde @ ((constants.kf - claims.LOWEST_KF[2]) * proof.f_tilde)
-    Q = jnp.min(constants.decay) * V1 + by_e2 + by_f
-    return (proof.dV - 0.5 * proof.df @ proof.df) / Q, proof.excluded
+    terms, _ = terms_and_sample(scenario, t, state, (THEOREM,))
+    gains, e2, f_tilde = gains_of(scenario), terms.e[1], terms.d_tilde
+    M0 = terms.claims["torque"].M0
+    V1 = terms.V - 0.5 * (e2 @ (M0 @ e2) + f_tilde @ f_tilde)
+    by_e2 = e2 @ ((gains.K2 - LOWEST_K2) * e2)
+    by_f = f_tilde @ ((gains.kf - LOWEST_KF[2]) * f_tilde)
+    Q = jnp.min(gains.decay) * V1 + by_e2 + by_f
+    return (terms.dV - 0.5 * terms.dd @ terms.dd) / Q, terms.excluded
 
 
 @checks.known_keywords
@@ -125,21 +124,11 @@ def counterexample(
 
 def _check_claimed(scenario: Scenario) -> None:
     """Raises ValueError for a scenario about which neither Theorem 2 nor (S.3) makes a claim."""
-    reason = _why_unclaimed(scenario)
+    claim = THEOREM if is_about_torque(scenario) else LEVELS
+    reason = claim.why_not(scenario)
     if reason:
         got = type(scenario.controller).__name__
         raise checks.fail("scenario", got, "a scenario with a claim", f"{reason}.")
-
-
-def _why_unclaimed(scenario: Scenario) -> str:
-    """Why the search has no claim to break, in words; "" if it has one."""
-    if is_about_levels(scenario):
-        return why_no_level_claim(scenario)
-    law = unwrapped(scenario.controller)
-    reason = claims.why_no_theorem(scenario)
-    if not reason and not isinstance(law, Backstepping):
-        reason = f"Q is Theorem 2's; {type(law).__name__} has a claim of its own"
-    return reason
 
 
 class _Search:

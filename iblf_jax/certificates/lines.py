@@ -162,6 +162,18 @@ def check_margins(
     )
 
 
+def finite(statement: Statement, t: np.ndarray, values: np.ndarray, note: str = "") -> Line:
+    """The line of a quantity that must be finite at every step, with its largest value."""
+    at = int(np.argmax(np.nan_to_num(values, nan=np.inf)))
+    verdict = verdict_of(bool(np.all(np.isfinite(values))))
+    return statement.line(verdict, value=float(values[at]), time=float(t[at]), note=note)
+
+
+def observed_only(line: Line, reason: str) -> Line:
+    """A line that no claim covers."""
+    return dataclasses.replace(line, verdict=NOT_APPLICABLE, note=f"{OBSERVED_ONLY}{reason})")
+
+
 def join_notes(*notes: str) -> str:
     """Several notes in one, without the empty ones."""
     return "; ".join(note for note in notes if note)

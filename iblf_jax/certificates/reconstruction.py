@@ -1,4 +1,4 @@
-"""Reconstruction of every step of a run from its recorded samples, with the proof terms of each.
+"""Reconstruction of every step of a run from its recorded samples, with the terms of its claims.
 
 A recorded sample holds the complete state of the loop. The steps between two samples are therefore
 integrated again from the first, and must arrive at the second; and the recorded signals must be
@@ -16,24 +16,25 @@ This is the only module of the package that runs the engine step by step. It wor
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
-from typing import Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.certificates.level_terms import is_about_levels, level_terms_and_sample
-from iblf_jax.certificates.proof_terms import ProofTerms, mass_over_gain, terms_and_sample
+from iblf_jax.certificates.terms import terms_and_sample
 from iblf_jax.core import checks
 from iblf_jax.core.attributes import attributes
 from iblf_jax.core.status import UNTRUSTED, Status, describe, has_flag
 from iblf_jax.engine import Step, step_states
 from iblf_jax.simulation import discontinuities
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state
-from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.world import plants
+
+if TYPE_CHECKING:
+    from iblf_jax.certificates.claims._base import Claim
 
 BLOCK_STEPS = 1024
 """Steps in a block: memory does not grow with the length of a run, and one program serves every
@@ -69,12 +70,12 @@ class Steps(NamedTuple):
     t: np.ndarray
     sample: Any
     """`Sample` at each step."""
-    proof: Any
-    """`ProofTerms`, or `LevelTerms`, at each step."""
+    terms: Any
+    """`Terms` of NumPy arrays at each step."""
     recorded: np.ndarray
     """Whether the run recorded the step, bool."""
     defect: np.ndarray
-    """Error of the integrator in V2 over one step from each."""
+    """Error of the integrator in V over one step from each."""
     defect_f: np.ndarray
     """Error of the integrator in |f_tilde|^2/2 over one step from each."""
 
@@ -110,8 +111,9 @@ def time_grid(run: Any) -> TimeGrid:
     return TimeGrid(every, last, last * dt)
 
 
-def steps_of(run: Any, grid: TimeGrid) -> Iterator[Steps]:
-    """All steps of one run, its arrays on the host, in order, in blocks.
+def steps_of(run: Any, grid: TimeGrid, claims: tuple[Claim, ...]) -> Iterator[Steps]:
+    """All steps of one run, its arrays on the host, in order, in blocks, with the terms of some
+    claims about its scenario.
 
     Raises:
       ValueError: the scenario of the run does not give what the run recorded.
@@ -119,7 +121,7 @@ def steps_of(run: Any, grid: TimeGrid) -> Iterator[Steps]:
     valid, sizes = is_valid(run), tolerances(run)
     blocks = _integrated_again(run, grid) if valid else _as_recorded(run, grid)
     for index, states in blocks:
-        steps = _with_proof(run, index, states, grid)
+        steps = _with_terms(run, index, states, grid, claims)
         if valid:
             _check_signals(run, steps, index[steps.recorded] // grid.record_every, sizes)
         yield steps
@@ -196,16 +198,16 @@ class Position(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class ObserveStep(Step):
-    """A step of the engine that keeps its position and records the proof terms there."""
+    """A step of the engine that keeps its position and records the terms of some claims there."""
 
-    terms: Callable = terms_and_sample
-    """Function of a scenario, a time and a state."""
+    claims: tuple[Claim, ...]
 
     is_derivative: ClassVar[bool] = True
 
-    def __call__(self, inputs, at: Position, index: jax.Array, form):
-        """The position, and its terms."""
-        return at, self.terms(inputs.scenario, at.steps * at.size, at.state)
+    def __call__(self, inputs: Any, at: Position, index: jax.Array, form: Any) -> tuple[Any, Any]:
+        """The position, and its terms and sample."""
+        t = at.steps * at.size
+        return at, terms_and_sample(inputs.scenario, t, at.state, self.claims)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -259,66 +261,47 @@ def padded_index(size: int) -> np.ndarray:
     return np.minimum(np.arange(BLOCK_STEPS), size - 1)
 
 
-def _with_proof(run: Any, index: np.ndarray, states: LoopState, grid: TimeGrid) -> Steps:
-    """The steps with their proof terms."""
+def _with_terms(
+    run: Any, index: np.ndarray, states: LoopState, grid: TimeGrid, claims: tuple[Claim, ...]
+) -> Steps:
+    """The steps with the terms of some claims."""
     size, padded = index.size, padded_index(index.size)
     t = index.astype(run.t.dtype) * run.dt
     padded_states = _rows(jax.tree.map(np.asarray, states), padded)
-    found = proof_along(run.scenario, index[padded], padded_states, run.dt, method=run.method)
-    proof, sample, defect, defect_f = _rows(found, slice(0, size))
-    return Steps(t, sample, proof, index % grid.record_every == 0, defect, defect_f)
+    found = terms_along(run, index[padded], padded_states, claims)
+    terms, sample, defect, defect_f = _rows(found, slice(0, size))
+    return Steps(t, sample, terms, index % grid.record_every == 0, defect, defect_f)
 
 
-def proof_along(
-    scenario: Scenario, index: np.ndarray, states: LoopState, dt: jax.Array, *, method: str
-):
-    """Proof terms, samples and integration errors at some steps of a run.
+def terms_along(
+    run: Any, index: np.ndarray, states: LoopState, claims: tuple[Claim, ...]
+) -> tuple[Any, Any, np.ndarray, np.ndarray]:
+    """Terms of claims, samples and integration errors at some steps of a run.
 
     Args:
-      scenario: canonical.
+      run: its scenario, dt and method are used.
       index: numbers of the steps, (T,).
       states: the states before them, (T, ...).
-      dt, method: of the run.
+      claims: about the scenario.
 
     Returns:
-      `ProofTerms`, or `LevelTerms` for a law that receives the levels; `Sample`; and the errors of
-      the integrator in V2 and in |f_tilde|^2/2 over one step, on the host; (T, ...) each.
+      Terms and samples; and the errors of the integrator in V and in |f_tilde|^2/2 over one step,
+      on the host; (T, ...) each.
     """
+    scenario, dt = run.scenario, run.dt
     full, halves = (_positions(index, states, dt, substeps) for substeps in (1, 2))
     # One step is compared with two half steps, because the envelopes are compared with a run in
-    # which V2 has fallen below what the integrator resolves. Both are advanced three times, so that
+    # which V has fallen below what the integrator resolves. Both are advanced three times, so that
     # they are one call of one program.
     both = jax.tree.map(lambda *xs: np.concatenate(xs), full, halves)
-    energies = step_states(scenario, dt, both, step=AdvanceStep(method), steps=3)[1][1]
-    proof, sample = _terms_along(scenario, dt, full)
+    energies = step_states(scenario, dt, both, step=AdvanceStep(run.method), steps=3)[1][1]
+    found = step_states(scenario, dt, full, step=ObserveStep(claims))[1]
+    terms, sample = jax.tree.map(lambda x: np.asarray(x)[:, 0], found)
     defect, defect_f = map(_defect, energies)
-    if is_about_levels(scenario) and not plants.is_chain(scenario.model):
+    if "levels" in terms.claims and not plants.is_chain(scenario.model):
         # V of a robot's sample includes |f_tilde|^2/2, which the sum of w_i V_i does not.
         defect = defect + defect_f
-    return proof, sample, defect, defect_f
-
-
-def _terms_along(scenario: Scenario, dt: jax.Array, at: Position) -> tuple[Any, Any]:
-    """Terms and samples at some positions, on the host; (T, ...) each."""
-    if is_about_levels(scenario):
-        found = step_states(scenario, dt, at, step=ObserveStep(level_terms_and_sample))[1]
-        return jax.tree.map(lambda x: np.asarray(x)[:, 0], found)  # type: ignore[no-any-return]
-    found = step_states(scenario, dt, at, step=ObserveStep())[1]
-    terms: dict[str, Any]
-    terms, M0, sample = jax.tree.map(lambda x: np.asarray(x)[:, 0], found)
-    eigenvalues = _eigenvalues(M0)
-    terms["lambda_min"], terms["lambda_max"] = eigenvalues[:, 0], eigenvalues[:, -1]
-    terms["mu"] = 1.0 / _eigenvalues(np.asarray(mass_over_gain(scenario, M0)))[:, -1]
-    return ProofTerms(**terms), sample
-
-
-def _eigenvalues(matrices: np.ndarray) -> np.ndarray:
-    """Eigenvalues of symmetric matrices, ascending, (T, n); NaN where a matrix is not finite, for
-    which NumPy would raise.
-    """
-    finite = np.all(np.isfinite(matrices), axis=(1, 2), keepdims=True)
-    unit = np.eye(matrices.shape[-1])
-    return np.where(finite[..., 0], np.linalg.eigvalsh(np.where(finite, matrices, unit)), np.nan)
+    return terms, sample, defect, defect_f
 
 
 def _defect(energy: jax.Array) -> np.ndarray:

@@ -111,7 +111,8 @@ def limiting_term(run: Any) -> Limit | None:
 def terms_of(scenario: Scenario) -> Iterator[Term]:
     """The terms of a scenario's loop that are leaves."""
     law = unwrapped(scenario.controller)
-    names = (*law.gains, *law.unit_factors, "c")
+    # Scaling the weights of all levels scales V, and no term of the loop.
+    names = {*law.gains, *law.factors, "c"} - {"weights"}
     of_law = {f"controller.{name}" for name in names}
     for parameter in parameters(scenario, named=False):
         part, _, rest = parameter.path.partition(".")

@@ -1,10 +1,10 @@
 """Structural constants of a scenario: the numbers that are compiled into the kernel.
 
 They are the numbers of a robot's geometry that are 0, 1 or -1 or equal other numbers, and the
-factors of a law that are 1.  Axes, offsets and rotations of real arms are mostly zeros, and model
-and plant mostly agree, so a kernel that uses this needs fewer operations.  Other values are inputs
-of the kernel, and so are all masses, gains and loads: new values need no compilation.  A robot
-declares the fields in question (`geometry_fields`), and so does a law (`unit_factors`, such as the
+factors of a law that are 0 or 1.  Axes, offsets and rotations of real arms are mostly zeros, and
+model and plant mostly agree, so a kernel that uses this needs fewer operations.  Other values are
+inputs of the kernel, and so are all masses, gains and loads: new values need no compilation.  A
+robot declares the fields in question (`geometry_fields`), and so does a law (`factors`, such as the
 weight of a barrier).  Leaves that differ between runs are never structural constants.
 """
 
@@ -24,6 +24,8 @@ from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.world import plants
 from iblf_jax.world.robots import Robot
 
+COMPILED = (0.0, 1.0)
+"""Factors of a law that are compiled into the kernel."""
 QUATERNIONS = ("rotation", "tip_rotation")
 """Fields whose rows have equal numbers for a systematic reason: a right angle."""
 
@@ -152,16 +154,16 @@ def _of_entry(
 def constants_of(scenario: Scenario) -> StructuralConstants | None:
     """The structural constants of a scenario's robots and of its law; None if there are none.
 
-    Those of a law are the entries of its `unit_factors` that are 1.
+    Those of a law are the entries of its `factors` that are 0 or 1.
     """
     of_robots = robot_constants(scenario)
-    factors = _unit_factors(scenario)
-    if not any(np.any(np.asarray(factor) == 1.0) for factor in factors.values()):
+    factors = _factors(scenario)
+    if not any(np.any(np.isin(factor, COMPILED)) for factor in factors.values()):
         return of_robots
     numbers: list[Known | None] = []
     for path, leaf in jax.tree_util.tree_flatten_with_path(scenario)[0]:
-        values = np.ravel(factors.get(_names(path), np.zeros(np.size(leaf))))
-        numbers += [Known(1.0) if x == 1.0 else None for x in values.tolist()]
+        values = np.ravel(factors.get(_names(path), np.full(np.size(leaf), np.nan)))
+        numbers += [Known(x) if x in COMPILED else None for x in values.tolist()]
     if of_robots is not None:
         # A number is a constant of a robot or of the law, not of both.
         both = zip(of_robots.numbers, numbers, strict=True)
@@ -169,14 +171,14 @@ def constants_of(scenario: Scenario) -> StructuralConstants | None:
     return StructuralConstants(tuple(numbers))
 
 
-def _unit_factors(scenario: Scenario) -> dict[tuple[str, ...], Any]:
-    """The `unit_factors` of a scenario's law and of the laws that it wraps, by their paths; traced
+def _factors(scenario: Scenario) -> dict[tuple[str, ...], Any]:
+    """The `factors` of a scenario's law and of the laws that it wraps, by their paths; traced
     ones are excluded.
     """
     path: tuple[str, ...] = ("controller",)
     found: dict[tuple[str, ...], Any] = {}
     for law in layers(scenario.controller):
-        names = _field_names(type(law).unit_factors)
+        names = _field_names(type(law).factors)
         for name, factor in attributes(law, names).items():
             if checks.is_concrete(factor):
                 found[*path, name] = factor

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import typing
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -130,6 +131,38 @@ def members_of(hint: Any) -> tuple[str, dict[str, Any]]:
     return "any family", {name: found[0] for name, found in seen.items() if len(found) == 1}
 
 
+def _of_full_state(table: dict[str, Any]) -> dict[str, Any]:
+    """The table of `FullState`, the law of order 2 of earlier versions, as one of
+    `BarrierBackstepping`.
+    """
+    integral = {"kind": "integral"}
+    given = dict(table)
+    found: dict[str, Any] = {
+        "kind": "barrier_backstepping",
+        "k": _rows(given.pop("k1", NONE), given.pop("K2", NONE)),
+        "barriers": [given.pop("barrier", integral), given.pop("velocity_barrier", integral)],
+        "c": _rows(0.0, given.pop("c", NONE)),
+        "weights": _rows(given.pop("weight", 1.0), 1.0),
+    }
+    o = given.pop("o", NONE)
+    if o != NONE:
+        found["o"] = _rows(o, o)
+    return given | found
+
+
+def _rows(first: Any, second: Any) -> list[Any]:
+    """The values of two levels, of as many joints each."""
+    joints = max((len(x) for x in (first, second) if isinstance(x, list)), default=0)
+    if joints == 0:
+        return [first, second]
+    return [x if isinstance(x, list) else [x] * joints for x in (first, second)]
+
+
+FORMER: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {"full_state": _of_full_state}
+"""Name of a member of earlier versions, which files may contain -> its table as that of a member
+of today."""
+
+
 # --- to tables
 
 
@@ -245,6 +278,9 @@ def _decode_member(table: dict[str, Any], hint: Any, path: str) -> Any:
     family, members = members_of(hint)
     expected = f"the name of one of the {family}"
     kind = table.get("kind")
+    if isinstance(kind, str) and kind in FORMER and kind not in members:
+        table = FORMER[kind](table)
+        kind = table["kind"]
     if kind is None:
         remedy = f'Write kind = "{next(iter(members))}".'
         raise missing(f"{path}.kind", f"{expected}: {', '.join(members)}", remedy)

@@ -295,7 +295,7 @@ def _arm_law(
     if law == "pd":  # The default gains of "pd" are for one size of joint.
         return PDGravity(Kp=3.0 * K2, Kd=K2)
     controller: Any = law_by_name(law, k1=2.0, K2=K2, o=0.1, reading=reading, p=1)
-    if "weight" in type(controller).unit_factors:
+    if "weight" in type(controller).factors:
         weight = inertial_weight(model, reference, bounds, controller.barrier)
         controller = dataclasses.replace(controller, weight=weight)
     return controller

@@ -7,7 +7,8 @@ import math
 
 import numpy as np
 
-from iblf_jax.control.controllers import FullState, Saturated, law_by_name
+from iblf_jax.control.barriers import Integral
+from iblf_jax.control.controllers import BarrierBackstepping, Saturated, law_by_name
 from iblf_jax.control.controllers.systems import observer_of
 from iblf_jax.control.observers import Momentum
 from iblf_jax.core import checks
@@ -173,12 +174,13 @@ def zhang_yan_2024_full_state(*, kf: float = 100.0, c: float = 8.0) -> Scenario:
 
         -1.6 - 0.1 sin t < q1' < 0.6 + 0.1 cos t,   -1.4 < q2' < 0.5   [rad/s]
 
-    The law is `controllers.FullState` with k1 = 2, K2 = 20 1/s, o = 0.1 and the momentum observer.
-    The claim of case 2 needs c > 6.5 with kf = 100, and c > 33 with the paper's kf = 20.
+    The law is `controllers.BarrierBackstepping` with integral barriers, k = (2, 20) 1/s, weights
+    of 1, o = 0.1 and the momentum observer.  The claim of case 2 needs c > 6.5 with kf = 100, and
+    c > 33 with the paper's kf = 20.
 
     Args:
       kf: gain of the observer [1/s].
-      c: `FullState.c` [rad^2/s^3].
+      c: of the second level [rad^2/s^3].
 
     Raises:
       ValueError: a gain that is not positive.
@@ -190,7 +192,9 @@ def zhang_yan_2024_full_state(*, kf: float = 100.0, c: float = 8.0) -> Scenario:
     paper = zhang_yan_2024(reading="corrected")
     return dataclasses.replace(
         paper,
-        controller=FullState(k1=2.0, K2=20.0, c=c, o=0.1),
+        controller=BarrierBackstepping(
+            k=(2.0, 20.0), barriers=(Integral(), Integral()), c=(0.0, c), weights=1.0, o=0.1
+        ),
         observer=Momentum(kf=kf),
         bounds=(paper.bounds[0], Bounds(lower=lower, upper=upper)),
     )

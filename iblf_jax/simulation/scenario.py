@@ -184,8 +184,8 @@ class Scenario:
         None for a level without; a single `Bounds` is that of x_1, which every scenario has.  The
         levels of a robot are its joint positions [rad] and velocities [rad/s]; the funnels of
         velocities follow q_d', and those of the levels of another plant the virtual control.  Runs
-        record the margins of all levels under every law; `controllers.BarrierBackstepping` and
-        `controllers.FullState` enforce those from the second level on.
+        record the margins of all levels under every law; `controllers.BarrierBackstepping`
+        enforces those from the second level on.
       controller: the law, any of `iblf_jax.controllers`.
       initial: position and velocity at the start, an `Initial`.
       observer: estimator of f, any of `iblf_jax.observers`; `NoObserver()` if not given.

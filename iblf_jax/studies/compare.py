@@ -193,6 +193,8 @@ def _with_law(scenario: Scenario, law: str | TrackingLaw) -> Scenario:
         own = unwrapped(scenario.controller)
         values = field_values(own)
         given = {name: values.get(name) for name in ("k1", "K2", "o", "reading")}
+        if own.barriers and given["o"] is not None:
+            given["o"] = given["o"][0]  # of the first level
         kept = {name: value for name, value in given.items() if value is not None}
         p = getattr(own.barrier, "p", 1)
         controller = _limited_as(scenario.controller, law_by_name(law, p=p, **kept))
@@ -202,9 +204,10 @@ def _with_law(scenario: Scenario, law: str | TrackingLaw) -> Scenario:
         observer = scenario.observer
         if not all(part.uses_observer for part in layers(law)):
             observer = NoObserver()
-    model = _model_for(controller, scenario)
-    is_of_robots = not isinstance(unwrapped(controller), Law)
-    if isinstance(law, str) and plants.is_chain(model) and is_of_robots:
+    model: Any = scenario.model
+    if isinstance(law, str) or not isinstance(unwrapped(law), Law):
+        model = _model_of_robots(model)
+    if isinstance(law, str) and plants.is_chain(model):
         raise _no_robot(law, model)
     return dataclasses.replace(scenario, controller=controller, observer=observer, model=model)
 
@@ -216,10 +219,9 @@ def _no_robot(name: str, model: Any) -> ValueError:
     return checks.fail("laws", name, expected, remedy)
 
 
-def _model_for(law: TrackingLaw, scenario: Scenario) -> Any:
-    """The scenario's model; for a law of robots its rigid limit, or the robot inside it."""
-    model: Any = scenario.model
-    if isinstance(unwrapped(law), Law) or not plants.is_chain(model):
+def _model_of_robots(model: Any) -> Any:
+    """The model of laws of robots: the rigid limit of a plant, or the robot inside it."""
+    if not plants.is_chain(model):
         return model
     for robot in (model.rigid(), model.robot):
         if robot is not None:

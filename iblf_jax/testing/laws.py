@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.control.barriers import Quadratic
 from iblf_jax.control.controllers import Command, Law, TrackingLaw, WithDrive
 from iblf_jax.control.controllers._base import contract_of, law_of_x
 from iblf_jax.core import notices
@@ -67,9 +68,11 @@ def check_law(
     check_scenario(scenario, n)
     with examine(law, "TrackingLaw", contract_of(law)) as findings:
         base = in_dtype(scenario_for(findings, law, scenario, n), "float64")
-        bounds = base.bounds
-        if bounds[1] is None and unwrapped(law).needs_velocity_bounds:
-            bounds = (bounds[0], Bounds(lower=Constant(-SPEED), upper=Constant(SPEED)))
+        bounds, inner = base.bounds, unwrapped(law)
+        keeps_second = any(not isinstance(x, Quadratic) for x in inner.barriers[1:2])
+        if bounds[1] is None and (inner.needs_velocity_bounds or keeps_second):
+            second = Bounds(lower=Constant(-SPEED), upper=Constant(SPEED))
+            bounds = (bounds[0], second, *bounds[2:])
         plant = law.drive if isinstance(law, WithDrive) else base.plant
         try:
             base = dataclasses.replace(

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.certificates.claims import OWN_CLAIM_METHODS, stated_methods, states_disturbance_terms
+from iblf_jax.certificates.claims.own import METHODS, stated_methods, states_disturbance_terms
 from iblf_jax.control.controllers import Law
 from iblf_jax.control.controllers._base import law_of_x
 from iblf_jax.core.attributes import attributes, has_members
@@ -32,7 +32,7 @@ def check_claims(findings: Findings, scenario: Scenario) -> None:
     if not stated:
         return
     remedy = "A law states both, or neither: iblf_jax.controllers.LyapunovLaw"
-    for name in OWN_CLAIM_METHODS:
+    for name in METHODS:
         findings.require(name in stated, f"it has {stated[0]} and no {name}", remedy)
     findings.stop_if_any()
     in_both_types(findings, _shapes, scenario)
@@ -46,7 +46,7 @@ def check_claims(findings: Findings, scenario: Scenario) -> None:
         own = of_x.init(x, context)
         return {
             name: method(t, x, f_tilde, context, own)
-            for name, method in attributes(of_x, OWN_CLAIM_METHODS).items()
+            for name, method in attributes(of_x, METHODS).items()
         }
 
     start = start_levels(scenario)[: model.order]
@@ -88,7 +88,7 @@ def _shapes(findings: Findings, scenario: Scenario) -> None:
         measured, names = (x,), "x, d_tilde"  # type: ignore[assignment]
     own = law.init(*measured, context)
     arguments: tuple[Any, ...] = (t, *measured, zero, context, own)
-    for name, method in attributes(law, OWN_CLAIM_METHODS).items():
+    for name, method in attributes(law, METHODS).items():
         label = f"{name}(t, {names}, context, state)"
         _is_summable(findings, label, shape_of(findings, label, method, *arguments), q)
     if states_disturbance_terms(law):

@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import iblf_jax as ij
-from iblf_jax.certificates.proof_terms import ProofTerms, terms_at
+from iblf_jax.certificates.claims import terms_at
+from iblf_jax.certificates.terms import Terms
 from iblf_jax.simulation.closed_loop import LoopState
 from iblf_jax.simulation.scenario import canonical
 
@@ -94,6 +95,6 @@ def _position(scenario: ij.Scenario, t, xi, dq):
 
 
 @jax.jit
-def terms_of(batch: ij.Scenario, t, state: LoopState) -> ProofTerms:
-    """The terms of the proof at each of the states."""
+def terms_of(batch: ij.Scenario, t, state: LoopState) -> Terms:
+    """The terms of the claims at each of the states."""
     return jax.vmap(terms_at)(batch, t, state)

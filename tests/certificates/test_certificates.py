@@ -17,10 +17,12 @@ from certificate_states import loop, random_loops, terms_of
 from conftest import PAPER, SHORT
 
 import iblf_jax as ij
-from iblf_jax.certificates import Certificate, certify, claims, counterexample, run_summary
+from iblf_jax.certificates import Certificate, certify, counterexample, summary
+from iblf_jax.certificates.claims import claims_of, terms_at, theorem, weighted
+from iblf_jax.certificates.claims.two_cases import Gains, gains_of
 from iblf_jax.certificates.eigenvalues import eigenvalues_over
-from iblf_jax.certificates.proof_terms import rounding, terms_at
-from iblf_jax.certificates.run_summary import restarts, summarise
+from iblf_jax.certificates.summary import restarts, summarise
+from iblf_jax.certificates.terms import rounding
 from iblf_jax.simulation.closed_loop import LoopState, initial_state
 from iblf_jax.simulation.scenario import canonical
 from iblf_jax.studies.perturbation_cube import unit_cube
@@ -58,21 +60,27 @@ def proven_rate(scenario, t, state, proof):
     above = state.q > tube.q_d
     k, dk = jnp.where(above, tube.k_u, tube.k_l), jnp.where(above, tube.dk_u, tube.dk_l)
     kappa = jnp.sqrt((tube.dk_u / tube.k_u) ** 2 + (tube.dk_l / tube.k_l) ** 2 + law.o)
-    xi, e2, f_tilde = tube.xi(state.q), proof.e2, proof.f_tilde
+    xi, e2, f_tilde = tube.xi(state.q), proof.e[1], proof.d_tilde
     position = -jnp.sum(2 * xi**2 / (1 - xi**2) * (law.k1 + kappa + dk / k))
-    rest = -e2 @ (law.K2 * e2) + e2 @ f_tilde + f_tilde @ proof.df - f_tilde @ (kf * f_tilde)
-    return position + rest + proof.dropped_e2 + proof.dropped_f
+    rest = -e2 @ (law.K2 * e2) + e2 @ f_tilde + f_tilde @ proof.dd - f_tilde @ (kf * f_tilde)
+    dropped = proof.claims["torque"]
+    return position + rest + dropped.dropped_e2 + dropped.dropped_f
 
 
 def rho_of(scenario, lambda_max, case):
     """The rate of Theorem 2, the least of its three terms."""
-    return jnp.min(claims.rho_terms(claims.constants_of(scenario), lambda_max, case))
+    return jnp.min(theorem.rho_terms(gains_of(scenario), lambda_max, case))
+
+
+def lambda_max_of(proof):
+    """The largest eigenvalue of M0 at each state."""
+    return jnp.linalg.eigvalsh(proof.claims["torque"].M0)[..., -1]
 
 
 def left_side(batch, proof):
     """V2' + rho V2 - |f'|^2/2 with lambda_max of each position."""
-    rho = jax.vmap(partial(rho_of, case=2))(batch, proof.lambda_max)
-    return np.asarray(proof.dV + rho * proof.V - 0.5 * jnp.sum(proof.df**2, axis=-1))
+    rho = jax.vmap(partial(rho_of, case=2))(batch, lambda_max_of(proof))
+    return np.asarray(proof.dV + rho * proof.V - 0.5 * jnp.sum(proof.dd**2, axis=-1))
 
 
 # --- states ---------------------------------------------------------------------------------------
@@ -86,12 +94,13 @@ def test_the_rate_of_V2_is_the_proofs_plus_the_dropped_terms(reading, observer, 
     assert proof.dV.dtype == dtype
     assert not np.any(proof.excluded)
     error = np.abs(np.asarray(jax.jit(jax.vmap(proven_rate))(batch, t, state, proof) - proof.dV))
-    allowed = rounding(dtype) * np.asarray(proof.dV_size)
+    allowed = rounding(dtype) * np.asarray(proof.size)
     assert np.all(error <= allowed)
     # The tolerance is small beside what it judges, so that it hides nothing.
     assert np.median(allowed / np.abs(proof.dV)) < (1e-11 if dtype == "float64" else 5e-3)
-    assert np.any(np.asarray(proof.dropped_e2) != 0) == (reading == "printed")
-    assert np.any(np.asarray(proof.dropped_f) != 0) == (observer == "printed")
+    dropped = proof.claims["torque"]
+    assert np.any(np.asarray(dropped.dropped_e2) != 0) == (reading == "printed")
+    assert np.any(np.asarray(dropped.dropped_f) != 0) == (observer == "printed")
 
 
 @pytest.mark.slow
@@ -103,7 +112,7 @@ def test_corrected_keeps_the_inequality_at_every_state(barrier):
         proof = terms_of(batch, t, state)
         free = ~np.asarray(proof.excluded)
         assert np.mean(free) > 0.9
-        left, allowed = left_side(batch, proof), rounding("float64") * np.asarray(proof.dV_size)
+        left, allowed = left_side(batch, proof), rounding("float64") * np.asarray(proof.size)
         assert np.all(np.isfinite(left[free]))
         assert np.all(left[free] <= allowed[free])
 
@@ -129,11 +138,11 @@ def test_inequality_is_an_equality_where_the_proof_leaves_nothing():
     )
     scenario = canonical(ij.with_parameters(scenario, {"observer.eta0": -0.8}))
     seen = jax.jit(terms_at)(scenario, jnp.zeros(()), initial_state(scenario))
-    np.testing.assert_allclose([seen.e2[0], seen.f_tilde[0], seen.df[0]], 0.8, rtol=1e-12)
-    rho = rho_of(scenario, seen.lambda_max, 2)
+    np.testing.assert_allclose([seen.e[1, 0], seen.d_tilde[0], seen.dd[0]], 0.8, rtol=1e-12)
+    rho = rho_of(scenario, lambda_max_of(seen), 2)
     assert float(rho) == pytest.approx(rate, rel=1e-12)
-    left = float(seen.dV + rho * seen.V - 0.5 * seen.df @ seen.df)
-    assert abs(left) <= rounding("float64") * float(seen.dV_size) < 1e-11
+    left = float(seen.dV + rho * seen.V - 0.5 * seen.dd @ seen.dd)
+    assert abs(left) <= rounding("float64") * float(seen.size) < 1e-11
 
 
 @pytest.mark.slow
@@ -153,23 +162,24 @@ def test_the_claim_with_weights_holds_at_every_state_for_every_positive_gain(nam
     b = 2.0 * kf.min(axis=1) * rng.uniform(0.02, 0.9, t.size)
     least = 0.25 / (a[:, None] * K2 * (kf - b[:, None] / 2.0))
     w_f = least.max(axis=1) * 10 ** rng.uniform(0.0, 2.0, t.size)
-    numbers = zip(decay, K2, kf, proof.mu, a, b, w_f, strict=True)
-    terms = np.array(
-        [claims.weighted_rate_terms(claims.Claim(*each[:3]), *each[3:]) for each in numbers]
-    )
+    M0 = proof.claims["torque"].M0
+    scaled = M0 / np.sqrt(K2[:, :, None] * K2[:, None, :])
+    mu = 1.0 / np.linalg.eigvalsh(scaled)[:, -1]
+    numbers = zip(decay, K2, kf, mu, a, b, w_f, strict=True)
+    terms = np.array([weighted.rate_terms(Gains(*each[:3]), *each[3:]) for each in numbers])
     assert np.all(terms > -1e-9 * (1.0 + kf.max(axis=1))[:, None])
-    rho, half_square = terms.min(axis=1), 0.5 * np.sum(proof.f_tilde**2, axis=1)
+    rho, half_square = terms.min(axis=1), 0.5 * np.sum(proof.d_tilde**2, axis=1)
     V = proof.V + (w_f - 1.0) * half_square
-    rate = proof.dV + (w_f - 1.0) * np.sum(proof.f_tilde * proof.df_tilde, axis=1)
-    left = rate + rho * V - w_f / (2.0 * b) * np.sum(proof.df**2, axis=1)
-    allowed = rounding("float64") * np.maximum(1.0, w_f) * proof.dV_size
+    rate = proof.dV + (w_f - 1.0) * np.sum(proof.d_tilde * proof.dd_tilde, axis=1)
+    left = rate + rho * V - w_f / (2.0 * b) * np.sum(proof.dd**2, axis=1)
+    allowed = rounding("float64") * np.maximum(1.0, w_f) * proof.size
     free = ~proof.excluded
     assert np.mean(free) > 0.9
     assert np.all(left[free] <= allowed[free])
     # V_w holds all that it says: what is left of it without e2 and f_tilde is the barriers' with
     # their weights.
-    M0 = np.asarray(jax.vmap(lambda scenario, q: scenario.model.mass_matrix(q))(batch, state.q))
-    V1 = V - w_f * half_square - 0.5 * np.einsum("ti,tij,tj->t", proof.e2, M0, proof.e2)
+    e2 = proof.e[:, 1]
+    V1 = V - w_f * half_square - 0.5 * np.einsum("ti,tij,tj->t", e2, M0, e2)
     one = jax.vmap(
         lambda scenario, t, q: scenario.controller.barrier.value(scenario.context.tube(t), q)
     )(batch, t, state.q)
@@ -183,17 +193,17 @@ def test_the_claim_with_weights_holds_at_every_state_for_every_positive_gain(nam
 
 def test_the_weights_that_are_chosen_give_the_smallest_mean_of_the_envelope():
     """No other a, b and w_f that (W.2) admits is better by more than the grid is coarse."""
-    constants = claims.Claim(*(np.array(x) for x in ([4.0, 3.0], [0.2, 0.05], [0.7, 0.4])))
+    gains = Gains(*(np.array(x) for x in ([4.0, 3.0], [0.2, 0.05], [0.7, 0.4])))
     given = {"mu": 0.9, "V_rest": 0.3, "half_square": 0.05, "F_d": 0.2, "duration": 10.0}
 
     def mean(rho, w_f, rho2):
         fading = (1.0 - np.exp(-rho * 10.0)) / (rho * 10.0)
         return (given["V_rest"] + w_f * given["half_square"]) * fading + rho2 / rho
 
-    found = claims.best_constants(constants, *given.values(), 2)
-    assert np.min(
-        claims.weighted_rate_terms(constants, 0.9, found.a, found.b, found.w_f)
-    ) == pytest.approx(found.rho)
+    found = weighted.best_constants(gains, *given.values(), 2)
+    assert np.min(weighted.rate_terms(gains, 0.9, found.a, found.b, found.w_f)) == pytest.approx(
+        found.rho
+    )
     rng, others = np.random.default_rng(0), []
     for a, b, w_f in zip(
         rng.uniform(0, 1, 20000),
@@ -201,10 +211,10 @@ def test_the_weights_that_are_chosen_give_the_smallest_mean_of_the_envelope():
         10 ** rng.uniform(0, 4, 20000),
         strict=True,
     ):
-        rho = np.min(claims.weighted_rate_terms(constants, 0.9, a, b, w_f))
+        rho = np.min(weighted.rate_terms(gains, 0.9, a, b, w_f))
         others.append(mean(rho, w_f, w_f * given["F_d"] ** 2 / (2 * b)) if rho > 0 else np.inf)
     assert mean(found.rho, found.w_f, found.rho2) < 1.01 * min(others)
-    assert claims.best_constants(constants, 0.9, np.nan, 0.0, 0.2, 10.0, 2) is None
+    assert weighted.best_constants(gains, 0.9, np.nan, 0.0, 0.2, 10.0, 2) is None
 
 
 # --- runs -----------------------------------------------------------------------------------------
@@ -227,9 +237,10 @@ def corrected_certificate(corrected_run) -> Certificate:
 
 @pytest.mark.slow
 def test_rate_along_the_run_is_its_difference_quotient(paper_run):
-    _, stretches = summarise(jax.tree.map(np.asarray, paper_run))
+    claims = claims_of(paper_run.scenario)
+    _, stretches = summarise(jax.tree.map(np.asarray, paper_run), claims)
     seen = [
-        jax.tree.map(lambda x, trajectory=trajectory: x[trajectory.recorded], trajectory.proof)
+        jax.tree.map(lambda x, trajectory=trajectory: x[trajectory.recorded], trajectory.terms)
         for trajectory in stretches
     ]
     proof = jax.tree.map(lambda *parts: np.concatenate(parts), *seen)
@@ -240,7 +251,7 @@ def test_rate_along_the_run_is_its_difference_quotient(paper_run):
         proof.dV[2:-2][quiet], quotient[quiet], atol=2e-6 * np.abs(proof.dV[102:]).max() + 1e-9
     )
     np.testing.assert_allclose(V, paper_run.V, rtol=1e-9)
-    np.testing.assert_allclose(proof.f, paper_run.disturbance, atol=1e-10)
+    np.testing.assert_allclose(proof.d, paper_run.disturbance, atol=1e-10)
 
 
 def test_paper_run_keeps_the_printed_inequality(paper_certificate):
@@ -393,9 +404,9 @@ def test_the_claim_with_weights_is_about_the_corrected_law_with_a_momentum_obser
 
 def test_a_broken_claim_with_weights_is_seen(corrected_run, monkeypatch):
     """With a rate that is too large the inequality fails where the right one holds."""
-    best = claims.best_constants
+    best = weighted.best_constants
     monkeypatch.setattr(
-        claims,
+        weighted,
         "best_constants",
         lambda *given: (found := best(*given)) and found._replace(rho=1e3 * found.rho),
     )
@@ -500,7 +511,7 @@ def test_decimated_run_is_judged_at_every_step(shaken, monkeypatch):
     assert_alike(sparse, whole)
     # The steps after the last sample count too; and a long run, which is not kept in memory, gives
     # the same.
-    monkeypatch.setattr(run_summary, "KEPT_STEPS", 0)
+    monkeypatch.setattr(summary, "KEPT_STEPS", 0)
     assert_alike(certify(run.scenario, decimated(shaken, 300)), whole)
     assert_alike(certify(run.scenario, decimated(shaken, 501)), whole)
 
@@ -611,10 +622,11 @@ def test_f_is_constant_only_where_nothing_that_changes_is_left_in_it(changes, st
         start = initial_state(one)
         moving = start._replace(x=start.x.at[1].set(0.3))
         seen = terms_there(one, jnp.asarray(0.15), moving)
-        assert bool(seen.steady) == steady
-        assert (float(jnp.abs(seen.df[0])) < 1e-9) == steady
+        assert bool(seen.claims["torque"].steady) == steady
+        assert (float(jnp.abs(seen.dd[0])) < 1e-9) == steady
     other = ij.with_parameters(scenario, {"model.mass": 1.2})
-    assert not terms_there(other, jnp.asarray(0.15), initial_state(other)).steady
+    there = terms_there(other, jnp.asarray(0.15), initial_state(other))
+    assert not there.claims["torque"].steady
 
 
 def pendulum(**changes):
@@ -790,8 +802,8 @@ def test_a_claim_that_is_too_strong_fails_and_says_when_first(own):
 @pytest.mark.slow
 def test_the_rate_of_an_own_V_is_its_difference_quotient(own):
     run = jax.tree.map(np.asarray, ij.simulate(own, duration=0.02, dt=1e-4, record_every=1))
-    _, stretches = summarise(run)
-    terms = next(stretches).proof.own
+    _, stretches = summarise(run, claims_of(own))
+    terms = next(stretches).terms.claims["own"]
     slope = (terms.V[2:] - terms.V[:-2]) / 2e-4
     np.testing.assert_allclose(terms.dV[1:-1], slope, rtol=1e-4)
     assert np.ptp(terms.dV) > 1.0

@@ -16,9 +16,9 @@ from random_plants import random_scenario, random_states
 
 import iblf_jax as ij
 from iblf_jax.certificates import certify, counterexample
-from iblf_jax.certificates.level_lines import LEVEL_ROUNDING
-from iblf_jax.certificates.level_terms import level_terms_at
-from iblf_jax.certificates.proof_terms import rounding
+from iblf_jax.certificates.claims import terms_at
+from iblf_jax.certificates.claims.levels import LEVEL_ROUNDING
+from iblf_jax.certificates.terms import rounding
 from iblf_jax.simulation.closed_loop import evaluate
 from iblf_jax.world import plants
 
@@ -100,7 +100,7 @@ def both_sides(scenario, seed):
     @jax.jit
     @jax.vmap
     def at(t, state):
-        terms = level_terms_at(scenario, t, state)
+        terms = terms_at(scenario, t, state)
         return rate_along_the_flow(scenario, t, state), right_side(scenario, t, state), terms
 
     left, right, terms = jax.tree.map(np.asarray, at(t, state))
@@ -114,21 +114,20 @@ def test_both_sides_of_the_claim_are_equal(design):
     order, barrier = DESIGNS[design]
     scenario = random_scenario(order, (barrier,) * order, seed=order)
     left, right, terms = both_sides(scenario, order)
-    claim = terms.claim
+    claim, estimate = terms.claims["levels"], terms.claims["estimate"]
     assert np.all(np.abs(left - right) <= 1e-10 * np.max(np.abs(left)))
     # Every state has terms of its own size: the terms of V' are the scale of rounding.
-    assert np.all(np.abs(left - right) <= 1e-13 * claim.size)
-    tolerance = LEVEL_ROUNDING * rounding("float64") * claim.size
+    assert np.all(np.abs(left - right) <= 1e-13 * terms.size)
+    tolerance = LEVEL_ROUNDING * rounding("float64") * terms.size
     assert np.median(tolerance / np.abs(left)) < 1e-10
     certified = claim.disturbance_terms - claim.decay - claim.by_slopes
-    assert np.all(np.abs(right - certified) <= 1e-13 * claim.size)
-    assert np.all(np.abs(left - claim.dV) <= 1e-13 * claim.size)
-    assert np.all(np.abs(claim.dV - certified) <= 0.2 * tolerance)
+    assert np.all(np.abs(right - certified) <= 1e-13 * terms.size)
+    assert np.all(np.abs(left - terms.dV) <= 1e-13 * terms.size)
+    assert np.all(np.abs(terms.dV - certified) <= 0.2 * tolerance)
     # The disturbance terms decide: without them nothing is equal.
     assert np.median(np.abs(claim.disturbance_terms) / tolerance) > 1e6
     assert np.all(
-        np.abs(terms.estimate_error)
-        <= 0.2 * LEVEL_ROUNDING * rounding("float64") * terms.estimate_size
+        np.abs(estimate.error) <= 0.2 * LEVEL_ROUNDING * rounding("float64") * estimate.size
     )
 
 

@@ -16,7 +16,7 @@ from scipy.integrate import solve_ivp
 from scipy.special import lambertw
 
 import iblf_jax as ij
-from iblf_jax.certificates.claims import why_no_theorem
+from iblf_jax.certificates.claims.theorem import THEOREM
 from iblf_jax.core.status import Status
 from iblf_jax.simulation.closed_loop import LoopState, evaluate
 from iblf_jax.simulation.delays import STAGES, arriving
@@ -451,7 +451,7 @@ def test_certificate_of_a_delayed_run_claims_nothing(tmp_path):
     ],
 )
 def test_theorem_claims_nothing_about_a_torque_that_is_not_the_command(actuator):
-    reason = why_no_theorem(with_actuator(actuator))
+    reason = THEOREM.why_not(with_actuator(actuator))
     assert type(actuator).__name__ in reason
 
 

@@ -13,12 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from independent import Loop
+from members import two_barriers
 
 import iblf_jax as ij
 from iblf_jax import barriers, controllers
-from iblf_jax.certificates.level_summary import growth_along
-from iblf_jax.certificates.level_terms import level_terms_at
-from iblf_jax.certificates.proof_terms import terms_at
+from iblf_jax.certificates.claims import terms_at
 from iblf_jax.control.controllers.saturated import AuxiliaryState
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state
 from iblf_jax.simulation.scenario import canonical
@@ -29,7 +28,7 @@ K = 6.0
 SATURATED = controllers.Saturated(PAPER.controller, limit=LIMIT, auxiliary=K)
 LIMITED = canonical(ij.with_parts(PAPER, controller=SATURATED))
 LAWS = {
-    "full_state": controllers.FullState(k1=2.0, K2=20.0, c=1.0),
+    "two_barriers": two_barriers(),
     "dynamic_surface": controllers.DynamicSurface(k1=2.0, K2=20.0, filter=0.02),
     "barrier_backstepping": controllers.BarrierBackstepping(k=(2.0, 20.0)),
     "adaptive_rbf": controllers.AdaptiveRBF(k1=2.0, K2=20.0, nodes=4),
@@ -144,24 +143,24 @@ def test_the_rate_of_V2_of_an_arm(rng):
         value = law.weight * law.barrier.value(tube, q)
         slope = law.weight * law.barrier.slope(tube, q)
         decay = jnp.sum(law.barrier.decay_rate(law.k1) * value)
-        z, f_tilde = proof.e2, proof.f_tilde
-        expected = -decay - z @ (law.K2 * z) + z @ f_tilde + f_tilde @ proof.df_tilde
+        z, f_tilde = proof.e[1], proof.d_tilde
+        expected = -decay - z @ (law.K2 * z) + z @ f_tilde + f_tilde @ proof.dd_tilde
         expected += slope @ aux
-        np.testing.assert_allclose(proof.dV, expected, rtol=1e-9, atol=1e-12 * proof.dV_size)
-        np.testing.assert_allclose(proof.auxiliary.growth, slope @ aux, rtol=1e-12)
+        np.testing.assert_allclose(proof.dV, expected, rtol=1e-9, atol=1e-12 * proof.size)
+        np.testing.assert_allclose(proof.claims["torque"].auxiliary.growth, slope @ aux, rtol=1e-12)
 
 
 @pytest.mark.slow
 def test_the_rate_of_V_of_a_chain_with_bounds_of_every_level(coupled, rng):
-    terms = jax.jit(level_terms_at)
+    terms = jax.jit(terms_at)
     case = chains.CASES["coupled"]
     for t, x, aux in random_points(case, rng, 10):
         state = LoopState(np.asarray(x), AuxiliaryState((), aux), ())
         proof = terms(coupled, jnp.asarray(t), jax.tree.map(jnp.asarray, state))
-        claim = proof.claim
-        left = claim.dV + claim.decay - growth_along(claim)
+        claim = proof.claims["levels"]
+        left = proof.dV + claim.decay - claim.growth
         assert not proof.excluded
-        np.testing.assert_allclose(left, 0.0, atol=1e-12 * claim.size)
+        np.testing.assert_allclose(left, 0.0, atol=1e-12 * proof.size)
 
 
 @pytest.mark.slow
@@ -204,7 +203,7 @@ def _limited(law, limit=LIMIT, auxiliary=K):
 @pytest.mark.parametrize("name", LAWS)
 def test_without_a_reached_limit_it_is_the_law_without_it(name):
     part = {}
-    if name == "full_state":
+    if name == "two_barriers":
         speeds = ij.Bounds(ij.bounds.Constant(-9.0), ij.bounds.Constant(9.0))
         part["bounds"] = (PAPER.bounds[0], speeds)
     scenario = canonical(ij.with_parts(PAPER, controller=LAWS[name], **part))

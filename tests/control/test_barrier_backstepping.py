@@ -1,4 +1,4 @@
-"""`BarrierBackstepping` against the independent program, and against `FullState`."""
+"""`BarrierBackstepping` against the independent program."""
 
 from __future__ import annotations
 
@@ -72,38 +72,6 @@ def test_a_torque_estimate_is_held_and_not_the_acceleration_that_it_causes():
     )
     found, _ = law.command(t, x, f_hat, scenario.context, ())
     np.testing.assert_allclose(found.tau, expected.tau, rtol=1e-9)
-
-
-PAIRS = {
-    "integral": (barriers.Integral(), barriers.Integral()),
-    "mapping and prescribed performance": (barriers.Mapping(), barriers.PrescribedPerformance()),
-    "log and mapping": (barriers.Log(), barriers.Mapping()),
-    "tan": (barriers.Tan(), barriers.Tan()),
-}
-
-
-QUICK_PAIR = "mapping and prescribed performance"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "pair", [x if x == QUICK_PAIR else pytest.param(x, marks=pytest.mark.slow) for x in PAIRS]
-)
-def test_order_two_is_full_state(pair):
-    preset = ij.presets.zhang_yan_2024_full_state()
-    first, second = PAIRS[pair]
-    o = 0.1 if pair in ("integral", "log and mapping") else None
-    full = controllers.FullState(
-        k1=[2.0, 3.0], K2=20.0, c=0.7, o=o, barrier=first, velocity_barrier=second, weight=1.3
-    )
-    chain = controllers.BarrierBackstepping(
-        k=(full.k1, full.K2), barriers=(first, second), c=(0.0, 0.7), weights=(1.3, 1.0), o=o
-    )
-    found = ij.simulate(ij.with_parts(preset, controller=chain), duration=0.5, dt=1e-3)
-    expected = ij.simulate(ij.with_parts(preset, controller=full), duration=0.5, dt=1e-3)
-    np.testing.assert_allclose(found.q, expected.q, atol=1e-12)
-    np.testing.assert_allclose(found.tau, expected.tau, rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(found.V, expected.V, rtol=1e-9, atol=1e-12)
 
 
 def flexible(**parts):

@@ -17,7 +17,7 @@ import pytest
 
 import iblf_jax as ij
 from iblf_jax import barriers, controllers, decays, disturbances, observers
-from iblf_jax.certificates import settling
+from iblf_jax.certificates.claims import settling
 from iblf_jax.core import notices
 from iblf_jax.core.status import Status
 from iblf_jax.simulation import stability
@@ -196,8 +196,17 @@ def test_settling_time_of_an_arm_and_the_case_in_which_it_is_broken():
     law = canonical(scenario).controller
     t = np.linspace(0.0, 1.0, 1001)
     slow = settling.Course(t, 0.3 * np.exp(-2.0 * t), 0.0 * t, 0.0 * t, np.zeros(1001, bool))
-    summary = SimpleNamespace(claims=SimpleNamespace(law=law), jumps=np.zeros(0))
-    (broken,) = settling.settling_lines(summary, [slow], "", 20.0)
+    summary = SimpleNamespace(
+        run=SimpleNamespace(scenario=scenario),
+        law=law,
+        claims=(settling.SETTLING,),
+        extrema=SimpleNamespace(mu=20.0),
+        jumps=np.zeros(0),
+        excluded=0,
+        samples=1001,
+        why_invalid="",
+    )
+    (broken,) = settling.SETTLING.conclusions(summary, [slow], {})
     assert broken.verdict == "fails"
 
 

@@ -1,5 +1,5 @@
-"""The law that keeps positions and velocities: its formulas beside independent ones, its
-inequality, its certificate."""
+"""`BarrierBackstepping` on a robot with bounds on positions and velocities: its formulas beside
+independent ones, the inequality (F.2) and the claim (F.3)."""
 
 import dataclasses
 
@@ -8,11 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from independent import Loop, sine
+from members import two_barriers
 from scipy.integrate import solve_ivp
 
 import iblf_jax as ij
 from iblf_jax import barriers, bounds, controllers
-from iblf_jax.certificates.proof_terms import rounding, terms_at
+from iblf_jax.certificates.claims import terms_at
+from iblf_jax.certificates.terms import rounding
 from iblf_jax.simulation.closed_loop import initial_state
 
 H = np.pi / 2
@@ -105,9 +107,7 @@ class FullLoop(Loop):
     def scenario(self):
         """The same in the package."""
         barrier = barriers.Integral() if self.factor == 2.0 else barriers.Log()
-        law = controllers.FullState(
-            k1=self.k1, K2=self.K2, c=self.c, o=self.o, barrier=barrier, velocity_barrier=barrier
-        )
+        law = two_barriers(self.k1, self.K2, self.c, barrier, barrier, o=(self.o, self.o))
         return dataclasses.replace(
             ij.presets.zhang_yan_2024(reading="corrected"),
             controller=law,
@@ -120,6 +120,11 @@ class FullLoop(Loop):
         )
 
 
+def tubes_of(law, t, q, dq, context):
+    """The tube of q around the reference, and that of q' around alpha."""
+    return law.levels(t, jnp.stack([q, dq]), jnp.zeros(2), context, ())[1]
+
+
 def random_states(scenario, count=64, seed=0):
     """Times and states of the loop inside both pairs of bounds, e1 and e2 up to 0.95 of theirs."""
     rng, law, context = np.random.default_rng(seed), scenario.controller, scenario.context
@@ -127,7 +132,7 @@ def random_states(scenario, count=64, seed=0):
     def state(t, xi, xi2, eta):
         tube = context.tube(t)
         q = tube.q_d + xi * jnp.where(xi > 0, tube.k_u, tube.k_l)
-        inner = law.tubes(t, q, jnp.zeros(2), context)[1]  # alpha and K do not depend on q'
+        inner = tubes_of(law, t, q, jnp.zeros(2), context)[1]  # alpha and K do not depend on q'
         dq = inner.q_d + xi2 * jnp.where(xi2 > 0, inner.k_u, inner.k_l)
         return initial_state(scenario)._replace(x=jnp.stack([q, dq]), observer=eta), jnp.minimum(
             inner.q_d - inner.lower, inner.upper - inner.q_d
@@ -152,9 +157,7 @@ def test_the_torque_is_the_independent_one_at_random_gains_bounds_and_states(rng
 
         def torque(t, state, scenario=scenario):
             f_hat = scenario.observer.estimate(t, state.q, state.dq, scenario.model, state.observer)
-            command = scenario.controller.command(
-                t, state.q, state.dq, f_hat, scenario.context, ()
-            )[0]
+            command = scenario.controller.command(t, state.x, f_hat, scenario.context, ())[0]
             return command.tau, command.V1
 
         tau, V1 = jax.jit(jax.vmap(torque))(t, states)
@@ -206,19 +209,14 @@ FAMILY = {name: cls() for name, cls in barriers.MEMBERS.items()}
 @pytest.mark.parametrize("first", ["integral", "tan"])
 def test_any_two_barriers_keep_their_inequality_at_every_state(first, second):
     """(F.2), with the exact rates of the whole loop."""
-    law = controllers.FullState(
-        k1=[2.0, 1.5],
-        K2=[20.0, 12.0],
-        c=[1.0, 0.3],
-        barrier=FAMILY[first],
-        velocity_barrier=FAMILY[second],
-    )
+    both = FAMILY[first], FAMILY[second]
+    law = two_barriers([2.0, 1.5], [20.0, 12.0], [1.0, 0.3], *both)
     scenario = dataclasses.replace(ij.presets.zhang_yan_2024_full_state(kf=20.0), controller=law)
     t, states = random_states(scenario)
     proof = jax.jit(jax.vmap(lambda t, state: terms_at(scenario, t, state)))(t, states)
     assert not np.any(proof.excluded)
-    allowed = rounding("float64") * np.asarray(proof.dV_size)
-    assert np.all(proof.full.left <= allowed)
+    allowed = rounding("float64") * np.asarray(proof.size)
+    assert np.all(proof.claims["matched"].left <= allowed)
     assert np.median(allowed / np.abs(proof.dV)) < 1e-10  # small beside what it judges
 
 
@@ -226,48 +224,43 @@ def test_any_two_barriers_keep_their_inequality_at_every_state(first, second):
 @pytest.mark.parametrize(("first", "second"), [("integral", "integral"), ("tan", "mapping")])
 def test_weights_of_the_first_barrier_keep_the_inequality_at_every_state(first, second):
     """(F.2) with V1 = sum w_i V1_i."""
-    law = controllers.FullState(
-        k1=[2.0, 1.5],
-        K2=[20.0, 12.0],
-        c=[1.0, 0.3],
-        barrier=FAMILY[first],
-        velocity_barrier=FAMILY[second],
-        weight=[0.2, 6.0],
-    )
+    both = FAMILY[first], FAMILY[second]
+    law = two_barriers([2.0, 1.5], [20.0, 12.0], [1.0, 0.3], *both, [0.2, 6.0])
     scenario = dataclasses.replace(ij.presets.zhang_yan_2024_full_state(kf=20.0), controller=law)
     t, states = random_states(scenario)
     proof = jax.jit(jax.vmap(lambda t, state: terms_at(scenario, t, state)))(t, states)
     assert not np.any(proof.excluded)
-    assert np.all(proof.full.left <= rounding("float64") * np.asarray(proof.dV_size))
-    V1 = jax.vmap(lambda t, q: law.barrier.value(scenario.context.tube(t), q))(t, states.q)
+    assert np.all(proof.claims["matched"].left <= rounding("float64") * np.asarray(proof.size))
+    V1 = jax.vmap(lambda t, q: law.barriers[0].value(scenario.context.tube(t), q))(t, states.q)
     phi = jax.vmap(
-        lambda t, q, dq: law.velocity_barrier.value(law.tubes(t, q, dq, scenario.context)[1], dq)
+        lambda t, q, dq: law.barriers[1].value(tubes_of(law, t, q, dq, scenario.context)[1], dq)
     )(t, states.q, states.dq)
-    expected = np.sum(V1 * np.array([0.2, 6.0]) + phi + 0.5 * proof.f_tilde**2, axis=1)
+    expected = np.sum(V1 * np.array([0.2, 6.0]) + phi + 0.5 * proof.d_tilde**2, axis=1)
     np.testing.assert_allclose(proof.V, expected, rtol=1e-9)
 
 
 @pytest.mark.slow
 def test_without_its_own_terms_the_inequality_breaks():
     """What the test above would see of a law without its cross term, or of a smaller rate."""
-    law = controllers.FullState(k1=2.0, K2=20.0, c=1.0)
+    law = two_barriers()
     scenario = dataclasses.replace(ij.presets.zhang_yan_2024_full_state(), controller=law)
     t, states = random_states(scenario)
+    wrong = dataclasses.replace(scenario, controller=_WithoutCrossTerm(**vars(law)))
 
     def lefts(t, state):
-        wrong = dataclasses.replace(scenario, controller=_WithoutCrossTerm(**vars(law)))
-        return terms_at(wrong, t, state).full.left
+        return terms_at(wrong, t, state).claims["matched"].left
 
     assert np.max(jax.jit(jax.vmap(lefts))(t, states)) > 1.0
 
 
 @ij.component
-class _WithoutCrossTerm(controllers.FullState):
-    def command(self, t, q, dq, f_hat, context, state):
-        command, rate = controllers.FullState.command(self, t, q, dq, f_hat, context, state)
-        outer, inner = self.tubes(t, q, dq, context)
-        crossed = self.barrier.slope(outer, q) * self.velocity_barrier.error_over_slope(inner, dq)
-        return command._replace(tau=command.tau + context.model.mass_matrix(q) @ crossed), rate
+class _WithoutCrossTerm(controllers.BarrierBackstepping):
+    def command(self, t, x, d_hat, context, state):
+        command, rate = controllers.BarrierBackstepping.command(self, t, x, d_hat, context, state)
+        levels, (_, inner) = self.levels(t, x, d_hat, context, state)
+        crossed = levels[0].slope * self.barriers[1].error_over_slope(inner, x[1])
+        added = context.model.mass_matrix(x[0]) @ crossed
+        return command._replace(tau=command.tau + added), rate
 
 
 @pytest.mark.slow
@@ -275,9 +268,7 @@ def test_symmetric_bounds_and_logarithms_are_the_published_barriers():
     """V = 1/2 sum ln(k^2/(k^2 - z^2)) with slope z/(k^2 - z^2) on both errors; He, Chen, Yin
     2016."""
     base = ij.presets.zhang_yan_2024_full_state()
-    law = controllers.FullState(
-        k1=2.0, K2=20.0, c=1.0, barrier=barriers.Log(), velocity_barrier=barriers.Log()
-    )
+    law = two_barriers(first=barriers.Log(), second=barriers.Log(), o=0.1)
     rest = ij.references.Sinusoid(offset=0.5, amplitude=0.0)
     walls = tuple(
         bounds.Bounds(lower=bounds.Constant(x - w), upper=bounds.Constant(x + w))
@@ -290,7 +281,7 @@ def test_symmetric_bounds_and_logarithms_are_the_published_barriers():
         jnp.array([0.3, -0.6]),
         jnp.array([0.2, 0.1]),
     )
-    command = law.command(t, q, dq, f_hat, scenario.context, ())[0]
+    command = law.command(t, jnp.stack([q, dq]), f_hat, scenario.context, ())[0]
     z2, kb, model = np.asarray(dq), 0.8, scenario.model
     np.testing.assert_allclose(
         command.alpha, 0.0, atol=1e-15
@@ -302,7 +293,7 @@ def test_symmetric_bounds_and_logarithms_are_the_published_barriers():
     tau = model.mass_matrix(q) @ wanted + model.coriolis(q, dq, dq) + model.gravity(q) - f_hat
     np.testing.assert_allclose(command.tau, tau, rtol=1e-12)
     z1 = np.array([0.1, -0.2])
-    command = law.command(t, q + z1, dq, f_hat, scenario.context, ())[0]
+    command = law.command(t, jnp.stack([q + z1, dq]), f_hat, scenario.context, ())[0]
     alpha = -gain * z1
     phi = 0.5 * np.log(1 / (1 - ((z2 - alpha) / np.where(z2 > alpha, kb - alpha, kb + alpha)) ** 2))
     np.testing.assert_allclose(command.V1, 0.5 * np.log(0.16 / (0.16 - z1**2)) + phi, rtol=1e-12)
@@ -363,6 +354,20 @@ def test_too_small_a_c_is_told_with_the_one_that_would_do():
     )
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "parts",
+    [{"controller": two_barriers(c=0.0)}, {"observer": ij.observers.NoObserver()}],
+    ids=["without c", "without an observer"],
+)
+def test_without_what_F3_needs_the_claim_is_that_of_levels(parts):
+    scenario = ij.with_parts(ij.presets.zhang_yan_2024_full_state(), **parts)
+    certificate = ij.certify(scenario, duration=0.05, dt=1e-3, method="euler")
+    assert certificate["inequality, levels"].verdict == "holds"
+    with pytest.raises(KeyError):
+        certificate["kf and c, case 2"]
+
+
 @pytest.mark.parametrize(
     "starts",
     [pytest.param(1_000, marks=pytest.mark.slow), pytest.param(10_000, marks=pytest.mark.release)],
@@ -382,7 +387,7 @@ def test_no_velocity_bound_is_violated_from_random_feasible_starts(starts):
     law, context, zero = scenario.controller, scenario.context, jnp.zeros(())
 
     def start(q, dq):
-        inner = law.tubes(zero, q, dq, context)[1]
+        inner = tubes_of(law, zero, q, dq, context)[1]
         return jnp.min(jnp.minimum(inner.q_d - inner.lower, inner.upper - inner.q_d)), jnp.max(
             jnp.abs(inner.xi(dq))
         )
@@ -402,13 +407,11 @@ def test_no_velocity_bound_is_violated_from_random_feasible_starts(starts):
 
 @pytest.mark.slow
 def test_a_gradient_is_the_difference():
-    smooth = controllers.FullState(
-        k1=2.0, K2=20.0, c=8.0, o=0.1, velocity_barrier=barriers.Mapping()
-    )
+    smooth = two_barriers(c=8.0, second=barriers.Mapping(), o=0.1)
 
     def loss(K2):
         scenario = ij.with_parts(ij.presets.zhang_yan_2024_full_state(), controller=smooth)
-        scenario = ij.with_parameters(scenario, {"controller.K2": K2, "initial.dq": [-1.0, -0.6]})
+        scenario = ij.with_parameters(scenario, {"controller.k[1]": K2, "initial.dq": [-1.0, -0.6]})
         return jnp.sum(ij.simulate(scenario, duration=0.1, dt=5e-4, record_every=200).metrics.ise)
 
     found, h = jax.grad(loss)(20.0), 1e-4
@@ -502,7 +505,12 @@ class Pieces:
 
 
 GAINS = {"k1": 2.0, "K2": 12.0, "c": 1.0, "kf": 100.0}
-PATHS = {"k1": "controller.k1", "K2": "controller.K2", "c": "controller.c", "kf": "observer.kf"}
+PATHS = {
+    "k1": "controller.k[0]",
+    "K2": "controller.k[1]",
+    "c": "controller.c[1]",
+    "kf": "observer.kf",
+}
 
 
 def pieces(duration, factor=2.0, **gains):
@@ -574,7 +582,10 @@ def test_a_disturbance_and_the_command_jump_in_one_step(time):
     )
 
     def integrals(values):
-        changed = {"disturbance.parts[1].time": values[0], "controller.k1": jnp.full(2, values[1])}
+        changed = {
+            "disturbance.parts[1].time": values[0],
+            "controller.k[0]": jnp.full(2, values[1]),
+        }
         metrics = ij.simulate(ij.with_parameters(scenario, changed), duration=0.03, dt=1e-3).metrics
         return jnp.array([jnp.sum(metrics.ise), metrics.effort])
 
@@ -622,7 +633,7 @@ def test_a_sampled_loop_needs_no_term():
     base = ij.with_parts(ij.presets.zhang_yan_2024_full_state(), sampling=ij.Sampling(period=2e-3))
 
     def loss(K2):
-        scenario = ij.with_parameters(base, {"controller.K2": K2, "initial.dq": [-1.0, -0.6]})
+        scenario = ij.with_parameters(base, {"controller.k[1]": K2, "initial.dq": [-1.0, -0.6]})
         return jnp.sum(ij.simulate(scenario, duration=0.1, dt=1e-3, record_every=100).metrics.ise)
 
     found, h = jax.grad(loss)(20.0), 1e-4
@@ -638,42 +649,13 @@ def test_a_barrier_states_whether_its_ratio_jumps(name):
     )
     left, right = (FAMILY[name].error_over_slope(tube, jnp.array([e])) for e in (-1e-9, 1e-9))
     assert bool(abs(left - right)[0] > 1e-6) == FAMILY[name].ratio_jumps
-    law = controllers.FullState(k1=2.0, K2=20.0, c=1.0, velocity_barrier=FAMILY[name])
+    law = two_barriers(second=FAMILY[name])
     scenario = ij.with_parts(ij.presets.zhang_yan_2024_full_state(), controller=law)
     wrapped = controllers.Saturated(law=law, limit=50.0)
     for each in (law, wrapped):
-        found = each.switching(
-            jnp.zeros(()), scenario.initial.q, scenario.initial.dq, scenario.context, ()
-        )
+        x = jnp.stack([scenario.initial.q, scenario.initial.dq])
+        found = each.switching(jnp.zeros(()), x, jnp.zeros(2), scenario.context, ())
         assert (found is not None) == FAMILY[name].ratio_jumps
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"velocity_barrier": barriers.Log(p=2)}, "falls with the error itself"),
-        ({"velocity_barrier": 3.0}, "FullState.velocity_barrier"),
-        (
-            {"o": 0.1, "barrier": barriers.Tan(), "velocity_barrier": barriers.Tan()},
-            "Neither has a kappa",
-        ),
-        ({"c": -1.0}, "> 0"),
-    ],
-)
-def test_bad_ones_are_refused(change, words):
-    with pytest.raises(ValueError, match=words):
-        controllers.FullState(**{"k1": 2.0, "K2": 20.0, "c": 1.0} | change)
-
-
-def test_it_needs_bounds_to_keep():
-    preset = ij.presets.zhang_yan_2024_full_state()
-    with pytest.raises(ValueError, match="the bounds that FullState keeps"):
-        ij.with_parts(preset, bounds=preset.bounds[:1])
-    with pytest.raises(ValueError, match="Q is Theorem 2's"):
-        ij.certificates.counterexample(
-            preset,
-            {"controller.k1": ij.value(ij.uniform(1.0, 3.0))},
-        )
 
 
 @pytest.mark.slow

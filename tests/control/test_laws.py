@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from members import two_barriers
 
 import iblf_jax as ij
 from iblf_jax import controllers, observers
@@ -467,9 +468,7 @@ def _constrained(name):
     pd = controllers.PDGravity(Kp=60.0, Kd=20.0)
     law = {
         "full_state": full.controller,
-        "full_state_smooth": controllers.FullState(
-            k1=2.0, K2=20.0, c=1.0, velocity_barrier=ij.barriers.Tan()
-        ),
+        "full_state_smooth": two_barriers(second=ij.barriers.Tan()),
         "dynamic_surface": controllers.DynamicSurface(k1=2.0, K2=20.0, filter=0.02),
         "reference_governor": controllers.ReferenceGovernor(law=pd),
         "safety_filter": controllers.SafetyFilter(law=pd, nearest="acceleration"),
@@ -514,7 +513,7 @@ def test_backends_agree_on_them_and_a_run_alone_is_that_of_a_batch(name):
 @pytest.mark.parametrize(
     ("name", "path"),
     [
-        ("full_state", "controller.c"),
+        ("full_state", "controller.c[1]"),
         ("dynamic_surface", "controller.filter"),
         ("safety_filter", "controller.a1"),
     ],
@@ -548,7 +547,6 @@ WEIGHTED = {
     ),
     "dynamic_surface": controllers.DynamicSurface(k1=2.0, K2=20.0, filter=0.02),
     "adaptive_rbf": controllers.AdaptiveRBF(k1=2.0, K2=20.0, nodes=4),
-    "full_state": controllers.FullState(k1=2.0, K2=20.0, c=1.0),
 }
 WEIGHT = jnp.array([0.3, 2.5])
 
@@ -573,27 +571,17 @@ def commanded(scenario):
 def test_the_weight_multiplies_slope_and_value_of_the_barrier(name):
     plain, other = (commanded(weighted(name, weight)) for weight in (None, WEIGHT))
     scenario = weighted(name)
-    tube, barrier, model = (
-        scenario.context.tube(jnp.asarray(0.3)),
-        scenario.controller.barrier,
-        scenario.model,
-    )
-    added, first = (WEIGHT - 1.0) * barrier.slope(tube, Q), 0.0
-    if name == "full_state":
-        inner = scenario.controller.tubes(jnp.asarray(0.3), Q, DQ, scenario.context)[1]
-        added = model.mass_matrix(Q) @ (
-            added * scenario.controller.velocity_barrier.error_over_slope(inner, DQ)
-        )
-        first = scenario.controller.velocity_barrier.value(inner, DQ)
+    tube, barrier = scenario.context.tube(jnp.asarray(0.3)), scenario.controller.barrier
+    added = (WEIGHT - 1.0) * barrier.slope(tube, Q)
     np.testing.assert_allclose(other.tau, plain.tau - added, rtol=1e-12)
-    np.testing.assert_allclose(other.V1 - first, WEIGHT * (plain.V1 - first), rtol=1e-9)
+    np.testing.assert_allclose(other.V1, WEIGHT * plain.V1, rtol=1e-9)
     np.testing.assert_array_equal(plain.tau, commanded(weighted(name, 1.0)).tau)
     np.testing.assert_array_equal(scenario.controller.weight, [1.0, 1.0])
 
 
 @pytest.mark.parametrize("name", WEIGHTED)
 def test_the_weight_is_a_leaf_with_the_unit_that_its_barrier_gives_it(name):
-    units = {"corrected_mapping": "N m/rad", "full_state": "1"}
+    units = {"corrected_mapping": "N m/rad"}
     found = {p.path: p for p in ij.parameters(weighted(name))}["controller.weight"]
     assert (found.shape, found.unit) == ((2,), units.get(name, "N m rad"))
     assert ij.simulation.paths.unit_at(weighted(name), "controller.weight[1]") == found.unit
@@ -604,20 +592,6 @@ def test_the_weight_is_a_leaf_with_the_unit_that_its_barrier_gives_it(name):
     np.testing.assert_array_equal(inside.controller.law.weight, WEIGHT)
     with pytest.raises(ValueError, match=r"weight.*> 0"):
         ij.with_parameters(weighted(name), {"controller.weight": [1.0, 0.0]})
-
-
-@pytest.mark.parametrize(
-    ("first", "second", "unit"),
-    [("Integral", "Tan", "rad^2/s^2"), ("Tan", "Integral", "1/rad^2"), ("State", "Tan", "1/s^2")],
-)
-def test_the_weight_of_a_full_state_law_has_the_unit_of_phi_over_that_of_V1(first, second, unit):
-    barriers = {
-        "barrier": getattr(ij.barriers, first)(),
-        "velocity_barrier": getattr(ij.barriers, second)(),
-    }
-    assert controllers.FullState(k1=2.0, K2=20.0, c=1.0, **barriers).leaf_units() == {
-        "weight": unit
-    }
 
 
 def test_files_without_a_weight_have_the_papers_and_others_keep_theirs(tmp_path):

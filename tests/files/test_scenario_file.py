@@ -20,7 +20,7 @@ import pytest
 import tomli_w
 
 import iblf_jax as ij
-from iblf_jax.core.pytree import layers, unwrapped
+from iblf_jax.core.pytree import layers
 from iblf_jax.files import scenario as scenario_file
 
 
@@ -55,7 +55,7 @@ def scenarios(draw) -> ij.Scenario:
         return ij.bounds.Bounds(one(members.SIDES), one(members.SIDES))
 
     plant, law = draw(st.sampled_from(TWO_JOINTS)), one(members.LAWS)
-    limited = getattr(unwrapped(law), "needs_velocity_bounds", False) or draw(st.booleans())
+    limited = members.keeps_velocities(law) or draw(st.booleans())
     scenario = ij.Scenario(
         plant=plant,
         model=draw(st.sampled_from([plant, *TWO_JOINTS])),
@@ -504,3 +504,47 @@ def refusal(load: Callable[[], Any]) -> str | None:
     except ValueError as error:
         return str(error)
     return None
+
+
+OF_AN_EARLIER_VERSION = """
+kind = "full_state"
+k1 = 2.0  # 1/s
+K2 = [20.0, 15.0]  # 1/s
+c = 8.0  # rad^2/s^3
+o = 0.1  # 1/s^2
+weight = [0.5, 2.0]
+
+[barrier]
+kind = "integral"
+
+[velocity_barrier]
+kind = "tan"
+
+[[decays]]
+kind = "finite_time"
+k_a = 1.0
+"""
+
+
+def test_a_file_of_an_earlier_version_may_have_the_law_of_two_levels(tmp_path):
+    path = tmp_path / "scenario.toml"
+    ij.save_scenario(ij.presets.zhang_yan_2024_full_state(), path)
+    data = tomllib.loads(path.read_text())
+    data["controller"] = tomllib.loads(OF_AN_EARLIER_VERSION)
+    path.write_text(tomli_w.dumps(data))
+    law = members.two_barriers(
+        K2=[20.0, 15.0],
+        c=8.0,
+        second=ij.barriers.Tan(),
+        weight=[0.5, 2.0],
+        o=0.1,
+        decays=ij.decays.FiniteTime(k_a=1.0),
+    )
+    expected = ij.with_parts(ij.presets.zhang_yan_2024_full_state(), controller=law)
+    found = ij.load_scenario(path)
+    assert jax.tree.structure(found.controller) == jax.tree.structure(expected.controller)
+    for one, same in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_array_equal(one, same)
+    path.write_text(path.read_text().replace("k1 = 2.0", "k_1 = 2.0"))
+    with pytest.raises(ValueError, match="controller"):
+        ij.load_scenario(path)

@@ -251,7 +251,9 @@ def test_a_protocol_and_its_methods_are_defined_for_the_general_index():
 
 
 def test_the_head_of_a_module_is_on_the_page_of_what_refers_to_it():
-    text = reference.page_of(ij.controllers.FullState, "FullState", 2, "iblf_jax.controllers")
+    text = reference.page_of(
+        ij.controllers.BarrierBackstepping, "BarrierBackstepping", 2, "iblf_jax.controllers"
+    )
     assert "head of this module" not in text
     assert text.index("notes below") < text.index("**Notes**")
     assert "**Notes**" not in reference.page_of(ij.controllers.PDGravity, "PDGravity")

@@ -15,7 +15,7 @@ guarded error, too, and continues with gain k1, so that it still leads back insi
 
 **Claims.**  `decay_rate` and `xi_bound` state the properties of V1 that certificates use.  A
 barrier without them makes no claim.  `error_over_slope` is for laws that put a barrier on
-velocities (`controllers.FullState`).
+velocities (`controllers.BarrierBackstepping`).
 """
 
 from __future__ import annotations

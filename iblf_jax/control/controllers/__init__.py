@@ -23,7 +23,6 @@ from iblf_jax.control.controllers.barrier_backstepping import (
 from iblf_jax.control.controllers.computed_torque import ComputedTorque as ComputedTorque
 from iblf_jax.control.controllers.dynamic_surface import DynamicSurface as DynamicSurface
 from iblf_jax.control.controllers.event_compensated import EventCompensated as EventCompensated
-from iblf_jax.control.controllers.full_state import FullState as FullState
 from iblf_jax.control.controllers.pd_gravity import PDGravity as PDGravity
 from iblf_jax.control.controllers.reference_governor import ReferenceGovernor as ReferenceGovernor
 from iblf_jax.control.controllers.safety_filter import SafetyFilter as SafetyFilter
@@ -41,7 +40,6 @@ from iblf_jax.control.controllers.with_drive import WithDrive as WithDrive
 MEMBERS = {
     "backstepping": Backstepping,
     "barrier_backstepping": BarrierBackstepping,
-    "full_state": FullState,
     "dynamic_surface": DynamicSurface,
     "adaptive_rbf": AdaptiveRBF,
     "adaptive_network": AdaptiveNetwork,
@@ -72,7 +70,6 @@ __all__ = [
     "ComputedTorque",
     "DynamicSurface",
     "EventCompensated",
-    "FullState",
     "Law",
     "LawContext",
     "LyapunovLaw",

@@ -131,9 +131,9 @@ class TrackingLaw(Timed):
 
     gains: ClassVar[tuple[str, ...]] = ("k1", "K2")
     """The names of the leaves that `compare` scales together."""
-    unit_factors: ClassVar[tuple[str, ...]] = ()
-    """The names of leaves that are factors only.  Which of their numbers are 1 may be compiled in
-    (`engine.structural_constants`)."""
+    factors: ClassVar[tuple[str, ...]] = ()
+    """The names of leaves that are factors only.  Which of their numbers are 0 or 1 may be compiled
+    in (`engine.structural_constants`)."""
     uses_observer: ClassVar[bool] = True
     """Whether it uses f_hat."""
     needs_velocity_bounds: ClassVar[bool] = False
@@ -303,7 +303,7 @@ class RobotLaw(TrackingLaw):
         self, t: jax.Array, q: jax.Array, dq: jax.Array, context: LawContext, state: State
     ) -> jax.Array | None:
         """The functions of q or q', (m,), at whose zeros the command jumps, such as that of a
-        sliding-mode law or of `FullState` with some barriers; None for a continuous command.
+        sliding-mode law; None for a continuous command.
 
         The derivatives of a run contain the effect of such a jump on a perturbation
         (`engine.switching`).  A law that wraps another forwards the call.

@@ -113,7 +113,7 @@ class AdaptiveNetwork(RobotLaw):
     barrier: Barrier = Log()
     nodes: int = static(default=10)
     weight: Leaf = leaf("N m rad", sign="positive", default=None)
-    unit_factors: ClassVar[tuple[str, ...]] = ("weight",)
+    factors: ClassVar[tuple[str, ...]] = ("weight",)
     uses_observer: ClassVar[bool] = False
     takes_shift: ClassVar[bool] = True
     leaf_units = weight_units

@@ -104,7 +104,7 @@ class AdaptiveRBF(RobotLaw):
     nodes: int = static(default=64)
     normalised: bool = static(default=False)
     weight: Leaf = leaf("N m rad", sign="positive", default=None)
-    unit_factors: ClassVar[tuple[str, ...]] = ("weight",)
+    factors: ClassVar[tuple[str, ...]] = ("weight",)
     uses_observer: ClassVar[bool] = False
     takes_shift: ClassVar[bool] = True
     leaf_units = weight_units

@@ -99,7 +99,7 @@ class Backstepping(RobotLaw):
     reading: str = static(default="printed")
     weight: Leaf = leaf("N m rad", sign="positive", default=None)
     decays: tuple[Decay, ...] = ()
-    unit_factors: ClassVar[tuple[str, ...]] = ("weight",)
+    factors: ClassVar[tuple[str, ...]] = ("weight",)
     takes_shift: ClassVar[bool] = True
     leaf_units = weight_units
     symbols_of_part = symbols_of_energy

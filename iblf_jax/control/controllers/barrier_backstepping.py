@@ -32,7 +32,33 @@ the derivatives of k_i(t, V_i).
 **Smoothness.**  u contains the slope s_i of a level differentiated r - i - 1 times.  `Integral` and
 `Log(p=1)` have a kink of the slope at e_i = 0 in an asymmetric tube, and on levels above the first
 their e_i/s_i jumps there.  Such a barrier is refused below the last level.  On the last level u
-jumps at e_r = 0 (`switching`), as the exact cancellation requires.
+jumps at e_r = 0 (`switching`), as the exact cancellation requires: for a robot with bounds on
+positions and velocities the torque jumps by M0 s_1 (K_u^2 - K_l^2)/2.  `Tan`, `State`, `Mapping`
+and `PrescribedPerformance` have no jump.
+
+**Derivatives across the jump.**  In a continuous loop the derivative of a step that reaches e_r,i =
+0 is that of the hybrid flow, with the jump of a perturbation at the crossing (`engine.switching`,
+J.1), in every executor and in forward and reverse mode; that of a metric of the input contains the
+jump of its integrand.  Limits:
+
+- Where the inputs of both sides drive e_r,i towards 0, it slides along 0.  Derivatives of the state
+  are then those of the sliding motion, of first order in dt; those of a metric of the input leave
+  out how the input alternates.  Where e_r,i touches 0 without crossing it, no derivative exists.
+- A sampled loop holds its input, so that its derivative needs no such term.  But its metrics, as
+  functions of a gain, jump whenever a crossing moves from one sample to the next, and no derivative
+  contains that.
+- Second derivatives leave out the kink of the barrier's slope at e_1 = 0, as those of every law
+  with asymmetric bounds do.
+- A fixed step across the jump is of first order; `numerical_error` contains that error.
+- Other solvers that take `VectorField` step across the jump in their own way: derivatives through
+  them leave the term out.
+
+**On a robot** with bounds on positions and velocities (order 2) the law is
+
+    tau = C0 q' + G0 + M0 (a_2 - w_1 s_1 e_2/(w_2 s_2) - c_2 s_2) - f_hat,                     (F.1)
+
+and with c_2 > 0 and a momentum observer it has the claim (F.3), which bounds the effect of the
+estimation error in advance (`iblf_jax.certificates.claims.matched`).
 """
 
 from __future__ import annotations
@@ -80,12 +106,16 @@ class BarrierBackstepping(Law):
     It keeps the bounds of every level that has a barrier, as long as alpha_{i-1} is inside the
     bounds of level i (`alpha_margin` > 0).
 
+    With `Integral` or `Log` as the last barrier, u jumps at e_r = 0 where K_u and K_l differ.
+    First derivatives of a run contain that jump (head of this module, with the limits).
+
     Args:
       k: gain of each level, r numbers or (r, n) [1/s], > 0.
       barriers: a `Barrier` for each level, `Quadratic()` where a level has no bounds.  A single
         barrier is that of the first level, with `Quadratic()` above; `(Mapping(),)` if not given.
       c: gain of each level's slope s_i, which limits the effect of estimation errors, one number, r
-        numbers or (r, n) [1], >= 0; 0 if not given.
+        numbers or (r, n) [1], >= 0; 0 if not given.  On a robot with a momentum observer the claim
+        (F.3) of case 2 asks for c_2 > w_2/(4 (kf - 1/2) lambda_min(M0)^2).
       weights: w_i of each level's V_i, r numbers or (r, n) [1], > 0; those of the model's energy if
         not given, with which w_i V_i is about half the scale of the level times e_i^2 near e_i = 0;
         1 for a model that states none.  The unit 1 of c and of the weights is that of a plant
@@ -101,8 +131,9 @@ class BarrierBackstepping(Law):
         is that of every level; exponential in k if not given.
 
     Source: M. Krstic, I. Kanellakopoulos, P. Kokotovic, Nonlinear and Adaptive Control Design,
-      1995 (backstepping); K. P. Tee, S. S. Ge, Automatica 47 (2011) 2511-2516 (barriers); weights
-      and full-state bounds of this package.
+      1995 (backstepping); K. P. Tee, S. S. Ge, Automatica 47 (2011) 2511-2516 (barriers); W. He,
+      Y. Chen, Z. Yin, IEEE Trans. Cybernetics 46 (2016) 620-629 (robots with bounds on positions
+      and velocities); weights and full-state bounds of this package.
     """
 
     k: Leaf = leaf("1/s", sign="positive", shape="level")
@@ -113,6 +144,7 @@ class BarrierBackstepping(Law):
     filter: Leaf = leaf("s", sign="positive", shape="level", default=None)
     decays: tuple[Decay, ...] = ()
     gains: ClassVar[tuple[str, ...]] = ("k",)
+    factors: ClassVar[tuple[str, ...]] = ("c", "weights")
     takes_shift: ClassVar[bool] = True
     includes_e2: ClassVar[bool] = True
 

@@ -65,7 +65,7 @@ class DynamicSurface(RobotLaw):
     barrier: Barrier = Integral()
     weight: Leaf = leaf("N m rad", sign="positive", default=None)
     decays: tuple[Decay, ...] = ()
-    unit_factors: ClassVar[tuple[str, ...]] = ("weight",)
+    factors: ClassVar[tuple[str, ...]] = ("weight",)
     takes_shift: ClassVar[bool] = True
     leaf_units = weight_units
     symbols_of_part = symbols_of_energy

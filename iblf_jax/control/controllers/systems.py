@@ -13,9 +13,9 @@ from iblf_jax.control import barriers
 from iblf_jax.control.controllers._base import RobotLaw, TrackingLaw
 from iblf_jax.control.controllers.adaptive_rbf import AdaptiveRBF
 from iblf_jax.control.controllers.backstepping import Backstepping
+from iblf_jax.control.controllers.barrier_backstepping import BarrierBackstepping
 from iblf_jax.control.controllers.computed_torque import ComputedTorque
 from iblf_jax.control.controllers.dynamic_surface import DynamicSurface
-from iblf_jax.control.controllers.full_state import FullState
 from iblf_jax.control.controllers.pd_gravity import PDGravity
 from iblf_jax.control.controllers.reference_governor import ReferenceGovernor
 from iblf_jax.control.controllers.safety_filter import SafetyFilter
@@ -45,7 +45,7 @@ FILTER = 0.01
 than K2 makes the loop."""
 
 DAMPING = 8.0
-"""rad^2/s^3.  ASSUMPTION: c of the full-state law by name, as in
+"""rad^2/s^3.  ASSUMPTION: c of the second level of the law "full_state", as in
 `presets.zhang_yan_2024_full_state`."""
 
 SPEED = 10.0
@@ -95,7 +95,9 @@ def law_by_name(
     if name == "dynamic_surface":
         return DynamicSurface(k1=k1, K2=K2, o=o, filter=FILTER, weight=weight)
     if name == "full_state":
-        return FullState(k1=k1, K2=K2, c=DAMPING, o=o, weight=weight)
+        both = (barriers.Integral(), barriers.Integral())
+        c, weights = (0.0, DAMPING), (weight, 1.0)
+        return BarrierBackstepping(k=(k1, K2), barriers=both, c=c, weights=weights, o=(o, o))
     if name == "reference_governor":
         return ReferenceGovernor(law=BASELINES["pd"](), eta=SPEED)
     if name == "safety_filter":

@@ -12,7 +12,7 @@ from iblf_jax.files.scenario import load_scenario_file
 
 scenario, options = load_scenario_file(Path(__file__).with_name("scenario.toml"))
 run = ij.simulate(scenario, **options)
-runs = {"FullState with a momentum observer": run}
+runs = {"BarrierBackstepping with a momentum observer": run}
 figure = plotting.velocity_portrait(run, joint=0)
 
 # %% The complete run.

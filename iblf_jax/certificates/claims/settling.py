@@ -5,11 +5,10 @@ joints,
 
     E' <= -sum_j w_j rate_j(k_j(t, V_j)) V_j + g                                              (D.2)
 
-with g = T - sum c_i w_i |s_i|^2 of (S.3) for `BarrierBackstepping`; for laws of robots E = V2
+with g = T - sum c_i w_i |s_i|^2 of (S.3) for `BarrierBackstepping`; for `Backstepping` E = V2
 without the term of f_tilde, and
 
     g = e2 . f_tilde (+ 1/2 e2^T M0' e2 in the printed reading)         `Backstepping`
-    g = s2 . M0^-1 f_tilde - c |s2|^2                                   `FullState`
 
 The second step of `Backstepping` has V = W = 1/2 e2^T M0 e2 with w = 1 and
 e2^T K2 e2 + 2 g(t, W) W >= 2 (mu + g(t, W)) W, mu = lambda_min(M0^-1 K2).
@@ -26,17 +25,20 @@ grid of shares of E, one joint of one level after the other, and (D.3) is integr
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections.abc import Iterable, Mapping
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.certificates.decay_lines import check_steps
-from iblf_jax.certificates.lines import Line, Statement, not_applicable
-from iblf_jax.certificates.run_summary import ENERGY_ROUNDING, Segment
+from iblf_jax.certificates.claims._base import Claim, check_steps
+from iblf_jax.certificates.claims.levels import LEVELS
+from iblf_jax.certificates.claims.matched import MATCHED
+from iblf_jax.certificates.lines import Line, Statement, join_notes, not_applicable
+from iblf_jax.certificates.summary import ENERGY_ROUNDING, Segment, Summary
 from iblf_jax.control.actuators import Ideal
-from iblf_jax.control.controllers import Backstepping, BarrierBackstepping, FullState
+from iblf_jax.control.controllers import Backstepping, BarrierBackstepping
 from iblf_jax.control.controllers._base import decay_of
 from iblf_jax.control.decays._base import energy_gain
 from iblf_jax.core import checks, programs
@@ -76,18 +78,6 @@ class Part(NamedTuple):
     """Decay rate of V for a gain, a function."""
 
 
-def has_settling_claim(scenario: Scenario) -> bool:
-    """Whether the law of a scenario has a decay that is not exponential, and the claim (D.2)."""
-    law: Any = unwrapped(scenario.controller)
-    if not isinstance(law, Backstepping | FullState | BarrierBackstepping):
-        return False
-    if isinstance(law, BarrierBackstepping) and law.filter is not None:
-        return False
-    if any(part.rate(part.gain) is None for part in parts_of(law)):
-        return False
-    return any(not decay.constant for decay in law.decays)
-
-
 def parts_of(law: Any) -> list[Part]:
     """The levels of a law that have a barrier."""
     if isinstance(law, BarrierBackstepping):
@@ -97,11 +87,7 @@ def parts_of(law: Any) -> list[Part]:
             for i, (barrier, k, w) in enumerate(rows)
         ]
     rate = law.barrier.decay_rate
-    first = Part(decay_of(law, 0), law.k1, law.weight, rate)
-    if isinstance(law, Backstepping):
-        return [first]
-    rate = law.velocity_barrier.decay_rate
-    return [first, Part(decay_of(law, 1), law.K2, jnp.ones_like(law.K2), rate)]
+    return [Part(decay_of(law, 0), law.k1, law.weight, rate)]
 
 
 def effective_rate(part: Part, t: jax.Array, V: jax.Array) -> jax.Array:
@@ -193,7 +179,7 @@ def _step(
     return logarithm + h / 6.0 * (k_1 + 2.0 * k_2 + 2.0 * k_3 + k_4)
 
 
-# --- the lines ----------------------------------------------------------------------------------
+# --- the claim ----------------------------------------------------------------------------------
 
 
 class Course(NamedTuple):
@@ -209,82 +195,104 @@ class Course(NamedTuple):
     excluded: np.ndarray
 
 
-def robot_course(segment: Segment) -> Course:
-    """The course of E = V2 - 1/2 |f_tilde|^2 along a segment, for a law of robots."""
-    proof = segment.proof
-    E = proof.V - 0.5 * np.sum(proof.f_tilde**2, axis=1)
-    if segment.summary.claims.bounds_velocities:
-        return course_of(segment, E, proof.full.growth)
-    growth = np.sum(proof.e2 * proof.f_tilde, axis=1) + proof.dropped_e2
-    return course_of(segment, E, growth)
+class Settling(Claim):
+    """The settling time that decays of a law predict."""
+
+    key: ClassVar[str] = "settling"
+    equation: ClassVar[str] = "(D.2)"
+
+    def why_not(self, scenario: Scenario) -> str:
+        """Why a law predicts no settling time; "" if it has a decay that is not exponential."""
+        law: Any = unwrapped(scenario.controller)
+        if not isinstance(law, Backstepping | BarrierBackstepping):
+            return f"(D.2) is about laws with decays, not about {type(law).__name__}"
+        if law.filter is not None:
+            return "(D.2) is about exact derivatives, and the law has filters"
+        if any(part.rate(part.gain) is None for part in parts_of(law)):
+            return "a barrier states no decay rate of its V"
+        if all(decay.constant for decay in law.decays):
+            return "the decays of the law are exponential"
+        return ""
+
+    def why_not_in_run(self, summary: Summary) -> str:
+        """Why (D.2) does not apply to a run; "" if it does."""
+        if LEVELS in summary.claims:
+            return LEVELS.why_not_in_run(summary)
+        actuator = summary.run.scenario.actuator
+        if not isinstance(actuator, Ideal):
+            name = checks.with_article(type(actuator).__name__)
+            return f"(D.2) is about a torque that acts as it is commanded, not about {name}"
+        if summary.excluded == summary.samples:
+            return f"{summary.why_excluded} all the time"
+        return summary.why_invalid
+
+    def gathered(self, segment: Segment) -> Course:
+        """The course of E along a segment."""
+        terms = segment.terms
+        eps = float(np.finfo(terms.V.dtype).eps)
+        noise = ENERGY_ROUNDING * eps * terms.sqrt_V_size
+        E = terms.V
+        if LEVELS not in segment.summary.claims:
+            E = E - 0.5 * np.sum(terms.d_tilde**2, axis=1)
+        return Course(segment.t, E, _growth(segment), noise, terms.excluded)
+
+    def lines(self, segment: Segment) -> list[Line]:
+        """The inequality (D.2) at every step of a segment, with the gains of each instant, for
+        `Backstepping`.
+        """
+        summary, terms = segment.summary, segment.terms
+        if not isinstance(summary.law, Backstepping):
+            return []
+        why_not = self.why_not_in_run(summary)
+        if why_not:
+            return [not_applicable(INEQUALITY, why_not)]
+        decay = terms.claims["torque"].decay
+        rate = terms.dV - np.sum(terms.d_tilde * terms.dd_tilde, axis=1)
+        tolerance = summary.eps * (terms.size + np.abs(decay))
+        note = join_notes(summary.exclusion_note(), summary.restart_note("f"))
+        margins = _growth(segment) - rate - decay
+        return [check_steps(segment, INEQUALITY, margins, tolerance, note=note)]
+
+    def conclusions(
+        self, summary: Summary, gathered: list[Any], lines: Mapping[str, Line]
+    ) -> Iterable[Line]:
+        """The lines about the settling time of a run."""
+        law: Any = summary.law
+        course = Course(*map(np.concatenate, zip(*gathered, strict=True)))
+        why_not = self.why_not_in_run(summary) or _why_not_from_the_start(summary, course)
+        band, deadline = _band(law), _deadline(law)
+        statements = []
+        if np.isfinite(band):
+            statements.append(TIME)
+        if np.isfinite(deadline):
+            statements.append(AT_DEADLINE)
+        if why_not:
+            return [not_applicable(statement, why_not) for statement in statements]
+        rho2 = max(float(np.max(course.growth)), 0.0)
+        mu, start, end = float(summary.extrema.mu), float(course.total[0]), float(course.t[-1])
+        times, v = predicted(law, mu, start, rho2, end)
+        found = []
+        if np.isfinite(band):
+            found.append(_time_line(course, times, v, band, rho2))
+        if np.isfinite(deadline):
+            found.append(_deadline_line(course, times, v, deadline, rho2))
+        return found
 
 
-def decay_line(segment: Segment, why_not: str) -> Line:
-    """The inequality (D.2) at every step of a segment, with the gains of each instant, for
-    `Backstepping`.
-    """
-    if why_not:
-        return not_applicable(INEQUALITY, why_not)
-    proof = segment.proof
-    rate = proof.dV - np.sum(proof.f_tilde * proof.df_tilde, axis=1)
-    growth = robot_course(segment).growth
-    tolerance = segment.summary.eps * (proof.dV_size + np.abs(proof.decay))
-    note = segment.summary.exclusion_note
-    return check_steps(segment, INEQUALITY, growth - rate - proof.decay, tolerance, note=note)
+SETTLING = Settling()
 
 
-def why_no_settling(summary: Any) -> str:
-    """Why (D.2) does not apply to a run of a robot; "" if it does."""
-    actuator = summary.run.scenario.actuator
-    if not isinstance(actuator, Ideal):
-        name = checks.with_article(type(actuator).__name__)
-        return f"(D.2) is about a torque that acts as it is commanded, not about {name}"
-    if summary.excluded == summary.samples:
-        return f"{summary.why_excluded} all the time"
-    return summary.why_invalid  # type: ignore[no-any-return]
+def _growth(segment: Segment) -> np.ndarray:
+    """The term g of (D.2) at every step, (T,)."""
+    terms = segment.terms
+    for claim in (LEVELS, MATCHED):
+        if claim.key in terms.claims:
+            return terms.claims[claim.key].growth  # type: ignore[no-any-return]
+    dropped = terms.claims["torque"].dropped_e2
+    return np.sum(terms.e[:, 1] * terms.d_tilde, axis=1) + dropped  # type: ignore[no-any-return]
 
 
-def course_of(segment: Segment, E: np.ndarray, growth: np.ndarray) -> Course:
-    """The course of E along a segment."""
-    proof = segment.proof
-    eps = float(np.finfo(proof.V.dtype).eps)
-    noise = ENERGY_ROUNDING * eps * proof.sqrt_V_size
-    return Course(segment.t, E, growth, noise, proof.excluded)
-
-
-def settling_lines(summary: Any, courses: list[Course], why_not: str, mu: float) -> list[Line]:
-    """The lines about the settling time of one run.
-
-    Args:
-      summary: of the run.
-      courses: of its segments; none for a law without the claim (D.2).
-      why_not: why (D.2) does not apply to the run; "" if it does.
-      mu: smallest eigenvalue of M0^-1 K2 along the run [1/s]; not used for laws of levels.
-    """
-    if not courses:
-        return []
-    law: Any = summary.claims.law
-    course = Course(*map(np.concatenate, zip(*courses, strict=True)))
-    why_not = why_not or _why_not_from_the_start(summary, course)
-    band, deadline = _band(law), _deadline(law)
-    statements = []
-    if np.isfinite(band):
-        statements.append(TIME)
-    if np.isfinite(deadline):
-        statements.append(AT_DEADLINE)
-    if why_not:
-        return [not_applicable(statement, why_not) for statement in statements]
-    rho2 = max(float(np.max(course.growth)), 0.0)
-    times, v = predicted(law, mu, float(course.total[0]), rho2, float(course.t[-1]))
-    lines = []
-    if np.isfinite(band):
-        lines.append(_time_line(course, times, v, band, rho2))
-    if np.isfinite(deadline):
-        lines.append(_deadline_line(course, times, v, deadline, rho2))
-    return lines
-
-
-def _why_not_from_the_start(summary: Any, course: Course) -> str:
+def _why_not_from_the_start(summary: Summary, course: Course) -> str:
     """Why (D.3) does not hold from the start of a run on; "" if it does."""
     if np.any(course.excluded):
         return "the prediction is from t = 0 on, and the claim excludes some samples"

@@ -1,0 +1,59 @@
+"""The claims about closed loops, one object each; `_base.Claim` is what they have in common.
+
+========  ==========================================================  ==============
+Theorem   the backstepping law with the observer (3.11)               (3.16)-(3.31)
+Weighted  the same with free weights, for every positive gain         (W.1)-(W.3)
+Matched   a law of order 2 whose gain c meets the estimation error    (F.1)-(F.3)
+Levels    a law with a barrier on every level of a plant              (S.1)-(S.4)
+Settling  the settling time that decays of a law predict              (D.2), (D.3)
+OwnClaim  what a law states about itself                              own
+========  ==========================================================  ==============
+"""
+
+from __future__ import annotations
+
+import jax
+
+from iblf_jax.certificates.claims._base import Claim as Claim
+from iblf_jax.certificates.claims._base import ShownClaim
+from iblf_jax.certificates.claims.levels import LEVELS
+from iblf_jax.certificates.claims.matched import MATCHED
+from iblf_jax.certificates.claims.own import OWN, is_about_torque
+from iblf_jax.certificates.claims.settling import SETTLING
+from iblf_jax.certificates.claims.theorem import THEOREM
+from iblf_jax.certificates.claims.weighted import WEIGHTED
+from iblf_jax.certificates.terms import Terms, terms_and_sample
+from iblf_jax.simulation.closed_loop import LoopState
+from iblf_jax.simulation.scenario import Scenario
+
+
+def shown_claim(scenario: Scenario) -> ShownClaim:
+    """The claim that a certificate of a scenario is about, whether or not it applies."""
+    if is_about_torque(scenario):
+        return THEOREM
+    return LEVELS if MATCHED.why_not(scenario) else MATCHED
+
+
+def claims_of(scenario: Scenario) -> tuple[Claim, ...]:
+    """All claims about a scenario, in the order of their lines.
+
+    Raises:
+      ValueError: a law that states half of a claim about itself.
+    """
+    shown = shown_claim(scenario)
+    candidates: tuple[Claim, ...] = (OWN, shown, SETTLING, WEIGHTED)
+    if shown is LEVELS:
+        candidates = (shown, SETTLING, OWN)
+    return tuple(x for x in candidates if x is shown or not x.why_not(scenario))
+
+
+def terms_at(scenario: Scenario, t: jax.Array, state: LoopState) -> Terms:
+    """The terms of all claims about a scenario at one state; pure, for `vmap` over states, times
+    and gains.
+
+    Args:
+      scenario: canonical.
+      t: time, () [s].
+      state: state of the loop at t.
+    """
+    return terms_and_sample(scenario, t, state, claims_of(scenario))[0]

@@ -1,0 +1,341 @@
+"""The claim about `controllers.BarrierBackstepping` of order 2 on a robot, with a gain c of the
+slope of the last barrier, where the error of the estimate acts: c meets the torque that the
+observer has not found.
+
+V1 = sum w_1 V_1 and phi = sum w_2 V_2 are the barriers on positions and velocities.  With
+V2 = V1 + phi + 1/2 |f_tilde|^2, s2 = w_2 s_2 the slope of phi, c for c_2/w_2 and
+lambda = lambda_min(M0),
+
+    (V1 + phi)' <= -(decay of V1) - (decay of phi) + s2 . M0^-1 f_tilde - c |s2|^2,            (F.2)
+    s2 . M0^-1 f_tilde <= c |s2|^2 + |f_tilde|^2/(4 c lambda^2),
+    V2' <= -rho V2 (+ 1/2 |f'|^2),                                                             (F.3)
+    rho = min(decay rate of V1, that of phi, 2 (lambda_min(kf) (- 1/2) - 1/(4 c lambda^2)));
+
+terms in brackets apply for f' != 0 (case 2).  (F.3) bounds the effect of the estimation error in
+advance, where (S.3) has it as it is along the run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax.certificates.claims._base import check_steps, with_status
+from iblf_jax.certificates.claims.own import own_claim
+from iblf_jax.certificates.claims.theorem import (
+    CASE_1_COUNTS,
+    Theorem,
+    eigenvalues_in,
+    torque_size,
+    torque_sizes,
+)
+from iblf_jax.certificates.claims.two_cases import CASES, along, why_no_decay, why_not_in_loop
+from iblf_jax.certificates.lines import (
+    Line,
+    Statement,
+    check_positive,
+    check_smallest,
+    join_notes,
+    not_applicable,
+    observed_only,
+)
+from iblf_jax.certificates.summary import Segment, Summary
+from iblf_jax.certificates.terms import (
+    Point,
+    Terms,
+    TorquePoint,
+    adaptive_law,
+    gap,
+    inner_context,
+)
+from iblf_jax.control.controllers import BarrierBackstepping
+from iblf_jax.control.controllers._base import decay_of
+from iblf_jax.control.controllers._levels import Level
+from iblf_jax.control.decays._base import gain_at
+from iblf_jax.core import checks, programs
+from iblf_jax.core.linalg import solve_spd
+from iblf_jax.core.pytree import unwrapped
+from iblf_jax.core.status import Status
+from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.world import plants
+from iblf_jax.world.bounds import NARROWEST, Tube
+
+LOWEST = {1: 0.0, 2: 0.5}
+"""Lower bound of kf - 1/(4 c lambda_min(M0)^2), by case."""
+FURTHER_TERM = {1: "", 2: " - 1/2"}
+"""Further term in the condition on kf, by case."""
+ALPHA_INSIDE = Statement("alpha inside", "(F.1)", "v_l < alpha < v_u", "rad/s")
+START_SPEED_INSIDE = Statement("start speed inside", "(F.1)", "v_l(0) < q'(0) < v_u(0)", "rad/s")
+
+
+class MatchedTerms(NamedTuple):
+    """The terms of (F.2) at one instant."""
+
+    left: jax.Array
+    """(V1 + phi)' + decay rates times V1 and phi - s2 . M0^-1 f_tilde + c |s2|^2, () [1/s]."""
+    bound: jax.Array
+    """K of each joint's side, (n,) [rad/s]."""
+    alpha_distance: jax.Array
+    """Distance of alpha to the velocity bounds, (n,) [rad/s]."""
+    growth: jax.Array
+    """s2 . M0^-1 f_tilde - c |s2|^2, () [1/s]."""
+
+
+class Matched(Theorem):
+    """(F.3): the estimation error acts where the law has the gain c."""
+
+    key: ClassVar[str] = "matched"
+    equation: ClassVar[str] = "(F.3)"
+    conditions: ClassVar[Mapping[int, str]] = {1: "(F.3)", 2: "(F.3)"}
+    least: ClassVar[tuple[str, ...]] = (
+        "the decay rate of V1",
+        "the decay rate of phi",
+        "kf and c",
+    )
+
+    def why_not(self, scenario: Scenario) -> str:
+        """Why (F.3) claims nothing about a scenario, in words; "" if it does."""
+        law: Any = unwrapped(scenario.controller)
+        if not isinstance(law, BarrierBackstepping) or law.order != 2 or law.filter is not None:
+            return "(F.3) is about BarrierBackstepping of order 2 with exact derivatives"
+        if plants.is_chain(scenario.model):
+            return "(F.3) is about the torque on a robot"
+        if not (checks.is_concrete(law.c) and np.all(np.asarray(law.c)[-1] > 0)):
+            return "(F.3) needs c > 0 on the last level"
+        if own_claim(scenario) is not None:
+            return "the law states a claim of its own"
+        if adaptive_law(scenario) is not None:
+            return "(F.3) is about a constant model, and AdaptiveParameters changes it"
+        pairs = zip(law.barriers, law.k, strict=True)
+        reasons = (why_no_decay(barrier, k) for barrier, k in pairs)
+        return next(filter(None, reasons), "") or why_not_in_loop(scenario)
+
+    def exclusion_note(self, summary: Summary) -> str:
+        """Which samples the claim excludes, and where it starts again, in words."""
+        excluded = summary.exclusion_note("alpha was outside, or {}")
+        return join_notes(excluded, summary.restart_note("f"))
+
+    # --- the terms --------------------------------------------------------------------------------
+
+    def has_law(self, law: Any) -> bool:
+        """Whether it is about a law of this class."""
+        return isinstance(law, BarrierBackstepping)
+
+    def added(self, point: Point, terms: Terms) -> Terms:
+        """The terms at a state with those of this claim."""
+        terms = super().added(point, terms)
+        assert isinstance(point, TorquePoint)
+        law, x, t = point.law, point.x, point.t
+        levels, tubes = _levels(point)
+        barriers_rate = terms.dV - terms.d_tilde @ terms.dd_tilde
+        decays = by_slopes = jnp.zeros_like(t)
+        for i, (barrier, tube, level) in enumerate(zip(law.barriers, tubes, levels, strict=True)):
+            gain = gain_at(decay_of(law, i), t, law.k[i], barrier, tube, x[i])
+            stated = barrier.decay_rate(gain)
+            if stated is not None:
+                decays += jnp.sum(stated * (law.weights[i] * barrier.value(tube, x[i])))
+            by_slopes += jnp.sum(law.c[i] / law.weights[i] * level.slope**2)
+        growth = levels[1].slope @ solve_spd(point.M0, terms.d_tilde) - by_slopes
+        inner = tubes[1]
+        distance = jnp.minimum(inner.q_d - inner.lower, inner.upper - inner.q_d)
+        entry = MatchedTerms(
+            left=barriers_rate + decays - growth,
+            bound=jnp.where(x[1] > inner.q_d, inner.k_u, inner.k_l),
+            alpha_distance=distance,
+            growth=growth,
+        )
+        return terms._replace(
+            xi=jnp.stack([terms.xi[0], inner.xi(x[1])]),
+            # e2 has no tube where alpha is outside the velocity bounds.
+            excluded=terms.excluded | jnp.any(distance <= NARROWEST),
+            claims=terms.claims | {self.key: entry},
+        )
+
+    def term_sizes(self, point: TorquePoint, terms: Terms) -> tuple[jax.Array, jax.Array]:
+        """`Terms.size` and `Terms.sqrt_V_size`, with the terms of phi'."""
+        law, dq = point.law, point.x[1]
+        guard = law.barriers[0].guard
+        size, sqrt_V_size = torque_sizes(point, terms, law.k[1], law.weights[0], guard)
+        levels, (_, inner) = _levels(point)
+        near = gap(inner.xi(dq), law.barriers[1].guard)
+        torque = torque_size(point, law.k[1], gap(point.now["xi"], guard))
+        unit = jnp.eye(torque.size, dtype=torque.dtype)
+        inverse = jnp.stack([solve_spd(point.M0, row) for row in unit])
+        accelerations = jnp.abs(point.now["ddq"]) + jnp.abs(point.rates["alpha"])
+        accelerations = accelerations + jnp.sum(jnp.abs(inverse) * torque, axis=1)
+        s2 = jnp.abs(levels[1].slope)
+        by_slope = jnp.sum(law.c[1] / law.weights[1] * s2**2)
+        return size + ((s2 / near) @ accelerations + by_slope), sqrt_V_size
+
+    # --- gains and rates --------------------------------------------------------------------------
+
+    def rho_terms(self, summary: Summary, case: int, domain: str) -> np.ndarray:
+        """The terms of which rho is the least, (3,) [1/s], with the eigenvalues of M0 of a
+        domain.
+        """
+        law: Any = summary.law
+        lambda_min = eigenvalues_in(summary, domain).lambda_min
+        pairs = zip(law.barriers, law.k, strict=True)
+        decay, decay_phi = (barrier.decay_rate(k) for barrier, k in pairs)
+        c, kf = law.c[1] / law.weights[1], summary.run.scenario.observer.kf
+        return np.asarray(rho_terms(decay, decay_phi, c, kf, lambda_min, case))
+
+    def gain_conditions(self, summary: Summary) -> list[Line]:
+        """The condition of (F.3) on kf and c, in both cases."""
+        scenario, lambda_min = summary.run.scenario, float(summary.extrema.lambda_min)
+        reason = self.why_not(scenario)
+        lines = []
+        for case in CASES:
+            text = f"lambda_min(kf){FURTHER_TERM[case]} - 1/(4 c lambda_min(M0)^2) > 0"
+            statement = Statement(f"kf and c, case {case}", "(F.3)", text, "1/s")
+            if reason:
+                lines.append(not_applicable(statement, reason))
+                continue
+            margin = 0.5 * float(summary.constants[self.key][case, "run"][2])
+            needed = np.asarray(scenario.observer.kf).min() - LOWEST[case]
+            note = f"lambda_min(M0) = {lambda_min:.4g} kg m^2 along the run"
+            if margin <= 0 < needed:
+                note += f": c > {0.25 / (needed * lambda_min**2):.4g} would do"
+            counts = not (case == 2 and summary.case == 1)
+            if not counts:
+                note = CASE_1_COUNTS
+            lines.append(check_positive(statement, margin, counts=counts, note=note))
+        return lines
+
+    def rate_statement(self, name: str, case: int) -> Statement:
+        """The statement of the rate of a case."""
+        text = (
+            "rho = min(decay of V1, decay of phi, 2 (kf"
+            f"{FURTHER_TERM[case]} - 1/(4 c lambda_min(M0)^2))) > 0"
+        )
+        return Statement(name, "(F.3)", text, "1/s")
+
+    def eigenvalue_note(self, source: Any) -> str:
+        """The eigenvalue of M0 on which rho depends, in words."""
+        return f"lambda_min(M0) = {source.lambda_min:.4g} kg m^2"
+
+    # --- every step -------------------------------------------------------------------------------
+
+    def assumptions(self, segment: Segment) -> list[Line]:
+        """Those of Theorem 2, and those on the virtual velocity and on the velocity at the
+        start.
+        """
+        entry, summary = segment.terms.claims[self.key], segment.summary
+        alpha = check_smallest(ALPHA_INSIDE, segment.t, entry.alpha_distance)
+        lines = super().assumptions(segment)
+        lines.append(with_status(summary, alpha, Status.ALPHA_INFEASIBLE))
+        if segment.t[0] == 0:
+            start = segment.terms.distance[:1, 1]
+            lines.append(check_smallest(START_SPEED_INSIDE, segment.t, start))
+        return lines
+
+    def lines(self, segment: Segment) -> list[Line]:
+        """The lines about every step of one segment."""
+        lines = [self._barriers_inequality(segment), *super().lines(segment)]
+        return [*lines, self._velocities_inside(segment)]
+
+    def _barriers_inequality(self, segment: Segment) -> Line:
+        """The inequality of the two barriers, at every step, for any kf and c."""
+        summary, terms = segment.summary, segment.terms
+        text = "(V1 + phi)' + decay of V1 and phi - s2 . M0^-1 f_tilde + c |s2|^2 <= 0"
+        statement = Statement("barriers", "(F.2)", text, "1/s")
+        reason = self.why_not_in_run(summary)
+        if reason:
+            return not_applicable(statement, reason)
+        tolerance, note = summary.eps * terms.size, self.exclusion_note(summary)
+        left = terms.claims[self.key].left
+        return check_steps(segment, statement, -left, tolerance, note=note)
+
+    def why_law_is_exact(self, summary: Summary) -> str:
+        """Why the proof drops no term of the law."""
+        return "the claim is exact: C0 q' is cancelled, and e2 weighed without M0"
+
+    def velocity_bound(self, case: int) -> Statement:
+        """The bound on the error of the velocity."""
+        text = "phi <= Vbar: |xi2_i| as the velocity barrier says"
+        return Statement("xi2, by phi", "(F.3)", text)
+
+    def sizes_along(self, segment: Segment) -> dict[str, np.ndarray]:
+        """What the bounds are about, by name."""
+        return super().sizes_along(segment) | {"xi2, by phi": np.abs(segment.terms.xi[:, 1])}
+
+    def bounds_along(
+        self, segment: Segment, V: np.ndarray, w_f: float = 1.0
+    ) -> dict[str, np.ndarray]:
+        """The bounds by name, with those on xi2 and e2 from phi."""
+        xi2 = along(segment, _xi2_bound, V, segment.sample.q, segment.sample.dq)
+        e2 = np.linalg.norm(xi2 * segment.terms.claims[self.key].bound, axis=1)
+        return super().bounds_along(segment, V, w_f) | {"e2": e2, "xi2, by phi": xi2}
+
+    def why_no_bound(self, segment: Segment, name: str, bounds: dict[str, np.ndarray]) -> str:
+        """Why a bound does not follow from the envelope, "" if it does."""
+        reason = super().why_no_bound(segment, name, bounds)
+        if not reason and name == "xi2, by phi" and np.all(np.isnan(bounds[name])):
+            return "the velocity barrier states no bound on xi2 from phi"
+        return reason
+
+    def _velocities_inside(self, segment: Segment) -> Line:
+        """Every velocity inside its bounds, at every step."""
+        summary = segment.summary
+        statement = Statement("velocities inside", "(F.3)", "v_l < q' < v_u", "rad/s")
+        line = check_smallest(statement, segment.t, segment.terms.distance[:, 1])
+        line = with_status(summary, line, Status.VELOCITY_VIOLATED)
+        if self.case_of(summary) is None:
+            return observed_only(line, self.why_not_in_case(summary, summary.case))
+        return line
+
+
+MATCHED = Matched()
+
+
+@programs.jit(static_argnames="case")
+def rho_terms(
+    decay: jax.Array,
+    decay_phi: jax.Array,
+    c: jax.Array,
+    kf: jax.Array,
+    lambda_min: jax.typing.ArrayLike,
+    case: int,
+) -> jax.Array:
+    """The three terms of which rho is the least, (3,) [1/s].
+    (F.3)
+
+    Args:
+      decay, decay_phi: decay rates of V1 and of phi, (n,) each [1/s].
+      c: gain of the slope s2, (n,).
+      kf: gain of the observer, (n,) [1/s].
+      lambda_min: smallest eigenvalue of M0, () [kg m^2].
+      case: 1 for f' = 0, 2 for bounded f'.
+    """
+    coupling = 0.25 / (jnp.min(c) * lambda_min**2)  # type: ignore[operator]
+    by_kf = 2.0 * (jnp.min(kf) - LOWEST[case] - coupling)
+    return jnp.stack([jnp.min(decay), jnp.min(decay_phi), by_kf])
+
+
+@programs.jit
+def _xi2_bound(
+    scenario: Scenario, t: jax.Array, q: jax.Array, dq: jax.Array, V: jax.Array
+) -> jax.Array | None:
+    """The velocity barrier's own bound on |xi2| where phi <= V, (T, n), or None if it states
+    none.
+    """
+    law: Any = unwrapped(scenario.controller)
+    barrier, weight = law.barriers[1], law.weights[1]
+
+    def at(t: jax.Array, q: jax.Array, dq: jax.Array, V: jax.Array) -> jax.Array | None:
+        x = jnp.stack([q, dq])
+        _, (_, inner) = law.levels(t, x, jnp.zeros_like(q), scenario.context, ())
+        return barrier.xi_bound(V / weight, inner)  # type: ignore[no-any-return]
+
+    return jax.vmap(at)(t, q, dq, V)
+
+
+def _levels(point: TorquePoint) -> tuple[list[Level], list[Tube]]:
+    """What each level of the law computes, and its tube."""
+    context = inner_context(point.scenario, point.state.controller)
+    f_hat = point.now["disturbance_estimate"]
+    return point.law.levels(point.t, point.x, f_hat, context, ())  # type: ignore[no-any-return]

@@ -1,0 +1,393 @@
+"""One run as a certificate uses it: extremes over the whole run, the constants of its claims, and
+the envelope of V along it.
+
+A claim V' <= -rho V + g integrates to
+
+    V(t) <= V(s) exp(-rho (t - s)) + rho2/rho   for t >= s,                (3.20), (3.28), (S.4)
+
+from any instant s on, with rho2 = sup g along the run.  Where d jumps, and after instants that the
+claim excludes, the envelope starts again at the next step.
+
+A run is not the exact solution.  The envelope is therefore widened by the integrator's own error in
+V (`reconstruction.terms_along`), which decays at the rate of the claim, and by rounding, so that V
+can be followed down to the level of its noise.
+
+`summarise` reads all steps, whatever the run recorded, twice: rho and rho2 are known after the
+first pass only.  The steps of a short run are kept in between; those of a long one are
+reconstructed again, so that memory stays bounded.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Iterator, Sequence
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from iblf_jax.certificates.eigenvalues import Extremes, eigenvalues_over
+from iblf_jax.certificates.reconstruction import (
+    Steps,
+    TimeGrid,
+    check_status,
+    is_valid,
+    steps_of,
+    time_grid,
+)
+from iblf_jax.certificates.terms import rounding
+from iblf_jax.control.controllers import AdaptiveParameters, Backstepping, Saturated
+from iblf_jax.core.pytree import layers, unwrapped
+from iblf_jax.core.status import UNTRUSTED, describe
+from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.simulation.units import status_words
+
+if TYPE_CHECKING:
+    from iblf_jax.certificates.claims._base import Claim
+
+KEPT_STEPS = 100_000
+"""Largest number of steps that stay in memory between the two passes over a run."""
+ENERGY_ROUNDING = 32.0
+"""Rounding error of sqrt(2 V) in units of the last place, relative to the sizes of its terms."""
+
+
+class Decay(NamedTuple):
+    """The constants of a claimed decay, V_w' <= -rho V_w + gain |f'|^2; V_w is V for w_f = 1."""
+
+    rho: float
+    """[1/s]."""
+    rho2: float
+    """Largest further term along the run."""
+    w_f: float = 1.0
+    """Weight of |f_tilde|^2 in the Lyapunov function."""
+    gain: float = 0.0
+    """In case 2; case 1 has no f'."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Summary:
+    """Quantities of a whole run, and the claims about its scenario."""
+
+    run: Any
+    """The Rollout, its arrays on the host."""
+    claims: tuple[Claim, ...]
+    extrema: Extrema
+    """Over all steps."""
+    duration: float
+    """[s]."""
+
+    @cached_property
+    def law(self) -> Any:
+        """The law without its wrappers (limits of the input)."""
+        return unwrapped(self.run.scenario.controller)
+
+    @cached_property
+    def eps(self) -> float:
+        """Relative error attributed to rounding."""
+        return rounding(self.run.q.dtype)
+
+    @cached_property
+    def jumps(self) -> np.ndarray:
+        """Times within the run at which the uncertain term jumps [s]."""
+        jumps = np.sort(np.ravel(np.asarray(self.run.scenario.jump_times())))
+        return jumps[(jumps > 0) & (jumps <= self.duration)]
+
+    @cached_property
+    def why_invalid(self) -> str:
+        """Why nothing can be claimed about this run; "" if something can."""
+        if is_valid(self.run):
+            return ""
+        words = status_words(self.run.scenario)
+        return f"the run is not valid: {describe(int(self.run.status) & int(UNTRUSTED), words)}"
+
+    @property
+    def samples(self) -> int:
+        """Number of samples, one for each step and one for the last instant."""
+        return self.extrema.samples
+
+    @property
+    def excluded(self) -> int:
+        """Number of samples that the claims exclude."""
+        return self.extrema.excluded
+
+    @cached_property
+    def why_excluded(self) -> str:
+        """What excludes samples from the claims, in words."""
+        return why_excluded(self.run.scenario)
+
+    def exclusion_note(self, of_alpha: str = "{}") -> str:
+        """Which samples the claims exclude, in words, with what a virtual control adds to the
+        reason {}; "" if none is.
+        """
+        if not self.excluded:
+            return ""
+        why = of_alpha.format(self.why_excluded)
+        return f"{self.excluded} of {self.samples} samples are excluded: {why}"
+
+    def restart_note(self, term: str) -> str:
+        """Where the claims start again because the uncertain term jumps, in words; "" if it does
+        not.
+        """
+        if not self.jumps.size:
+            return ""
+        times = ", ".join(f"{x:.4g}" for x in self.jumps)
+        return f"{term} jumps at t = {times} s, and the claim starts again there"
+
+    @cached_property
+    def over_box(self) -> Extremes:
+        """Extreme eigenvalues of M0 over the admissible box of positions."""
+        extrema = self.extrema
+        return eigenvalues_over(self.run.scenario.model, extrema.low, extrema.high)
+
+    @cached_property
+    def case(self) -> int:
+        """1 if f' = 0, else 2."""
+        return 1 if self.extrema.steady else 2
+
+    @property
+    def F_d(self) -> float:
+        """Largest |f'| [N m/s]; 0 in case 1."""
+        return 0.0 if self.case == 1 else float(self.extrema.dd)
+
+    @cached_property
+    def constants(self) -> dict[str, Any]:
+        """Key of a claim -> its numbers for this run."""
+        return {claim.key: claim.constants(self) for claim in self.claims}
+
+    @cached_property
+    def decays(self) -> dict[tuple[str, int], Decay]:
+        """The constants of every claimed decay, by key of the claim and case."""
+        return {
+            (claim.key, case): decay
+            for claim in self.claims
+            for case, decay in claim.decays(self).items()
+        }
+
+
+def why_excluded(scenario: Scenario) -> str:
+    """What excludes instants from the claims about the law inside its wrappers, in words."""
+    changing = []
+    for law in layers(scenario.controller)[:-1]:
+        if law.has_auxiliary:
+            changing.append(f"the auxiliary state of {type(law).__name__}")
+        elif not isinstance(law, Saturated | AdaptiveParameters):
+            changing.append(type(law).__name__)
+    reason = "the guard or a limit of the input was active"
+    if not changing:
+        return reason
+    inner = type(unwrapped(scenario.controller)).__name__
+    return f"{reason}, or {' or '.join(changing)} changed the input of {inner}"
+
+
+class Envelope(NamedTuple):
+    """The bound on V along a segment, (T,) each; NaN where nothing is claimed."""
+
+    bound: np.ndarray
+    tolerance: np.ndarray
+    """Error of the bound by rounding and by the integrator."""
+
+
+class Segment(NamedTuple):
+    """Consecutive steps of a run, and the envelopes along them."""
+
+    summary: Summary
+    t: np.ndarray
+    sample: Any
+    terms: Any
+    """`Terms` of NumPy arrays at each step."""
+    recorded: np.ndarray
+    envelopes: dict[tuple[str, int], Envelope]
+    """By key of the claim and case."""
+
+
+def summarise(run: Any, claims: Sequence[Claim]) -> tuple[Summary, Iterator[Segment]]:
+    """The summary of one run, its arrays on the host, and its segments in order."""
+    grid, claims = time_grid(run), tuple(claims)
+    if grid.last <= KEPT_STEPS:
+        kept = list(steps_of(run, grid, claims))
+        summary = _summary(run, grid, claims, kept)
+        return summary, _segments(summary, kept)
+    summary = _summary(run, grid, claims, steps_of(run, grid, claims))
+    return summary, _segments(summary, steps_of(run, grid, claims))
+
+
+# --- first pass: extremes over all steps ---------------------------------------------------------
+
+
+class Extrema:
+    """Running extrema over the steps of a run.  NaN propagates.
+
+    Args:
+      root: sqrt(K2), (n,), of the law of Theorem 2; None for others.
+    """
+
+    def __init__(self, root: np.ndarray | None) -> None:
+        self.root = root
+        self.low: Any = np.inf
+        self.high: Any = -np.inf
+        self.bound_distance: Any = np.inf
+        self.d: Any = 0.0
+        """sup |d|: of a torque, or of each level, (r,)."""
+        self.dd: Any = 0.0
+        self.d_tilde: Any = 0.0
+        self.growth = 0.0
+        """sup max(g, 0) of (S.4)."""
+        self.lambda_min = np.inf
+        """Smallest eigenvalue of M0 along the run [kg m^2]."""
+        self.lambda_max = -np.inf
+        self.mu = np.inf
+        """Smallest eigenvalue of M0^-1 K2 along the run [1/s]."""
+        self.steady = True
+        """Whether f' = 0 at every step."""
+        self.samples = 0
+        self.excluded = 0
+        self.V_start = np.nan
+        self.V_end = np.nan
+        self.half_square_start = np.nan
+        """1/2 |f_tilde(0)|^2."""
+
+    def add(self, steps: Steps) -> None:
+        """Updates the extrema with some steps."""
+        sample, terms = steps.sample, steps.terms
+        if self.samples == 0:
+            self.V_start = terms.V[0]
+            self.half_square_start = 0.5 * np.sum(terms.d_tilde[0] ** 2)
+        self.V_end = terms.V[-1]
+        self.low = np.minimum(self.low, sample.lower.min(axis=0))
+        self.high = np.maximum(self.high, sample.upper.max(axis=0))
+        self.bound_distance = np.minimum(self.bound_distance, terms.distance[:, 0].min())
+        self.d = np.maximum(self.d, _largest(terms.d))
+        self.d_tilde = np.maximum(self.d_tilde, _largest(terms.d_tilde))
+        self.samples += steps.t.size
+        self.excluded += int(terms.excluded.sum())
+        if "torque" in terms.claims:
+            self._add_torque(terms, terms.claims["torque"])
+        if "levels" in terms.claims:
+            growth = np.where(terms.excluded, 0.0, terms.claims["levels"].growth)
+            self.growth = np.maximum(self.growth, growth.max())
+
+    def _add_torque(self, terms: Any, torque: Any) -> None:
+        """Updates the extrema of claims about a torque."""
+        self.dd = np.maximum(self.dd, _largest(terms.dd))
+        self.steady = self.steady and bool(torque.steady.all())
+        M0 = np.asarray(torque.M0)
+        eigenvalues = _eigenvalues(M0)
+        self.lambda_min = np.minimum(self.lambda_min, eigenvalues[:, 0].min())
+        self.lambda_max = np.maximum(self.lambda_max, eigenvalues[:, -1].max())
+        if self.root is None:
+            self.mu = np.nan
+            return
+        scaled = M0 / (self.root[:, None] * self.root[None, :])
+        self.mu = np.minimum(self.mu, (1.0 / _eigenvalues(scaled)[:, -1]).min())
+
+
+def _largest(values: np.ndarray) -> np.ndarray:
+    """Largest norm over time: of a torque, (), or of each level, (r,)."""
+    return np.linalg.norm(values, axis=-1).max(axis=0)  # type: ignore[no-any-return]
+
+
+def _eigenvalues(matrices: np.ndarray) -> np.ndarray:
+    """Eigenvalues of symmetric matrices, ascending, (T, n); NaN where a matrix is not finite, for
+    which NumPy would raise.
+    """
+    finite = np.all(np.isfinite(matrices), axis=(1, 2), keepdims=True)
+    unit = np.eye(matrices.shape[-1])
+    return np.where(finite[..., 0], np.linalg.eigvalsh(np.where(finite, matrices, unit)), np.nan)
+
+
+def _summary(
+    run: Any, grid: TimeGrid, claims: tuple[Claim, ...], all_steps: Iterable[Steps]
+) -> Summary:
+    """Extremes over all steps, and the constants that follow from them."""
+    law = unwrapped(run.scenario.controller)
+    root = np.asarray(law.K2**0.5) if isinstance(law, Backstepping) else None
+    extrema = Extrema(root)
+    for steps in all_steps:
+        extrema.add(steps)
+    if is_valid(run):
+        check_status(run, float(extrema.bound_distance))
+    return Summary(run, claims, extrema, grid.duration)
+
+
+# --- second pass: envelopes ----------------------------------------------------------------------
+
+
+class _Anchor(NamedTuple):
+    """Start of an envelope, passed from one segment to the next."""
+
+    t: float
+    """[s]."""
+    V: float
+    noise: float
+    carried: float
+    """Error of the integrator since then, at the first step of the next segment."""
+
+
+def _segments(summary: Summary, all_steps: Iterable[Steps]) -> Iterator[Segment]:
+    """The segments, with the envelopes that run through them."""
+    decays = summary.decays
+    anchors: dict[tuple[str, int], _Anchor] = {}
+    # The last step of the segment before decides whether an envelope starts again.
+    last_t, last_excluded = np.zeros(0), np.zeros(0, bool)
+    for steps in all_steps:
+        t, excluded = steps.t, steps.terms.excluded
+        starts = restarts(np.append(last_t, t), np.append(last_excluded, excluded), summary.jumps)
+        starts = starts[last_t.size :]
+        last_t, last_excluded = t[-1:], excluded[-1:]
+        envelopes = {}
+        for key, decay in decays.items():
+            envelopes[key], anchors[key] = _envelope(
+                float(summary.run.dt), decay, steps, starts, anchors.get(key)
+            )
+        yield Segment(summary, t, steps.sample, steps.terms, steps.recorded, envelopes)
+
+
+def restarts(t: np.ndarray, excluded: np.ndarray, jumps: np.ndarray) -> np.ndarray:
+    """The samples at which the envelope starts, (T,) bool: the first, those after a jump, and those
+    after an excluded one.
+    """
+    jumps_until = np.searchsorted(jumps, t, side="right")
+    after_jump = jumps_until[1:] > jumps_until[:-1]
+    return np.concatenate([[True], after_jump | excluded[:-1]])
+
+
+def weighted_lyapunov(terms: Any, w_f: float) -> np.ndarray:
+    """V_w with the weight w_f of f_tilde, (T,); V2 for w_f = 1."""
+    if w_f == 1.0:
+        return terms.V
+    return terms.V + (w_f - 1.0) * 0.5 * np.sum(terms.d_tilde**2, axis=1)
+
+
+def _envelope(
+    dt: float, claimed: Decay, steps: Steps, starts: np.ndarray, anchor: _Anchor | None
+) -> tuple[Envelope, _Anchor]:
+    """The envelope along some steps and its tolerance; NaN at excluded steps, and everywhere if the
+    rate is not positive.
+    """
+    t, terms, rho, w_f = steps.t, steps.terms, claimed.rho, claimed.w_f
+    V = weighted_lyapunov(terms, w_f)
+    eps = float(np.finfo(terms.V.dtype).eps)
+    # The rounding error of sqrt(2 V), and the error of the integrator in V over one step.
+    noise = ENERGY_ROUNDING * eps * terms.sqrt_V_size * max(1.0, w_f) ** 0.5
+    defects = steps.defect + abs(w_f - 1.0) * steps.defect_f
+    if anchor is None:
+        anchor = _Anchor(t[0], V[0], noise[0], 0.0)
+    # Index of the step at which the envelope started, plus 1; 0 for one before these steps.
+    start = np.maximum.accumulate(np.where(starts, np.arange(1, t.size + 1), 0))
+    start_t = np.append(anchor.t, t)[start]
+    start_V = np.append(anchor.V, V)[start]
+    start_noise = np.append(anchor.noise, noise)[start]
+    # The integrator's errors accumulate and decay at the claimed rate.
+    decay = np.exp(-max(rho, 0.0) * dt)
+    errors, carried = [], anchor.carried
+    for restart, defect in zip(starts.tolist(), defects.tolist(), strict=True):
+        errors.append(0.0 if restart else carried)
+        carried = decay * errors[-1] + defect
+    after = _Anchor(start_t[-1], start_V[-1], start_noise[-1], carried)
+    if not rho > 0:
+        unclaimed = np.full(t.size, np.nan)
+        return Envelope(unclaimed, unclaimed), after
+    bound = start_V * np.exp(-rho * (t - start_t)) + claimed.rho2 / rho
+    bound = np.where(terms.excluded, np.nan, bound)
+    widened = np.sqrt(2 * (bound + np.asarray(errors))) + start_noise + noise
+    return Envelope(bound, 0.5 * widened**2 - bound), after
