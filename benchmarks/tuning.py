@@ -867,9 +867,9 @@ def compare_starts(name: str, quick: bool, count: int) -> list[Any]:
         )
         search = _tune.search_of(moved, ij.tuning.SQP(), "forward", EFFORTS["normal"])
         search.run(EFFORTS["normal"].iterations)
-        violation, objective = search.state["incumbent_key"]
+        violation, objective = search.state.incumbent_key
         found.append(np.inf if violation > 0 else float(objective))
-        evaluations.append(int(search.state["evaluations"]))
+        evaluations.append(search.state.evaluations)
     best = min(found)
     if not np.isfinite(best):
         return [name, best, f"0 of {count}", np.nan, np.nan, float(np.mean(evaluations)), 0]

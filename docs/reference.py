@@ -18,7 +18,7 @@ PAGES: dict[str, tuple[str, str]] = {
     "runs": (
         "Scenarios and runs",
         (
-            "Scenario Initial Bounds Sampling EventTrigger with_parts simulate Rollout Metrics"
+            "Scenario Initial Bounds Sampling EventTrigger with_parts simulate Runs Rollout Metrics"
             " Status SimulationError SimulationWarning parameters with_parameters recommended_dt"
             " recommended_period vector_field VectorField explain component leaf Leaf static astype"
         ),

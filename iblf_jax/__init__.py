@@ -29,6 +29,7 @@ from iblf_jax.core.pytree import leaf as leaf
 from iblf_jax.core.pytree import static as static
 from iblf_jax.core.status import Status as Status
 from iblf_jax.engine.explain import explain as explain
+from iblf_jax.engine.runs import Runs as Runs
 from iblf_jax.engine.simulate import SimulationError as SimulationError
 from iblf_jax.engine.simulate import SimulationWarning as SimulationWarning
 from iblf_jax.engine.simulate import simulate as simulate

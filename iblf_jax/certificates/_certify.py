@@ -29,6 +29,7 @@ from iblf_jax.core import checks, notices
 from iblf_jax.core.progress import announced
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.status import Status, has_flag
+from iblf_jax.engine import takes_runs
 from iblf_jax.engine.simulate import SimulationWarning, simulate
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical, with_history, with_parts
@@ -64,6 +65,7 @@ AT_CHECKS = "measured; it holds at the instants at which the condition of the tr
 
 @notices.each_warning_once
 @announced("checking the conditions of the theorem along a run")
+@takes_runs
 def certify(
     scenario: Scenario,
     run: Any = None,
@@ -102,7 +104,7 @@ def certify(
       scenario: the scenario.
       run: a `Rollout` of it (one run or a batch), or a study (with `replay(i)`, `metrics`, `len`),
         whose runs that were not made are ignored; simulated here if not given.
-      duration, dt, method: of the simulation, if `run` is not given [s].
+      duration, dt, method, runs_as: of the simulation, if `run` is not given [s].
       worst: of a study, check this many runs, those nearest to their bounds; None for all.
 
     Returns:

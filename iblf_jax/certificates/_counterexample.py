@@ -26,8 +26,7 @@ nothing is claimed (the guard or a torque limit is active), are no counterexampl
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Mapping
 
 import jax
 import jax.numpy as jnp
@@ -45,7 +44,8 @@ from iblf_jax.simulation.closed_loop import initial_state
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.distributions import Perturbation
-from iblf_jax.studies.perturbation_cube import unit_cube
+from iblf_jax.studies.perturbation_cube import Cube, unit_cube
+from iblf_jax.studies.worst import Losses, WorstCase, search
 
 EXCLUDED = "The guard or a torque limit is active at the start, where nothing is claimed."
 
@@ -114,12 +114,11 @@ def counterexample(
     seed = checks.positive_integer("seed", seed, least=0, most=2**32 - 1)
     cube = unit_cube(scenario, perturbations, signs=False)
     checks.fits_memory("starts", starts, 8.0 * 2 * cube.size)
-    search = _Search(scenario, cube)
-    for point in cube.admissible_points(starts, seed, search.why_unusable):
-        search.ascend(point)
-    values = search.values(search.best_point)
+    problem = WorstCase(cube, _losses_of(scenario, cube), starts, (seed,), EXCLUDED)
+    worst = search(problem, _ascend)
+    values = cube.values(jnp.asarray(worst.u, scenario.initial.q.dtype))
     found = {path: np.asarray(value) for path, value in values.items()}
-    return Counterexample(with_parameters(scenario, found), found, search.best_growth)
+    return Counterexample(with_parameters(scenario, found), found, -worst.loss)
 
 
 def _check_claimed(scenario: Scenario) -> None:
@@ -131,50 +130,38 @@ def _check_claimed(scenario: Scenario) -> None:
         raise checks.fail("scenario", got, "a scenario with a claim", f"{reason}.")
 
 
-class _Search:
-    """Ascents over the unit cube of the perturbations, and the best point of all of them."""
+def _losses_of(scenario: Scenario, cube: Cube) -> Callable[[np.ndarray], Losses]:
+    """The function of a point u, (1, d), with -g and its gradient; infinite where the claim
+    excludes the start.
+    """
 
-    def __init__(self, scenario: Scenario, cube: Any) -> None:
-        self.cube = cube
-        self.dtype = scenario.initial.q.dtype
-        self.best_growth = -np.inf
-        self.best_point = np.zeros(0)
-        self._growth = jax.jit(
-            jax.value_and_grad(
-                lambda u: _growth(with_parameters(scenario, cube.values(u))), has_aux=True
-            )
-        )
+    def growth_at(u: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return _growth(with_parameters(scenario, cube.values(u)))
 
-    def values(self, point: np.ndarray) -> dict[str, jax.Array]:
-        """Path -> value at a point of the cube."""
-        return self.cube.values(jnp.asarray(point, self.dtype))
+    growth = jax.jit(jax.value_and_grad(growth_at, has_aux=True))
 
-    def evaluate(self, point: np.ndarray) -> tuple[str, float, np.ndarray]:
-        """Why a point is unusable ("" if it is usable), and g and its gradient there; the best
-        point is kept.
-        """
-        why = self.cube.why_inadmissible(point)
-        if why:
-            return why, -np.inf, np.zeros(self.cube.size)
-        (g, excluded), gradient = self._growth(jnp.asarray(point, self.dtype))
-        if excluded or not np.isfinite(g):
-            return EXCLUDED, -np.inf, np.zeros(self.cube.size)
-        if float(g) > self.best_growth:
-            self.best_growth, self.best_point = float(g), point.copy()
-        return "", float(g), np.asarray(gradient)
+    def losses(u: np.ndarray) -> Losses:
+        (g, excluded), gradient = growth(jnp.asarray(u[0], scenario.initial.q.dtype))
+        loss = np.inf if excluded or not np.isfinite(g) else -float(g)
+        return Losses(np.array([loss]), -np.asarray(gradient)[None], np.asarray([excluded]))
 
-    def why_unusable(self, point: np.ndarray) -> str:
-        """Why a point is unusable; "" if it is usable."""
-        return self.evaluate(point)[0]
+    return losses
 
-    def ascend(self, start: np.ndarray) -> None:
-        """Ascends from one point. Unusable points have a constant value below that of the start,
-        from which the line search turns back.
-        """
-        floor = self.evaluate(start)[1] - 1.0
 
-        def value_and_gradient(point):
-            why, g, gradient = self.evaluate(point)
-            return (floor if why else g), gradient
+def _ascend(problem: WorstCase) -> None:
+    """Ascends from each starting point. Points that are not usable have a constant value below that
+    of the start, from which the line search turns back.
+    """
+    size = problem.cube.size
+    for start in problem.points():
+        floor = -problem(start[None]).values[0] - 1.0
 
-        maximise(value_and_gradient, start, np.zeros(self.cube.size), np.ones(self.cube.size))
+        def value_and_gradient(u: np.ndarray, floor: float = floor) -> tuple[float, np.ndarray]:
+            if problem.cube.why_inadmissible(u):
+                return floor, np.zeros(size)
+            found = problem(u[None])
+            if not np.isfinite(found.values[0]):
+                return floor, np.zeros(size)
+            return -found.values[0], -found.gradients[0]
+
+        maximise(value_and_gradient, start, np.zeros(size), np.ones(size))

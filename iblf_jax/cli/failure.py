@@ -23,7 +23,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the arguments of the command."""
     parser.add_argument("file", metavar="FAILURE.toml", help="the file")
     parser.add_argument(
-        "--method", metavar="NAME", help="subset, importance or monte_carlo (default: the file's)"
+        "--estimator",
+        metavar="NAME",
+        help="subset, importance or monte_carlo (default: the file's)",
     )
     parser.add_argument(
         "--runs", type=int, metavar="N", help="number of runs (default: the file's, else chosen)"
@@ -41,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
         from iblf_jax.tuning import failure_probability
 
         file = load_study_file(args.file, "failure")
-        options = file.options | given_options(args, "method", "runs", "seed") | execution
+        options = file.options | given_options(args, "estimator", "runs", "seed") | execution
         found = failure_probability(file.scenario, file.perturbations, **options)
         print(repr(found))
         write_netcdf(found.to_xarray(), args.out)

@@ -29,6 +29,8 @@ from iblf_jax.engine.outcome import Outcome as Outcome
 from iblf_jax.engine.registry import uses_host_compiler as uses_host_compiler
 from iblf_jax.engine.request import RunRequest as RunRequest
 from iblf_jax.engine.request import check_backend as check_backend
+from iblf_jax.engine.runs import Runs as Runs
+from iblf_jax.engine.runs import takes_runs as takes_runs
 from iblf_jax.engine.simulate import run_rollout as run_rollout
 from iblf_jax.engine.sizes import STUDY_MEMORY as STUDY_MEMORY
 from iblf_jax.engine.sizes import block_size as block_size

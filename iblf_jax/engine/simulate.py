@@ -19,6 +19,7 @@ from iblf_jax.engine.diagnosis import SimulationError as SimulationError
 from iblf_jax.engine.diagnosis import SimulationWarning as SimulationWarning
 from iblf_jax.engine.diagnosis import report
 from iblf_jax.engine.request import RunRequest
+from iblf_jax.engine.runs import Runs, takes_runs
 from iblf_jax.engine.single_run import run_one
 from iblf_jax.engine.transformable import run_transformable
 from iblf_jax.simulation.metrics import Fold, as_folds, metric_units
@@ -33,6 +34,7 @@ memory.  For two joints they take about 5 GB."""
 
 @notices.each_warning_once
 @announced("simulating; the first run of a structure compiles its programs")
+@takes_runs
 def simulate(
     scenario: Scenario,
     *,
@@ -72,6 +74,7 @@ def simulate(
         and differentiate everything that is recorded: increase `record_every` if metrics suffice.
       seed: seed of the noise of a sensor, of process noise and of random switching times; the run
         is run 0 of a study with this seed.
+      runs_as: an `ij.Runs`, in place of its fields.
 
     Returns:
       A `Rollout` with T = steps // record_every + 1 samples.
@@ -82,21 +85,18 @@ def simulate(
 
     Source: design of this package; the closed loop is Zhang & Yan 2024, section 3.
     """
-    steps = checks.whole_steps(duration, dt)
-    every = _checked_record(record_every, steps)
+    runs = Runs(duration, dt, method, backend, seed)
+    every = _checked_record(record_every, runs.steps)
     throw = checks.boolean("throw", throw)
-    seed = checks.seed(seed)
     scenario = fitted_to_step(canonical(scenario), dt)
-    request = RunRequest.of(
-        scenario, steps=steps, method=method, record_every=every, backend=backend
-    )
+    request = runs.request(scenario, record_every=every)
     step = jnp.asarray(dt, scenario.initial.q.dtype)
     folds = as_folds(metrics, step.dtype, scenario)
-    noise = noise_key(jax.random.PRNGKey(seed)) if has_noise(scenario) else None
+    noise = noise_key(jax.random.PRNGKey(runs.seed)) if has_noise(scenario) else None
     result = run_rollout(scenario, folds, step, request, noise)
     # Inside a transformation the status may be a number, while the metrics are traced.
     if checks.is_concrete(result) and result.status.ndim == 0:
-        report(result, steps, throw)
+        report(result, request.steps, throw)
     return result
 
 

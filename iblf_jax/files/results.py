@@ -123,6 +123,7 @@ RECORDS: dict[str, tuple[str, str]] = {
     "Risk": ("tuning.robust", "Risk"),
     "RobotMotion": ("deployment.ros2.robot_motion", "RobotMotion"),
     "Rollout": ("simulation.results", "Rollout"),
+    "Runs": ("engine.runs", "Runs"),
     "RunOptions": ("studies.options", "RunOptions"),
     "Sensitivity": ("studies.sensitivity", "Sensitivity"),
     "Status": ("core.status", "Status"),

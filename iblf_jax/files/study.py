@@ -10,8 +10,8 @@ A study file is a scenario file (`files.scenario`) with more tables:
     "initial.q" = { offset = "normal", mean = 0.0, std = 0.02 }
     [study]                       # Monte-Carlo: runs, seed, sampler, replicates
     runs = 10000
-    [failure]                     # or a probability of failure: method, runs, seed, margin, limit,
-    method = "subset"             # confidence
+    [failure]                     # or a probability of failure: estimator, runs, seed, margin,
+    estimator = "subset"          # limit, confidence
     [sweep]                       # or a sweep: also design, points, unit
     runs = 256
     [grid]                        # path -> values, or a perturbation in a random design
@@ -54,7 +54,7 @@ OPTIONS: dict[str, dict[str, type]] = {
     "study": {"runs": int, "seed": int, "sampler": str, "replicates": int},
 }
 OPTIONS["failure"] = {
-    "method": str,
+    "estimator": str,
     "runs": int,
     "seed": int,
     "margin": str,
@@ -76,8 +76,7 @@ class StudyFile(NamedTuple):
     perturbations: dict[str, Perturbation]
     grid: dict[str, Any]
     options: dict[str, Any]
-    """duration, dt, method, and the entries of [study], [sweep] or [failure]; `integrator` is the
-    method of [run] for a probability of failure."""
+    """duration, dt, method, and the entries of [study], [sweep] or [failure]."""
 
 
 def load_study_file(
@@ -119,10 +118,7 @@ def study_from_dict(
         if "duration" not in file.run:
             remedy = "Add [run] with duration = ..."
             raise missing("run.duration", "the length of a run [s]", remedy)
-        run = dict(file.run)
-        if kind == "failure" and "method" in run:
-            run["integrator"] = run.pop("method")
-        options = run | _options(data.get(kind), kind)
+        options = file.run | _options(data.get(kind), kind)
         perturbations = perturbations_of(data)
         grid = {}
         if kind == "sweep":

@@ -82,7 +82,7 @@ def level_curve(levels: tuple[Level, ...]) -> tuple[np.ndarray, np.ndarray]:
 
 def _draw_levels(axes: Axes, found: FailureProbability) -> None:
     axes.set_yscale("log")
-    if found.method != "importance":
+    if found.estimator != "importance":
         margins, probabilities = level_curve(found.levels)
         label = "P(margin $\\leq$ x)"
         axes.plot(margins, probabilities, color=_style.colour(0), label=label)

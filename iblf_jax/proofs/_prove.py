@@ -13,7 +13,6 @@ V_w = V with the weight w of the estimation error.  Three steps answer:
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import time
 import warnings
@@ -144,13 +143,40 @@ def prove(
     options = _Options.of(weight, max_boxes, threads, progress, checkpoint, runs, seed)
     level, parameters = _chosen(level, parameters)
     problem = problem_of(scenario, parameters, duration, disturbance_rate)
+    start = time.monotonic()
     with jax.enable_x64(True):
-        try:
-            proof = _decided(canonical(scenario), problem, dict(parameters), level, weight, options)
-        except UnsupportedError as error:
-            expected = "operations of the list in docs/how_to/prove.md"
-            raise checks.fail("prove: scenario", checks.Words(str(error)), expected) from error
-    return dataclasses.replace(proof, disturbance_rate=disturbance_rate)
+        scenario = canonical(scenario)
+        sampled = sample_weights(problem, level, weights_of(scenario, weight), options.seed)
+        best = min(sampled, key=lambda found: found.largest)
+        result, worst = None, None
+        if best.largest <= 0.0:
+            best, result = _searched(problem, level, sampled, best, options)
+            worst = result.worst
+        violation, verdict = None, Verdict.PROVED
+        if result is None or not result.proved:
+            violation = _refuted(problem, level, best, options.runs)
+            verdict = Verdict.NOT_PROVED if result is None else Verdict.UNDECIDED
+        if violation is not None:
+            verdict = Verdict.REFUTED
+        return Proof(
+            verdict=verdict,
+            scenario=scenario,
+            parameters=dict(parameters),
+            ranges=problem.uncertain.scales(),
+            level=level,
+            weight=best.weight,
+            duration=problem.duration,
+            is_period=problem.is_period,
+            boxes=0 if result is None else result.boxes,
+            done=0.0 if result is None else result.done,
+            seconds=time.monotonic() - start,
+            rates={found.weight: found.largest for found in sampled},
+            growth_points=_growth_points(problem, level, sampled),
+            worst_box=None if worst is None else _worst_box(problem, level, best.weight, worst),
+            violation=violation,
+            assumptions=problem.assumptions,
+            disturbance_rate=disturbance_rate,
+        )
 
 
 def _chosen(level: Any, parameters: Any) -> tuple[float, Mapping[str, Perturbation]]:
@@ -171,46 +197,6 @@ def _chosen(level: Any, parameters: Any) -> tuple[float, Mapping[str, Perturbati
         raise checks.fail("parameters", None, f"a mapping such as {EXAMPLE}", remedy)
     checks.mapping("parameters", parameters, EXAMPLE)
     return checks.positive_number("level", level, "the unit of V_w"), parameters
-
-
-def _decided(
-    scenario: Scenario,
-    problem: LevelSetProblem,
-    parameters: dict[str, Perturbation],
-    level: float,
-    weight: float | None,
-    options: _Options,
-) -> Proof:
-    """The three steps."""
-    start = time.monotonic()
-    sampled = sample_weights(problem, level, weights_of(scenario, weight), options.seed)
-    best = min(sampled, key=lambda found: found.largest)
-    if best.largest > 0.0:
-        result = None
-    else:
-        best, result = _searched(problem, level, sampled, best, options)
-    proved = result is not None and result.proved
-    violation = None if proved else _refuted(problem, level, best, options.runs)
-    verdict = _verdict(result, violation)
-    worst = None if result is None else result.worst
-    return Proof(
-        verdict=verdict,
-        scenario=scenario,
-        parameters=parameters,
-        ranges=dict(problem.scales),
-        level=level,
-        weight=best.weight,
-        duration=problem.duration,
-        is_period=problem.is_period,
-        boxes=0 if result is None else result.boxes,
-        done=0.0 if result is None else result.done,
-        seconds=time.monotonic() - start,
-        rates={found.weight: found.largest for found in sampled},
-        growth_points=_growth_points(problem, level, sampled),
-        worst_box=None if worst is None else _worst_box(problem, level, best.weight, worst),
-        violation=violation,
-        assumptions=problem.assumptions,
-    )
 
 
 class _Options(NamedTuple):
@@ -258,7 +244,9 @@ def problem_of(
     Raises:
       ValueError: it is not supported; the message says why.
     """
-    if not (isinstance(scenario, Scenario) and plants.is_chain(scenario.plant)):
+    if not isinstance(scenario, Scenario):
+        raise checks.fail("scenario", scenario, "a Scenario", "Make one with ij.presets.")
+    if not plants.is_chain(scenario.plant):
         return arm_problem(
             scenario, parameters, duration=duration, disturbance_rate=disturbance_rate
         )
@@ -388,17 +376,21 @@ def _search(
     checkpoint: str | PathLike | None,
 ) -> SearchResult:
     """The search at a weight."""
-    return search(
-        problem.bound,
-        problem.lower,
-        problem.upper,
-        problem.constants(weight, level),
-        patterns=problem.patterns,
-        max_boxes=max_boxes,
-        threads=options.threads,
-        progress=options.progress,
-        checkpoint=checkpoint,
-    )
+    try:
+        return search(
+            problem.bound,
+            problem.lower,
+            problem.upper,
+            problem.constants(weight, level),
+            patterns=problem.patterns,
+            max_boxes=max_boxes,
+            threads=options.threads,
+            progress=options.progress,
+            checkpoint=checkpoint,
+        )
+    except UnsupportedError as error:
+        expected = "operations of the list in docs/how_to/prove.md"
+        raise checks.fail("prove: scenario", checks.Words(str(error)), expected) from error
 
 
 def _worst_box(problem: LevelSetProblem, level: float, weight: float, found: Any) -> WorstBox:
@@ -407,7 +399,7 @@ def _worst_box(problem: LevelSetProblem, level: float, weight: float, found: Any
         name: (float(low), float(high))
         for name, low, high in zip(problem.names, found.lower, found.upper, strict=True)
     }
-    wide = [k for k, name in enumerate(problem.names) if _is_uncertain(problem, name)]
+    wide = [problem.names.index(name) for name in problem.uncertain.names]
     lower, upper = (np.tile(corner, (len(wide), 1)) for corner in (found.lower, found.upper))
     for row, k in enumerate(wide):
         lower[row, k] = upper[row, k] = 0.5 * (found.lower[k] + found.upper[k])
@@ -418,12 +410,6 @@ def _worst_box(problem: LevelSetProblem, level: float, weight: float, found: Any
         least = bounds[0].min(axis=1)
         narrowed = {problem.names[k]: float(x) for k, x in zip(wide, least, strict=True)}
     return WorstBox(intervals, float(found.bound), float(found.value), narrowed)
-
-
-def _is_uncertain(problem: LevelSetProblem, name: str) -> bool:
-    """Whether a coordinate is one of parameters."""
-    first = name.split(" and ")[0]
-    return first in problem.scales or first.startswith("disturbance_rate")
 
 
 # --- runs ----------------------------------------------------------------------------------------
@@ -465,13 +451,3 @@ def _run(scenario: Scenario, duration: float, dt: float) -> Rollout:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", SimulationWarning)
         return simulate(scenario, duration=steps * dt, dt=dt, record_every=steps)
-
-
-def _verdict(result: SearchResult | None, violation: Violation | None) -> Verdict:
-    if violation is not None:
-        return Verdict.REFUTED
-    if result is None:
-        return Verdict.NOT_PROVED
-    if result.proved:
-        return Verdict.PROVED
-    return Verdict.UNDECIDED

@@ -316,8 +316,8 @@ def decay_bound(constants: Constants, point: LevelPoint) -> jax.Array:
     """A lower bound of the decay of the barriers, ()."""
     parts = constants.parts
     exact = decay(parts, point.errors)
-    rate = parts.law.barrier.decay_rate(parts.law.k1)
-    return jnp.sum(jnp.maximum(exact, rate * point.energy))
+    claimed = parts.law.barrier.decay_rate(parts.law.k1) * point.energy  # type: ignore[operator]
+    return jnp.sum(jnp.maximum(exact, claimed))
 
 
 def arm_bound(places: Places, n: int, x: jax.Array, constants: Constants) -> jax.Array:

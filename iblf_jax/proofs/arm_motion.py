@@ -40,6 +40,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from iblf_jax.control import controllers
 from iblf_jax.core.linalg import inner, matvec
 from iblf_jax.proofs.forms import enclosed
 from iblf_jax.proofs.matrices import inverse
@@ -57,8 +58,8 @@ class ArmParts(NamedTuple):
     plant: Robot
     """With the parameters of `Uncertainty` at any value."""
     disturbance: Disturbance
-    law: Any
-    """`controllers.Backstepping` whose barrier has no guard."""
+    law: controllers.Backstepping
+    """Its barrier has no guard."""
     kf: jax.Array
     """Gain of the observer, (n,) [1/s]."""
     reference: Reference
@@ -172,7 +173,7 @@ def error_at(parts: ArmParts, t: jax.Array, energy: jax.Array, sign: jax.Array) 
     """The xi with the sign of `sign` at which w V1 = energy, (n,) [1]."""
     law, side = parts.law, side_of(parts, t, sign)
     scaled = energy / (law.weight * side.k ** degree(law.barrier))
-    return law.barrier.error_at(scaled, side.scaled, sign > 0)
+    return law.barrier.error_at(scaled, side.scaled, sign > 0)  # type: ignore[return-value]
 
 
 def along(function: Callable, point: tuple, rates: tuple) -> Any:

@@ -11,7 +11,7 @@ import functools
 import itertools
 import math
 from collections.abc import Mapping
-from typing import Any, NamedTuple, cast
+from typing import Any, ClassVar, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -21,48 +21,44 @@ from iblf_jax.control import controllers, observers
 from iblf_jax.core import checks
 from iblf_jax.core.linalg import matvec
 from iblf_jax.core.pytree import astype
-from iblf_jax.core.time import jump_times_of
 from iblf_jax.proofs import arm_motion, uncertainty
 from iblf_jax.proofs.arm_bound import Constants, arm_bound
 from iblf_jax.proofs.arm_motion import ArmParts, Errors, position
-from iblf_jax.proofs.examination import Examined, Operations, check_operations
 from iblf_jax.proofs.matrices import solve_transposed, upper_factor
 from iblf_jax.proofs.parameters import Uncertain, uncertain_coordinates
-from iblf_jax.proofs.periods import shifted
 from iblf_jax.proofs.problem import (
     LevelSetProblem,
     LevelState,
-    length_of_part,
-    patterns_of,
-    random_points,
+    OfStructure,
+    split_point,
 )
 from iblf_jax.proofs.support import (
     CONTINUOUS,
     INSTANTS,
     REAL_NUMBERS,
+    bounds_of,
     check_absent,
     check_exponential,
-    check_level,
     check_same_structure,
+    check_unchanging,
     claims_of,
+    examined,
     infinite_unless_defined,
+    operations_of_plant,
     time_interval,
+    unit_tube,
     unsupported,
+    without_guard,
 )
 from iblf_jax.proofs.uncertainty import Places
-from iblf_jax.proofs.users_barriers import check_barrier
-from iblf_jax.proofs.users_parts import (
-    BARRIERS,
-    agreement_of_robot,
-    check_constant,
-    check_time_functions,
-)
-from iblf_jax.simulation import paths
-from iblf_jax.simulation.scenario import Scenario, canonical
+from iblf_jax.proofs.users_parts import agreement_of_robot
+from iblf_jax.simulation.scenario import Initial, Scenario, canonical
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.world import plants
-from iblf_jax.world.bounds import Tube, tube_at
+from iblf_jax.world.bounds import tube_at
+from iblf_jax.world.disturbances import Disturbance
 from iblf_jax.world.references import WaypointSpline
+from iblf_jax.world.robots import Robot
 
 ASSUMPTIONS = (
     REAL_NUMBERS,
@@ -74,36 +70,23 @@ VECTORS = ("q", "dq", "f_tilde", "f_hat", "eta")
 """Vectors of a point in physical numbers, as in `LevelState`."""
 
 
-@dataclasses.dataclass(frozen=True)
-class ArmBound:
-    """The bound of arms of one structure, as a hashable function."""
-
-    structure: Any
-    places: Places
-    n: int
-    digests: tuple[str, ...]
-    """Of the functions that users wrote, so that a changed one has a program of its own."""
+class ArmBound(OfStructure):
+    """The bound of arms of one structure."""
 
     def __call__(self, x: jax.Array, constants: list[jax.Array]) -> tuple[jax.Array, jax.Array]:
         """Upper bounds of V_w' over a box, and no region."""
-        numbers = jax.tree.unflatten(self.structure, constants)
-        return arm_bound(self.places, self.n, x, numbers), jnp.zeros((0,))
+        numbers: Constants = jax.tree.unflatten(self.structure, constants)
+        n = numbers.parts.kf.shape[0]
+        return arm_bound(self.places, n, x, numbers), jnp.zeros((0,))
 
 
-@dataclasses.dataclass(frozen=True)
-class ArmRate:
-    """V_w' at a point of arms of one structure, as a hashable function."""
-
-    structure: Any
-    places: Places
-    n: int
-    digests: tuple[str, ...]
-    """Of the functions that users wrote, so that a changed one has a program of its own."""
+class ArmRate(OfStructure):
+    """V_w' at a point of arms of one structure."""
 
     def __call__(self, point: jax.Array, constants: list[jax.Array]) -> jax.Array:
         """V_w', () [N m rad/s]; infinite where the torque is not defined, such as log(-1)."""
-        numbers = jax.tree.unflatten(self.structure, constants)
-        found = point_of(self.places, self.n, jnp.asarray(point), numbers)
+        numbers: Constants = jax.tree.unflatten(self.structure, constants)
+        found = point_of(self.places, jnp.asarray(point), numbers)
         rate = arm_motion.level_rate(
             found.parts, numbers.weight, found.errors, found.f_tilde, found.rate
         )
@@ -121,14 +104,14 @@ class ArmPoint(NamedTuple):
     """Rate of the further disturbance, (n,) [N m/s]."""
 
 
-def point_of(places: Places, n: int, point: jax.Array, constants: Constants) -> ArmPoint:
+def point_of(places: Places, point: jax.Array, constants: Constants) -> ArmPoint:
     """The errors, f_tilde and the plant at a point (t, s, z).
 
     s/|s| = (sqrt(w V1/c) with the signs of e1, U^T e2/sqrt(2c), sqrt(w_f/(2c)) f_tilde).
     """
     parts, level = constants.parts, constants.level
-    t, s, z = point[0], point[1 : 1 + 3 * n], point[1 + 3 * n :]
-    s = s / jnp.sqrt(jnp.sum(s**2))
+    n = parts.kf.shape[0]
+    t, s, z = split_point(point, 3 * n)
     energy = level * s[:n] ** 2
     xi = arm_motion.error_at(parts, t, energy, s[:n])
     errors = Errors(t, xi, jnp.zeros(n))
@@ -145,90 +128,69 @@ def point_of(places: Places, n: int, point: jax.Array, constants: Constants) -> 
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class _Arm:
-    """The functions of a problem that need its numbers."""
+class ArmProblem(LevelSetProblem):
+    """The proof problem of an arm."""
 
-    scenario: Scenario
+    bound: ArmBound
     parts: ArmParts
-    uncertain: Uncertain
-    function: ArmBound
-    point_rate: ArmRate
-    duration: float
+    units: ClassVar[tuple[str, str]] = ("1/(N m)^2 N m rad", "N m rad")
+    first_barrier: ClassVar[str] = "barrier"
 
-    def constants(self, weight: float, level: float) -> list[np.ndarray]:
-        """The constants of a weight w_f and a level.
+    @property
+    def angles(self) -> list[tuple[str, float, float]]:
+        """The theta of V1, psi, and the phi of e2."""
+        n = self.signs
+        right, full = np.nextafter(0.5 * math.pi, 2.0), np.nextafter(2.0 * math.pi, 7.0)
+        theta = [(f"theta[{i}]", 0.0, right) for i in range(n)]
+        if n == 1:
+            return [*theta, ("psi", 0.0, 2.0 * right)]
+        ends = [*[2.0 * right] * (n - 2), full]
+        phi = [(f"phi[{i}]", 0.0, end) for i, end in enumerate(ends)]
+        return [*theta, ("psi", 0.0, right), *phi]
 
-        Raises:
-          ValueError: a weight that is not positive, or a level at which the guard of the barrier is
-            active.
-        """
-        weight = checks.positive_number("weight", weight, "1/(N m)^2 N m rad")
-        level = checks.positive_number("level", level, "N m rad")
-        self._check_level(level)
-        parts, numbers = self.parts, self.uncertain.numbers
-        leaves = [*jax.tree.leaves((parts, numbers)), weight, level]
-        return [np.asarray(x, float) for x in leaves]
+    @property
+    def signs(self) -> int:
+        """Number of joints: each e1 has a sign."""
+        return self.scenario.n
 
-    def _check_level(self, level: float) -> None:
-        """Raises ValueError if the level set reaches the guard of the barrier."""
-        law: Any = self.scenario.controller
+    @property
+    def terms(self) -> int:
+        """3 n: those of V1, of e2 and of f_tilde."""
+        return 3 * self.scenario.n
 
-        def xi_bound(t: jax.Array) -> jax.Array:
-            tube = tube_at(self.parts.reference, self.parts.bounds, t, acceleration=False)
-            return law.barrier.xi_bound(level / law.weight, tube)  # type: ignore[no-any-return]
-
-        check_level(level, xi_bound, law.barrier.guard, self.duration, "barrier")
-
-    def sample(self, seed: int, count: int) -> np.ndarray:
-        """Random points, (count, 1 + 3 n + m)."""
-        ends = (self.uncertain.low, self.uncertain.high)
-        return random_points(seed, count, self.duration, 3 * self.scenario.n, *ends)
+    def numbers(self, weight: float, level: float) -> Constants:
+        """The constants of a weight w_f and a level."""
+        numbers = jnp.asarray(weight), jnp.asarray(level)
+        return Constants(self.parts, self.uncertain.numbers, *numbers)
 
     def state_of(self, point: Any, constants: Any) -> LevelState:
         """A point in physical numbers."""
         with jax.enable_x64(True):
-            numbers = _physical(self.function, np.asarray(point, float), list(constants))
-            z = np.asarray(point)[1 + 3 * self.scenario.n :]
-            rates = self.function.places.rates
+            numbers = _physical(self.bound, np.asarray(point, float), list(constants))
             return LevelState(
                 t=float(numbers["t"]),
                 **{name: np.asarray(numbers[name]) for name in VECTORS},
-                parameters=self.uncertain.values(z),
-                rate=np.broadcast_to(np.asarray(numbers["rate"]), (rates,)),
+                parameters=self.uncertain.values(np.asarray(point)[1 + self.terms :]),
+                rate=np.broadcast_to(np.asarray(numbers["rate"]), (self.bound.places.rates,)),
             )
 
-    def scenario_at(self, point: Any, constants: Any) -> Scenario:
-        """The scenario whose run starts at a point, with its parameters and moved in time.
-
-        Raises:
-          ValueError: a part that cannot be moved in time.
-        """
-        state = self.state_of(point, constants)
-        scenario = paths.with_parameters(self.scenario, state.parameters)
-        initial = dataclasses.replace(scenario.initial, q=state.q, dq=state.dq)
-        observer: Any = scenario.observer
-        observer = dataclasses.replace(observer, eta0=state.eta, start="zero")
-        return dataclasses.replace(
-            scenario,
-            initial=initial,
-            observer=observer,
-            bounds=tuple(shifted(bounds, state.t) for bounds in scenario.bounds),
-            reference=shifted(scenario.reference, state.t),
-            disturbance=shifted(scenario.disturbance, state.t),
-        )
+    def initial(self, state: LevelState) -> Initial:
+        """Position and velocity of a state."""
+        return Initial(q=state.q, dq=state.dq)
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _physical(function: ArmBound, point: jax.Array, constants: list[jax.Array]) -> dict[str, Any]:
+def _physical(
+    bound: ArmBound, point: jax.Array, constants: list[jax.Array]
+) -> dict[str, jax.Array]:
     """Time, position, velocity, f_tilde, f_hat, eta and the further rate at a point."""
-    numbers = jax.tree.unflatten(function.structure, constants)
-    found = point_of(function.places, function.n, point, numbers)
+    found = point_of(bound.places, point, jax.tree.unflatten(bound.structure, constants))
     parts, errors = found.parts, found.errors
     now = arm_motion.motion(parts, errors, found.f_tilde).now
     f_hat = arm_motion.mismatch_torque(parts, now) - found.f_tilde
     eta = f_hat - parts.kf * matvec(parts.model.mass_matrix(now.q), now.v)
     vectors = dict(zip(VECTORS, (now.q, now.v, found.f_tilde, f_hat, eta), strict=True))
-    return {"t": errors.t, "rate": found.rate, **vectors}
+    return {"t": errors.t, "rate": jnp.asarray(found.rate), **vectors}
 
 
 def arm_problem(
@@ -237,7 +199,7 @@ def arm_problem(
     *,
     duration: float | None = None,
     disturbance_rate: Any = None,
-) -> LevelSetProblem:
+) -> ArmProblem:
     """The proof problem of a rigid arm under the corrected backstepping law.
 
     Args:
@@ -259,66 +221,28 @@ def arm_problem(
         uncertain = uncertain_coordinates(scenario, parameters, disturbance_rate)
         varying = {
             "reference": scenario.reference,
-            "bounds": scenario.bounds[0],
+            **bounds_of(scenario),
             "disturbance": scenario.disturbance,
         }
         length, is_period = time_interval(varying, duration, uncertain)
-        examined = _examined(scenario, parts, uncertain)
+        digests = _digests(parts, uncertain)
+        barriers = {"barrier": (parts.law.barrier, parts.law.o)}
+        found = examined(scenario, digests, agreement_of_robot, barriers, homogeneous=True)
         _check_tube(scenario, length)
         _check_mass_matrices(parts, uncertain)
         zero = jnp.zeros(())
         structure = jax.tree.structure(Constants(parts, uncertain.numbers, zero, zero))
-    n = scenario.n
-    function = ArmBound(structure, uncertain.places, n, tuple(examined.digests))
-    point_rate = ArmRate(structure, uncertain.places, n, tuple(examined.digests))
-    arm = _Arm(scenario, parts, uncertain, function, point_rate, length)
-    names, lower, upper = _coordinates(n, length, uncertain)
-    return LevelSetProblem(
-        names=names,
-        lower=lower,
-        upper=upper,
-        patterns=patterns_of(n, length),
-        bound=function,
-        constants=arm.constants,
-        point_rate=point_rate,
-        sample=arm.sample,
-        state_of=arm.state_of,
-        scenario_at=arm.scenario_at,
-        scales=uncertain.scales(),
-        duration=length,
-        is_period=is_period,
-        assumptions=(*ASSUMPTIONS, *claims_of([parts.law.barrier]), *examined.assumed),
-    )
-
-
-def _coordinates(
-    n: int, duration: float, uncertain: Uncertain
-) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
-    """Names and ends of the coordinates; ends of angles are rounded outward."""
-    right, full = np.nextafter(0.5 * math.pi, 2.0), np.nextafter(2.0 * math.pi, 7.0)
-    names = ["time since start", *(f"theta[{i}]" for i in range(n)), "psi"]
-    names += [f"phi[{i}]" for i in range(n - 1)]
-    lower = [0.0] * (2 * n + 1)
-    phi = [2.0 * right] * (n - 1)
-    if n > 1:
-        phi[-1] = full
-    psi = right if n > 1 else 2.0 * right
-    upper = [length_of_part(duration), *[right] * n, psi, *phi]
-    names += [*uncertain.names, *(f"side[{i}]" for i in range(n)), "start"]
-    return (
-        tuple(names),
-        np.concatenate([lower, uncertain.low]),
-        np.concatenate([upper, uncertain.high]),
-    )
+    of_structure = (structure, uncertain.places, tuple(found.digests))
+    assumptions = (*ASSUMPTIONS, *claims_of([parts.law.barrier]), *found.assumed)
+    functions = (ArmBound(*of_structure), ArmRate(*of_structure))
+    return ArmProblem(scenario, uncertain, *functions, length, is_period, assumptions, parts)
 
 
 # --- what is supported -------------------------------------------------------------------------
 
 
-def check_supported(scenario: Any) -> None:
+def check_supported(scenario: Scenario) -> None:
     """Raises ValueError, with the reason, for a scenario whose V_w' is not known here."""
-    if not isinstance(scenario, Scenario):
-        raise checks.fail("scenario", scenario, "a Scenario", "Make one with ij.presets.")
     _check_plant(scenario)
     _check_law(scenario.controller)
     observer = scenario.observer
@@ -343,10 +267,8 @@ def _check_plant(scenario: Scenario) -> None:
         if plants.is_chain(part):
             reason = "This bound is that of rigid arms."
             raise unsupported(name, type(part).__name__, "a robot", reason)
-        if jnp.size(jump_times_of(name, part)):
-            reason = "A load that is picked up changes the plant during the run."
-            raise unsupported(name, type(part).__name__, "a robot that does not change", reason)
-        check_constant(f"scenario.{name}", part)
+        reason = "A load that is picked up changes the plant during the run."
+        check_unchanging(name, part, "a robot that does not change", reason)
     expected = f"a robot of the structure of the plant, {type(scenario.plant).__name__}"
     check_same_structure(scenario, expected)
 
@@ -361,15 +283,14 @@ def _check_law(law: Any) -> None:
         reason = "The printed law leaves 1/2 e2^T M0' e2 in V_w', and its proof fails."
         raise unsupported("controller.reading", law.reading, '"corrected"', reason)
     check_exponential(law, "V_w'")
-    barrier = law.barrier
+    barrier, tube = law.barrier, unit_tube()
     zero, one = jnp.zeros(1), jnp.ones(1)
-    tube = Tube(zero, zero, -one, one, zero, zero)
-    known = barrier.error_at(zero, tube, zero > 0)
     claims = (
+        barrier.error_at(zero, tube, zero > 0),
         barrier.decay_rate(one),
         barrier.xi_bound(one, tube),
     )
-    if known is None or any(claim is None for claim in claims):
+    if any(claim is None for claim in claims):
         reason = "The level set needs the error at which V1 has a value, in closed form."
         expected = "a barrier with error_at, xi_bound and decay_rate"
         raise unsupported("controller.barrier", type(barrier).__name__, expected, reason)
@@ -396,59 +317,41 @@ def _check_absent(scenario: Scenario) -> None:
 
 def _parts_of(scenario: Scenario) -> ArmParts:
     """The parts of V_w', with a barrier without a guard."""
-    law: Any = copy.copy(scenario.controller)
-    barrier, observer = copy.copy(law.barrier), cast(Any, scenario.observer)
-    # The constructor refuses such a guard: only inside the guard is the barrier evaluated.
-    object.__setattr__(barrier, "guard", -math.inf)
-    object.__setattr__(law, "barrier", barrier)
+    law = cast(controllers.Backstepping, copy.copy(scenario.controller))
+    guard = jnp.asarray(law.barrier.guard)
+    object.__setattr__(law, "barrier", without_guard(law.barrier))
     zero = jnp.zeros(())
     return ArmParts(
-        scenario.model.at(zero),
-        scenario.plant.at(zero),
+        cast(Robot, scenario.model).at(zero),
+        cast(Robot, scenario.plant).at(zero),
         scenario.disturbance,
         law,
-        jnp.broadcast_to(observer.kf, (scenario.n,)),
+        jnp.broadcast_to(cast(observers.Momentum, scenario.observer).kf, (scenario.n,)),
         scenario.reference,
         scenario.bounds[0],
-        jnp.asarray(scenario.controller.barrier.guard),  # type: ignore[union-attr]
+        guard,
     )
 
 
-def _examined(scenario: Scenario, parts: ArmParts, uncertain: Uncertain) -> Examined:
-    """What is assumed of the parts of a scenario.
+def _digests(parts: ArmParts, uncertain: Uncertain) -> list[str]:
+    """The digests of plant and disturbance, with which f must not jump, and V_w with it."""
 
-    Raises:
-      ValueError: a part that may jump, or one that contradicts its contract.
-    """
-    digests = [_check_operations(parts, uncertain, scenario.n).digest]
-    sides = {f"bounds[0].{name}": vars(scenario.bounds[0])[name] for name in ("lower", "upper")}
-    in_time = check_time_functions(scenario.reference, sides, scenario.n)
-    if type(parts.law.barrier) not in BARRIERS:
-        name = "scenario.controller.barrier"
-        digests += check_barrier(
-            name, parts.law.barrier, parts.law.o, n=scenario.n, homogeneous=True
-        )
-    assumed = [*in_time.assumed, *agreement_of_robot(scenario.plant)]
-    return Examined(assumed, [*digests, *in_time.digests])
-
-
-def _check_operations(parts: ArmParts, uncertain: Uncertain, n: int) -> Operations:
-    """The operations of plant and disturbance, with which f must not jump, and V_w with it."""
-    places = uncertain.places
-    known = (parts.plant, parts.disturbance, parts.model)
-    leaves = jax.tree.leaves(known)
-    structure = jax.tree.structure(known)
-
-    def torque(t: jax.Array, q: jax.Array, v: jax.Array, a: jax.Array, *x: jax.Array) -> jax.Array:
-        plant, disturbance, model = jax.tree.unflatten(structure, x)
+    def torque(
+        t: jax.Array,
+        q: jax.Array,
+        v: jax.Array,
+        a: jax.Array,
+        plant: Robot,
+        disturbance: Disturbance,
+        model: Robot,
+    ) -> jax.Array:
         true = parts._replace(plant=plant, disturbance=disturbance, model=model)
         return arm_motion.required_torque(true, arm_motion.Kinematics(t, q, v, a))
 
-    vector = jnp.zeros(n)
+    vector = jnp.zeros(parts.kf.shape)
     inputs = [jnp.zeros(()), vector, vector, vector]
-    varying = [*range(4), *(4 + leaf for leaf in places.varying_leaves)]
-    name = "scenario.plant and disturbance"
-    return check_operations(name, torque, [*inputs, *leaves], varying, kinks=True)
+    known = (parts.plant, parts.disturbance, parts.model)
+    return [operations_of_plant(torque, inputs, known, uncertain).digest]
 
 
 def _check_tube(scenario: Scenario, duration: float) -> None:

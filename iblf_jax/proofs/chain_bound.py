@@ -52,7 +52,7 @@ class Constants(NamedTuple):
     """The numbers of a problem; a pytree."""
 
     parts: ChainParts
-    plant: Any
+    plant: plants.Plant
     disturbance: Disturbance
     numbers: Numbers
     weights: jax.Array
@@ -222,7 +222,7 @@ def _error(
 
     def next_error(e: jax.Array) -> jax.Array:
         tube = kind(zero, zero, -(k_l + slope * e), k_u - slope * e, zero, zero)
-        return barrier.error_at(value, tube, sign > 0)
+        return barrier.error_at(value, tube, sign > 0)  # type: ignore[return-value]
 
     if i == 0 and true.is_box:
         # Both widths of the first tube depend on the time: a mean-value form keeps their relation.
@@ -251,7 +251,7 @@ def _first_error(parts: ChainParts, value: jax.Array, sign: jax.Array, t: jax.Ar
         lower, upper = bounds_at(bounds, t, middle)
         zero = jnp.zeros(1)
         tube = OpenTube(zero, zero, lower - middle, upper - middle, zero, zero)
-        return parts.law.barriers[0].error_at(value, tube, sign > 0)
+        return parts.law.barriers[0].error_at(value, tube, sign > 0)  # type: ignore[return-value]
 
     c = centre(t)
     return error(c) + derivative(error)(t) * (t - c)

@@ -53,6 +53,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from iblf_jax.control import controllers
 from iblf_jax.control.barriers import Quadratic
 from iblf_jax.core import taylor
 from iblf_jax.proofs.arm_motion import along
@@ -68,9 +69,9 @@ Column = tuple[jax.Array, ...]
 class ChainParts(NamedTuple):
     """The parts of a scenario on which V' depends; a pytree."""
 
-    model: Any
-    law: Any
-    """`controllers.BarrierBackstepping` whose barriers have no guard."""
+    model: plants.Plant
+    law: controllers.BarrierBackstepping
+    """Its barriers have no guard."""
     kappa: jax.Array
     """Gain of the observer, (r, 1) [1/s]."""
     reference: Reference
@@ -82,7 +83,7 @@ class ChainParts(NamedTuple):
     @property
     def order(self) -> int:
         """Number of levels."""
-        return self.law.order  # type: ignore[no-any-return]
+        return self.law.order
 
 
 class OpenTube(Tube):
@@ -277,7 +278,7 @@ class LevelEquations:
         """
         law = self.parts.law
         barrier = law.barriers[i]
-        claimed = barrier.decay_rate(law.k[i]) * energy
+        claimed = barrier.decay_rate(law.k[i]) * energy  # type: ignore[operator]
         if barrier.exact_decay:
             return claimed
         return jnp.maximum(self.exact_decay(i, y), claimed)

@@ -9,7 +9,7 @@ import copy
 import dataclasses
 import math
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -18,10 +18,8 @@ import numpy as np
 from iblf_jax.control import controllers, observers
 from iblf_jax.control.barriers import Quadratic
 from iblf_jax.control.barriers._base import has_ratio
-from iblf_jax.core import checks
 from iblf_jax.core.families import is_default
 from iblf_jax.core.pytree import astype
-from iblf_jax.core.time import jump_times_of
 from iblf_jax.proofs import chain_motion
 from iblf_jax.proofs.chain_bound import (
     Constants,
@@ -32,40 +30,32 @@ from iblf_jax.proofs.chain_bound import (
     level_rate,
 )
 from iblf_jax.proofs.chain_motion import ChainParts
-from iblf_jax.proofs.examination import Examined, check_operations, operations
+from iblf_jax.proofs.examination import operations
 from iblf_jax.proofs.parameters import Uncertain, uncertain_coordinates
-from iblf_jax.proofs.periods import shifted
-from iblf_jax.proofs.problem import (
-    LevelSetProblem,
-    length_of_part,
-    patterns_of,
-    random_points,
-)
+from iblf_jax.proofs.problem import LevelSetProblem, OfStructure, split_point
 from iblf_jax.proofs.support import (
     CONTINUOUS,
     REAL_NUMBERS,
+    bounds_of,
     check_absent,
     check_exponential,
-    check_level,
     check_same_structure,
+    check_unchanging,
     claims_of,
+    examined,
     infinite_unless_defined,
+    operations_of_plant,
     time_interval,
+    unit_tube,
     unsupported,
+    without_guard,
 )
 from iblf_jax.proofs.uncertainty import Places
-from iblf_jax.proofs.users_barriers import check_barrier
-from iblf_jax.proofs.users_parts import (
-    BARRIERS,
-    agreement_of_plant,
-    check_constant,
-    check_time_functions,
-)
-from iblf_jax.simulation import paths
+from iblf_jax.proofs.users_parts import agreement_of_plant
 from iblf_jax.simulation.scenario import Initial, Scenario, canonical
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.world import plants
-from iblf_jax.world.bounds import Tube, tube_at
+from iblf_jax.world.disturbances import Disturbance
 
 ORDERS = (2, 3)
 """Numbers of levels for which the bound is small enough to be of use."""
@@ -77,33 +67,27 @@ ASSUMPTIONS = (
 )
 
 
-class ChainBound(NamedTuple):
-    """The bound of chains of one structure, as a hashable function."""
+@dataclasses.dataclass(frozen=True)
+class ChainBound(OfStructure):
+    """The bound of chains of one structure."""
 
-    structure: Any
-    places: Places
     observed: tuple[bool, ...]
-    digests: tuple[str, ...]
-    """Of the functions that users wrote, so that a changed one has a program of its own."""
 
     def __call__(self, x: jax.Array, constants: list[jax.Array]) -> tuple[jax.Array, jax.Array]:
         """Upper bounds of V' over a box, and no region."""
-        numbers = jax.tree.unflatten(self.structure, constants)
+        numbers: Constants = jax.tree.unflatten(self.structure, constants)
         return chain_bound(self.places, self.observed, x, numbers), jnp.zeros((0,))
 
 
-class ChainRate(NamedTuple):
-    """V' at a point of chains of one structure, as a hashable function."""
+@dataclasses.dataclass(frozen=True)
+class ChainRate(OfStructure):
+    """V' at a point of chains of one structure."""
 
-    structure: Any
-    places: Places
     observed: tuple[bool, ...]
-    digests: tuple[str, ...]
-    """Of the functions that users wrote, so that a changed one has a program of its own."""
 
     def __call__(self, point: jax.Array, constants: list[jax.Array]) -> jax.Array:
         """V', (); infinite where d is not defined."""
-        numbers = jax.tree.unflatten(self.structure, constants)
+        numbers: Constants = jax.tree.unflatten(self.structure, constants)
         true, found = point_of(self.places, self.observed, jnp.asarray(point), numbers)
         rate = level_rate(numbers, self.observed, true, found)
         return infinite_unless_defined(rate, jnp.stack(found.now.d))
@@ -116,11 +100,9 @@ def point_of(
     e_i, sqrt(v_i/(2c)) d_tilde_i).
     """
     order = len(observed)
-    terms = order + sum(observed)
-    t, s, z = point[0], point[1 : 1 + terms], point[1 + terms :]
-    shares = s / jnp.sqrt(jnp.sum(s**2))
+    t, shares, z = split_point(point, order + sum(observed))
     true = TruePlant(constants, places, z, is_box=False)
-    signs = jnp.where(s[:order] > 0, 1.0, -1.0)
+    signs = jnp.where(shares[:order] > 0, 1.0, -1.0)
     return true, level_point(constants, observed, true, t, list(shares), signs)
 
 
@@ -144,124 +126,95 @@ class ChainLevelState(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class _Chain:
-    """The functions of a problem that need its numbers."""
+class ChainProblem(LevelSetProblem):
+    """The proof problem of a plant in strict-feedback form."""
 
-    scenario: Scenario
+    bound: ChainBound
     parts: ChainParts
-    uncertain: Uncertain
-    observed: tuple[bool, ...]
-    structure: Any
-    duration: float
+    units: ClassVar[tuple[str, str]] = ("1", "energy")
+    first_barrier: ClassVar[str] = "first barrier"
+
+    @property
+    def angles(self) -> list[tuple[str, float, float]]:
+        """One fewer than terms of V.
+
+        Terms of d_tilde have both signs, and those of the barriers the signs of a pattern.
+        """
+        right, half = np.nextafter(0.5 * math.pi, 2.0), np.nextafter(math.pi, 4.0)
+        count, estimates = self.terms - 1, self.terms - self.signs
+        lower, upper = np.zeros(count), np.full(count, right)
+        if estimates == 1:
+            lower[-1] = -right
+        if estimates > 1:
+            upper[self.signs :] = half
+            lower[-1] = -half
+        return [(f"theta[{i}]", lower[i], upper[i]) for i in range(count)]
+
+    @property
+    def signs(self) -> int:
+        """Order of the plant: the error of each level has a sign."""
+        return self.parts.order
 
     @property
     def terms(self) -> int:
-        """Number of terms of V."""
-        return len(self.observed) + sum(self.observed)
+        """Number of levels and of estimates."""
+        return self.signs + sum(self.bound.observed)
 
-    @jax.enable_x64(True)
-    def constants(self, weight: float, level: float) -> list[np.ndarray]:
-        """The constants of a weight and a level.
-
-        Args:
-          weight: v_i = weight w_i s_i'(0)/(k_i kappa_i), a number without unit.
-          level: c, in the unit of w_i V_i.
-
-        Raises:
-          ValueError: a number that is not positive, or a level that reaches the guard of the first
-            barrier; the bound examines those of the other levels.
-        """
-        weight = checks.positive_number("weight", weight, "1")
-        level = checks.positive_number("level", level, "energy")
-        self._check_level(level)
-        weights = weight * self._scales_of_weights()
-        numbers = Constants(
+    def numbers(self, weight: float, level: float) -> Constants:
+        """The constants of a weight, with v_i = weight w_i s_i'(0)/(k_i kappa_i), and a level."""
+        return Constants(
             self.parts,
-            self.scenario.plant,
+            cast(plants.Plant, self.scenario.plant),
             self.scenario.disturbance,
             self.uncertain.numbers,
-            jnp.asarray(weights),
+            jnp.asarray(weight * self._scales_of_weights()),
             jnp.asarray(level),
         )
-        return [np.asarray(x, float) for x in jax.tree.leaves(numbers)]
-
-    def _check_level(self, level: float) -> None:
-        """Raises ValueError if the level set reaches the guard of the first barrier."""
-        law: Any = self.scenario.controller
-        barrier = law.barriers[0]
-        if isinstance(barrier, Quadratic):
-            return
-        value = level / self.parts.law.weights[0] * jnp.ones(1)
-
-        def xi_bound(t: jax.Array) -> jax.Array:
-            tube = tube_at(self.parts.reference, self.scenario.bounds[0], t, acceleration=False)
-            return barrier.xi_bound(value, tube)  # type: ignore[no-any-return]
-
-        check_level(level, xi_bound, barrier.guard, self.duration, "first barrier")
 
     def _scales_of_weights(self) -> np.ndarray:
         """w_i s_i'(0)/(k_i kappa_i) of each observed level at t = 0, 1 of the others, (r, 1)."""
-        law, order = self.parts.law, len(self.observed)
-        scales = np.ones((order, 1))
-        for i in range(order):
-            if not self.observed[i]:
-                continue
+        law = self.parts.law
+        scales = np.ones((self.signs, 1))
+        for i in np.flatnonzero(self.bound.observed).tolist():
             slope = _slope_at_centre(self.parts, i)
             gains = law.k[i] * self.parts.kappa[i]
             scales[i] = np.asarray(law.weights[i] * slope / gains)
         return scales
 
-    def sample(self, seed: int, count: int) -> np.ndarray:
-        """Random points, (count, 1 + terms + m)."""
-        ends = (self.uncertain.low, self.uncertain.high)
-        return random_points(seed, count, self.duration, self.terms, *ends)
-
+    @jax.enable_x64(True)
     def state_of(self, point: Any, constants: Any) -> ChainLevelState:
         """A point in physical numbers."""
-        with jax.enable_x64(True):
-            numbers = jax.tree.unflatten(self.structure, list(map(jnp.asarray, constants)))
-            _, found = point_of(
-                self.uncertain.places, self.observed, jnp.asarray(point, float), numbers
-            )
-            y = found.now.y
-            d_hat = np.stack(y.d_hat)
-            x = np.asarray(found.x)
-            return ChainLevelState(
-                float(y.t),
-                x,
-                np.asarray(found.u),
-                np.stack(found.now.d_tilde),
-                d_hat,
-                d_hat - np.asarray(self.parts.kappa) * x,
-                self.uncertain.values(np.asarray(point)[1 + self.terms :]),
-            )
-
-    def scenario_at(self, point: Any, constants: Any) -> Scenario:
-        """The scenario whose run starts at a point, with its parameters and moved in time."""
-        state = self.state_of(point, constants)
-        scenario = paths.with_parameters(self.scenario, state.parameters)
-        observer = scenario.observer
-        if isinstance(observer, observers.LevelObserver):
-            observer = dataclasses.replace(observer, eta0=state.eta, start="zero")
-        return dataclasses.replace(
-            scenario,
-            initial=Initial(x=state.x),
-            observer=observer,
-            bounds=tuple(shifted(bounds, state.t) for bounds in scenario.bounds),
-            reference=shifted(scenario.reference, state.t),
-            disturbance=shifted(scenario.disturbance, state.t),
+        numbers: Constants = jax.tree.unflatten(
+            self.bound.structure, list(map(jnp.asarray, constants))
         )
+        x = jnp.asarray(point, float)
+        _, found = point_of(self.uncertain.places, self.bound.observed, x, numbers)
+        y = found.now.y
+        d_hat = np.stack(y.d_hat)
+        return ChainLevelState(
+            t=float(y.t),
+            x=np.asarray(found.x),
+            u=np.asarray(found.u),
+            d_tilde=np.stack(found.now.d_tilde),
+            d_hat=d_hat,
+            eta=d_hat - np.asarray(self.parts.kappa) * np.asarray(found.x),
+            parameters=self.uncertain.values(np.asarray(point)[1 + self.terms :]),
+        )
+
+    def initial(self, state: ChainLevelState) -> Initial:
+        """All levels of a state."""
+        return Initial(x=state.x)
 
 
 def _slope_at_centre(parts: ChainParts, i: int) -> jax.Array:
     """s_i' at e_i = 0 and t = 0 in the tube around the middle of the bounds, (1,)."""
     zero, one = jnp.zeros(1), jnp.ones(1)
-    tube = Tube(zero, zero, -one, one, zero, zero)
+    tube = unit_tube()
     bounds = parts.bounds[i]
     if bounds is not None:
         lower, upper = (side.at(jnp.zeros(()), zero) for side in (bounds.lower, bounds.upper))
         half = 0.5 * (upper - lower) * one
-        tube = Tube(zero, zero, -half, half, zero, zero)
+        tube = tube._replace(lower=-half, upper=half)
     return chain_motion.along(lambda e: parts.law.barriers[i].slope(tube, e), (zero,), (one,))
 
 
@@ -270,7 +223,7 @@ def chain_problem(
     parameters: Mapping[str, Perturbation],
     *,
     duration: float | None = None,
-) -> LevelSetProblem:
+) -> ChainProblem:
     """The proof problem of a plant in strict-feedback form of order 2 or 3, with one number per
     level, under `controllers.BarrierBackstepping` with exact derivatives.
 
@@ -288,42 +241,29 @@ def chain_problem(
     with jax.enable_x64(True):
         scenario = canonical(astype(scenario, jnp.float64))
         parts = _parts_of(scenario)
+        law = parts.law
         uncertain = uncertain_coordinates(scenario, parameters, None)
-        length, is_period = time_interval(_varying(scenario), duration, uncertain)
-        examined = _examined(scenario, parts, uncertain)
+        varying = {
+            "reference": scenario.reference,
+            "disturbance": scenario.disturbance,
+            **bounds_of(scenario),
+        }
+        length, is_period = time_interval(varying, duration, uncertain)
+        gains = [None] * law.order if law.o is None else law.o
+        barriers = {
+            f"barriers[{i}]": pair for i, pair in enumerate(zip(law.barriers, gains, strict=True))
+        }
+        digests = _digests(scenario, uncertain)
+        found = examined(scenario, digests, agreement_of_plant, barriers, homogeneous=False)
+        observed = tuple(bool(gain > 0.0) for gain in np.asarray(parts.kappa)[:, 0])
+        true = (cast(plants.Plant, scenario.plant), scenario.disturbance)
         zero = jnp.zeros(())
-        numbers = Constants(
-            parts, scenario.plant, scenario.disturbance, uncertain.numbers, zero, zero
-        )
-        structure = jax.tree.structure(numbers)
-    observed = tuple(bool(gain > 0.0) for gain in np.asarray(parts.kappa)[:, 0])
-    chain = _Chain(scenario, parts, uncertain, observed, structure, length)
-    names, lower, upper = _coordinates(observed, length, uncertain)
-    order = len(observed)
-    digests = tuple(examined.digests)
-    function: Any = ChainBound(structure, uncertain.places, observed, digests)
-    point_rate: Any = ChainRate(structure, uncertain.places, observed, digests)
-    return LevelSetProblem(
-        names=names,
-        lower=lower,
-        upper=upper,
-        patterns=patterns_of(order, length),
-        bound=function,
-        constants=chain.constants,
-        point_rate=point_rate,
-        sample=chain.sample,
-        state_of=chain.state_of,  # type: ignore[arg-type]
-        scenario_at=chain.scenario_at,
-        scales=uncertain.scales(),
-        duration=length,
-        is_period=is_period,
-        assumptions=(
-            *ASSUMPTIONS,
-            *claims_of(parts.law.barriers),
-            *_without_claim(scenario),
-            *examined.assumed,
-        ),
-    )
+        structure = jax.tree.structure(Constants(parts, *true, uncertain.numbers, zero, zero))
+    of_structure = (structure, uncertain.places, tuple(found.digests), observed)
+    claims = (*claims_of(law.barriers), *_without_claim(scenario))
+    assumptions = (*ASSUMPTIONS, *claims, *found.assumed)
+    functions = (ChainBound(*of_structure), ChainRate(*of_structure))
+    return ChainProblem(scenario, uncertain, *functions, length, is_period, assumptions, parts)
 
 
 def _without_claim(scenario: Scenario) -> list[str]:
@@ -340,48 +280,22 @@ def _without_claim(scenario: Scenario) -> list[str]:
     return [f"Nothing is claimed about the bounds of {names}: a Quadratic barrier has none."]
 
 
-def _coordinates(
-    observed: tuple[bool, ...], duration: float, uncertain: Uncertain
-) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
-    """Names and ends of the coordinates; ends of angles are rounded outward."""
-    order, estimates = len(observed), sum(observed)
-    right, half = np.nextafter(0.5 * math.pi, 2.0), np.nextafter(math.pi, 4.0)
-    count = order + estimates - 1
-    lower, upper = np.zeros(count), np.full(count, right)
-    # Terms of d_tilde have both signs, and those of the barriers the signs of a pattern.
-    if estimates == 1:
-        lower[-1] = -right
-    if estimates > 1:
-        upper[order:] = half
-        lower[-1] = -half
-    names = ["time since start", *(f"theta[{i}]" for i in range(count)), *uncertain.names]
-    names += [*(f"side[{i}]" for i in range(order)), "start"]
-    part = length_of_part(duration)
-    lower = np.concatenate([[0.0], lower, uncertain.low])
-    upper = np.concatenate([[part], upper, uncertain.high])
-    return tuple(names), lower, upper
-
-
 def _parts_of(scenario: Scenario) -> ChainParts:
     """The parts of V', with barriers without a guard."""
-    law: Any = copy.copy(scenario.controller)
+    law = cast(controllers.BarrierBackstepping, copy.copy(scenario.controller))
     guards = [[0.0 if isinstance(x, Quadratic) else x.guard] for x in law.barriers]
-    barriers = []
-    for barrier in law.barriers:
-        free = copy.copy(barrier)
-        if not isinstance(barrier, Quadratic):
-            # The constructor refuses such a guard: only inside the guard is the barrier evaluated.
-            object.__setattr__(free, "guard", -math.inf)
-        barriers.append(free)
-    object.__setattr__(law, "barriers", tuple(barriers))
-    order = law.order
-    gain: Any = jnp.zeros(())
+    object.__setattr__(law, "barriers", tuple(map(without_guard, law.barriers)))
+    gain = jnp.zeros(())
     if isinstance(scenario.observer, observers.LevelObserver):
         gain = scenario.observer.gain
-    bounds = scenario.bounds[:order]
-    model = scenario.model.at(jnp.zeros(()))
+    order = law.order
     return ChainParts(
-        model, law, _rows(gain, order), scenario.reference, bounds, jnp.asarray(guards)
+        cast(plants.Plant, scenario.model).at(jnp.zeros(())),
+        law,
+        _rows(gain, order),
+        scenario.reference,
+        scenario.bounds[:order],
+        jnp.asarray(guards),
     )
 
 
@@ -390,29 +304,11 @@ def _rows(value: jax.Array, order: int) -> jax.Array:
     return jnp.broadcast_to(jnp.reshape(value, (-1, 1)), (order, 1))
 
 
-def _varying(scenario: Scenario) -> dict[str, Any]:
-    """The parts that may depend on time, by name."""
-    given = {f"bounds[{i}]": bounds for i, bounds in enumerate(scenario.bounds)}
-    return {"reference": scenario.reference, "disturbance": scenario.disturbance, **given}
-
-
-def _sides_of(scenario: Scenario) -> dict[str, Any]:
-    """The sides of all bounds, by name."""
-    return {
-        f"bounds[{i}].{side}": vars(bounds)[side]
-        for i, bounds in enumerate(scenario.bounds)
-        if bounds is not None
-        for side in ("lower", "upper")
-    }
-
-
 # --- what is supported -------------------------------------------------------------------------
 
 
-def check_supported(scenario: Any) -> None:
+def check_supported(scenario: Scenario) -> None:
     """Raises ValueError, with the reason, for a scenario whose V' is not known here."""
-    if not isinstance(scenario, Scenario):
-        raise checks.fail("scenario", scenario, "a Scenario", "Make one with ij.presets.")
     _check_plant(scenario)
     _check_law(scenario)
     _check_observer(scenario)
@@ -439,10 +335,8 @@ def _check_plant(scenario: Scenario) -> None:
         if part.order not in ORDERS:
             reason = "The derivatives of the law grow with each level."
             raise unsupported(f"{name}.order", part.order, "order 2 or 3", reason)
-        if plants.nominal_of(part) is not part or jnp.size(jump_times_of(name, part)):
-            reason = "The plant changes during the run."
-            raise unsupported(name, kind, "a plant that does not change", reason)
-        check_constant(f"scenario.{name}", part)
+        reason = "The plant changes during the run."
+        check_unchanging(name, part, "a plant that does not change", reason)
         functions = _functions_of(part)
         inputs = [jnp.zeros(()), jnp.zeros((part.order, 1))]
         if any(0 in operations(name, function, inputs).inputs for function in functions.values()):
@@ -469,48 +363,34 @@ def _functions_of(plant: Any) -> dict[str, Callable]:
     return {f"{member} of level {i}": at_level(member, i) for member in members for i in levels}
 
 
-def _examined(scenario: Scenario, parts: ChainParts, uncertain: Uncertain) -> Examined:
-    """What is assumed of the parts of a scenario.
-
-    Raises:
-      ValueError: a part that may jump, or one that contradicts its contract.
-    """
-    digests = _check_operations(scenario, uncertain)
-    in_time = check_time_functions(scenario.reference, _sides_of(scenario), 1)
-    for i, barrier in enumerate(parts.law.barriers):
-        if type(barrier) not in BARRIERS:
-            name = f"scenario.controller.barriers[{i}]"
-            o = None if parts.law.o is None else parts.law.o[i]
-            digests += check_barrier(name, barrier, o, n=1, homogeneous=False)
-    assumed = [*in_time.assumed, *agreement_of_plant(scenario.plant)]
-    return Examined(assumed, [*digests, *in_time.digests])
-
-
-def _check_operations(scenario: Scenario, uncertain: Uncertain) -> list[str]:
+def _digests(scenario: Scenario, uncertain: Uncertain) -> list[str]:
     """The digests of plant and disturbance, with which d must not jump, and V with it.
 
     The law differentiates what it reads of the levels below the last one.
     """
     order = plants.order_of(scenario.plant)
     known = (scenario.plant, scenario.disturbance, scenario.model)
-    leaves, structure = jax.tree.leaves(known), jax.tree.structure(known)
-    inputs = [jnp.zeros(()), jnp.zeros((order, 1)), *leaves]
-    varying = [0, 1, *(2 + leaf for leaf in uncertain.places.varying_leaves)]
-    name = "scenario.plant and disturbance"
+    inputs = [jnp.zeros(()), jnp.zeros((order, 1))]
 
-    def external(t: jax.Array, x: jax.Array, *numbers: jax.Array) -> Any:
-        plant, disturbance, model = jax.tree.unflatten(structure, numbers)
+    def external(
+        t: jax.Array,
+        x: jax.Array,
+        plant: plants.Plant,
+        disturbance: Disturbance,
+        model: plants.Plant,
+    ) -> chain_motion.External:
         return chain_motion.external_at(disturbance, t, x, plant, model)
 
-    digests = [check_operations(name, external, inputs, varying, kinks=True).digest]
+    digests = [operations_of_plant(external, inputs, known, uncertain).digest]
     for method in _functions_of(scenario.plant):
 
-        def function(t: jax.Array, x: jax.Array, *numbers: jax.Array, method=method) -> Any:
-            plant, _, _ = jax.tree.unflatten(structure, numbers)
-            return _functions_of(plant)[method](t, x)
+        def function(
+            t: jax.Array, x: jax.Array, plant: plants.Plant, *others: Any, method: str = method
+        ) -> jax.Array:
+            return _functions_of(plant)[method](t, x)  # type: ignore[no-any-return]
 
-        is_last = method.endswith(f"level {order}")
-        found = check_operations(name, function, inputs, varying, kinks=is_last)
+        kinks = method.endswith(f"level {order}")
+        found = operations_of_plant(function, inputs, known, uncertain, kinks=kinks)
         digests.append(found.digest)
     return digests
 
@@ -526,8 +406,7 @@ def _check_law(scenario: Scenario) -> None:
         reason = "With filters V' has the errors of the filters, which are not in V."
         raise unsupported("controller.filter", law.filter, "exact derivatives (None)", reason)
     check_exponential(law, "V'")
-    one = jnp.ones(1)
-    tube = Tube(0.0 * one, 0.0 * one, -one, one, 0.0 * one, 0.0 * one)
+    one, tube = jnp.ones(1), unit_tube()
     for i, barrier in enumerate(law.barriers):
         name, kind = f"controller.barriers[{i}]", type(barrier).__name__
         if barrier.decay_rate(one) is None:

@@ -63,19 +63,12 @@ def period_of(parts: dict[str, Any], uncertain: Sequence[str] = ()) -> float:
     }
     if not frequencies:
         return 0.0
-    common = Fraction(
-        math.gcd(*_over_common_denominator(frequencies)),
-        math.lcm(*(w.denominator for w in frequencies)),
-    )
+    denominator = math.lcm(*(w.denominator for w in frequencies))
+    common = Fraction(math.gcd(*(int(w * denominator) for w in frequencies)), denominator)
     if max(frequencies) / common > LARGEST_RATIO:
         listed = ", ".join(f"{float(w):g}" for w in sorted(frequencies))
         raise AperiodicError(f"the frequencies {listed} rad/s have no common divisor")
     return 2.0 * math.pi / float(common)
-
-
-def _over_common_denominator(numbers: set[Fraction]) -> list[int]:
-    denominator = math.lcm(*(w.denominator for w in numbers))
-    return [int(w * denominator) for w in numbers]
 
 
 def _frequencies(name: str, part: Any, *, all_count: bool) -> Iterator[float]:

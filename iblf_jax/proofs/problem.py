@@ -2,14 +2,26 @@
 
 from __future__ import annotations
 
+import abc
 import dataclasses
 import itertools
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jax.tree_util import PyTreeDef
+
+from iblf_jax.control import observers
+from iblf_jax.core import checks
+from iblf_jax.proofs.parameters import Uncertain
+from iblf_jax.proofs.periods import shifted
+from iblf_jax.proofs.support import check_level
+from iblf_jax.proofs.uncertainty import Places
+from iblf_jax.simulation import paths
+from iblf_jax.simulation.scenario import Initial, Scenario
 
 PARTS_OF_TIME = 32
 """Parts of the time interval, each of which is searched on its own: over a long part a tube may
@@ -37,45 +49,24 @@ class LevelState(NamedTuple):
     """Rate of the further disturbance, (n,) [N m/s]; (0,) if there is none."""
 
 
-def length_of_part(duration: float) -> float:
-    """The length of each part of a time interval, () [s]: parts overlap by more than the rounding
-    of their starts.
-    """
-    return duration / PARTS_OF_TIME * (1.0 + 1e-9)
+def split_point(point: jax.Array, terms: int) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Time, s/|s| and z of a point (t, s, z)."""
+    t, s, z = point[0], point[1 : 1 + terms], point[1 + terms :]
+    return t, s / jnp.sqrt(jnp.sum(s**2)), z
 
 
-def patterns_of(signs: int, duration: float) -> np.ndarray:
-    """The signs of the errors and the start of each part of the time interval, (p, signs + 1)."""
-    sides = itertools.product((-1.0, 1.0), repeat=signs)
-    starts = np.arange(PARTS_OF_TIME) * (duration / PARTS_OF_TIME)
-    return np.array([[*side, start] for side in sides for start in starts])
+@dataclasses.dataclass(frozen=True)
+class OfStructure:
+    """A hashable function of the constants of problems of one structure."""
 
-
-def random_points(
-    seed: int, count: int, duration: float, terms: int, low: np.ndarray, high: np.ndarray
-) -> np.ndarray:
-    """Random points (t, s, z), (count, 1 + terms + m); every second one has its parameters at a
-    corner.
-
-    Args:
-      seed: of the points.
-      count: their number.
-      duration: length of the time interval [s].
-      terms: length of s.
-      low: least z, (m,).
-      high: greatest z, (m,).
-    """
-    generator = np.random.default_rng(seed)
-    t = generator.uniform(0.0, duration, (count, 1))
-    s = generator.normal(size=(count, terms))
-    s /= np.linalg.norm(s, axis=1, keepdims=True)
-    share = generator.uniform(size=(count, len(low)))
-    share[::2] = np.round(share[::2])
-    return np.concatenate([t, s, low + share * (high - low)], axis=1)
+    structure: PyTreeDef
+    places: Places
+    digests: tuple[str, ...]
+    """Of the functions that users wrote, so that a changed one has a program of its own."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class LevelSetProblem:
+class LevelSetProblem(abc.ABC):
     """Is V_w' < 0 at every point of V_w = level, at every time and for all parameters of a box?
 
     A box is one of coordinates x = (`lower`, `upper`) together with a row of `patterns`, which are
@@ -87,37 +78,130 @@ class LevelSetProblem:
     of V_w, and z are the parameters.
     """
 
-    names: tuple[str, ...]
-    """Of the coordinates and of the patterns."""
-    lower: np.ndarray
-    upper: np.ndarray
-    patterns: np.ndarray
+    scenario: Scenario
+    """The loop, canonical in double precision."""
+    uncertain: Uncertain
     bound: Callable
     """A hashable function (x, constants) for `search.search`."""
-    constants: Callable[[float, float], list[np.ndarray]]
-    """The constants of a weight w_f and a level; ValueError for a level that is not admissible."""
     point_rate: Callable[[jax.Array, Any], jax.Array]
     """V_w' at a point in plain floating-point numbers, to be compiled and differentiated."""
-    sample: Callable[[int, int], np.ndarray]
-    """Random points from a seed and their number, (count, p): half of them with parameters at the
-    corners."""
-    state_of: Callable[[Any, Any], LevelState]
-    """A point in physical numbers."""
-    scenario_at: Callable[[Any, Any], Any]
-    """The scenario whose run starts at a point."""
-    scales: dict[str, tuple[float, float]]
-    """Path of each uncertain entry -> its least and its greatest value."""
     duration: float
     """Length of the time interval of the proof [s]."""
     is_period: bool
     """Whether the time interval is a period, so that the proof is for all times."""
     assumptions: tuple[str, ...]
     """What was assumed, as sentences."""
+    units: ClassVar[tuple[str, str]]
+    """Of a weight and of a level."""
+    first_barrier: ClassVar[str]
+    """The barrier of the positions in words."""
 
+    @property
+    @abc.abstractmethod
+    def angles(self) -> list[tuple[str, float, float]]:
+        """Name, least and greatest value of each angle; ends are rounded outward."""
+
+    @property
+    @abc.abstractmethod
+    def signs(self) -> int:
+        """Number of errors with a sign."""
+
+    @property
+    @abc.abstractmethod
+    def terms(self) -> int:
+        """Number of terms of V_w, the length of s."""
+
+    @abc.abstractmethod
+    def numbers(self, weight: float, level: float) -> Any:
+        """The constants of a weight and a level, as a pytree."""
+
+    @abc.abstractmethod
+    def state_of(self, point: Any, constants: Any) -> Any:
+        """A point in physical numbers, with t, eta and parameters."""
+
+    @abc.abstractmethod
+    def initial(self, state: Any) -> Initial:
+        """The start of a run in a state of `state_of`."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the coordinates and of the patterns."""
+        angles = [name for name, _, _ in self.angles]
+        sides = [f"side[{i}]" for i in range(self.signs)]
+        return ("time since start", *angles, *self.uncertain.names, *sides, "start")
+
+    @property
+    def lower(self) -> np.ndarray:
+        """Lower ends of the coordinates, (b,)."""
+        return np.array([0.0, *(low for _, low, _ in self.angles), *self.uncertain.low])
+
+    @property
+    def upper(self) -> np.ndarray:
+        """Upper ends of the coordinates, (b,): parts of the time interval overlap by more than the
+        rounding of their starts.
+        """
+        part = self.duration / PARTS_OF_TIME * (1.0 + 1e-9)
+        return np.array([part, *(high for _, _, high in self.angles), *self.uncertain.high])
+
+    @property
+    def patterns(self) -> np.ndarray:
+        """The signs of the errors and the start of each part of the time interval, (p, signs +
+        1).
+        """
+        sides = itertools.product((-1.0, 1.0), repeat=self.signs)
+        starts = np.arange(PARTS_OF_TIME) * (self.duration / PARTS_OF_TIME)
+        return np.array([[*side, start] for side in sides for start in starts])
+
+    @jax.enable_x64(True)
+    def constants(self, weight: float, level: float) -> list[np.ndarray]:
+        """The constants of a weight and a level.
+
+        Raises:
+          ValueError: a number that is not positive, or a level that reaches the guard of the
+            barrier of the positions; the bound examines those of further levels.
+        """
+        weight = checks.positive_number("weight", weight, self.units[0])
+        level = checks.positive_number("level", level, self.units[1])
+        check_level(level, self.scenario, self.duration, self.first_barrier)
+        return [np.asarray(x, float) for x in jax.tree.leaves(self.numbers(weight, level))]
+
+    @jax.enable_x64(True)
     def rate(self, points: Any, constants: Any) -> np.ndarray:
         """V_w' at points, (count, p) -> (count,) [N m rad/s], in plain floating-point numbers."""
-        with jax.enable_x64(True):
-            return np.asarray(_rates(self.point_rate, np.asarray(points, float), list(constants)))
+        return np.asarray(_rates(self.point_rate, np.asarray(points, float), list(constants)))
+
+    def sample(self, seed: int, count: int) -> np.ndarray:
+        """Random points (t, s, z), (count, 1 + terms + m); every second one has its parameters at a
+        corner.
+        """
+        low, high = self.uncertain.low, self.uncertain.high
+        generator = np.random.default_rng(seed)
+        t = generator.uniform(0.0, self.duration, (count, 1))
+        s = generator.normal(size=(count, self.terms))
+        s /= np.linalg.norm(s, axis=1, keepdims=True)
+        share = generator.uniform(size=(count, len(low)))
+        share[::2] = np.round(share[::2])
+        return np.concatenate([t, s, low + share * (high - low)], axis=1)
+
+    def scenario_at(self, point: Any, constants: Any) -> Scenario:
+        """The scenario whose run starts at a point, with its parameters and moved in time.
+
+        Raises:
+          ValueError: a part that cannot be moved in time.
+        """
+        state = self.state_of(point, constants)
+        scenario = paths.with_parameters(self.scenario, state.parameters)
+        observer = scenario.observer
+        if isinstance(observer, observers.Momentum | observers.LevelObserver):
+            observer = dataclasses.replace(observer, eta0=state.eta, start="zero")
+        return dataclasses.replace(
+            scenario,
+            initial=self.initial(state),
+            observer=observer,
+            bounds=tuple(shifted(bounds, state.t) for bounds in scenario.bounds),
+            reference=shifted(scenario.reference, state.t),
+            disturbance=shifted(scenario.disturbance, state.t),
+        )
 
 
 @partial(jax.jit, static_argnums=0)

@@ -18,6 +18,7 @@ from iblf_jax.core.presentation import Result, present
 from iblf_jax.core.pytree import astype
 from iblf_jax.engine.simulate import simulate
 from iblf_jax.proofs.problem import LevelSetProblem
+from iblf_jax.proofs.support import position_barrier
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.distributions import Perturbation
@@ -271,7 +272,8 @@ class Proof(Result):
 
     def details(self) -> list[str]:
         """What was found, as lines."""
-        lines = _range_rows(self.ranges)
+        rows = [("", name, f"{low:.6g} to {high:.6g}") for name, (low, high) in self.ranges.items()]
+        lines = list(tables.as_text(rows, left=(0, 1)))
         if self.proved:
             lines.append(self._guarantee())
         if self.verdict == Verdict.NOT_PROVED:
@@ -344,12 +346,6 @@ _STATEMENTS = {
 }
 
 
-def _range_rows(ranges: Mapping[str, tuple[float, float]]) -> list[str]:
-    """Intervals as aligned lines."""
-    rows = [("", name, f"{low:.6g} to {high:.6g}") for name, (low, high) in ranges.items()]
-    return list(tables.as_text(rows, left=(0, 1)))
-
-
 def _numbers(value: Any) -> str:
     """Numbers as text."""
     if isinstance(value, Mapping):
@@ -368,19 +364,12 @@ def tube_of_level(scenario: Scenario, level: float, duration: float) -> Guarante
     def ends(t):
         tube = scenario.context.tube(t)
         values = jnp.broadcast_to(level / weight, tube.q_d.shape)
-        error_at = barrier.error_at
-        below = error_at(values, tube, jnp.zeros(values.shape, bool))
-        above = error_at(values, tube, jnp.ones(values.shape, bool))
+        below = barrier.error_at(values, tube, jnp.zeros(values.shape, bool))
+        above = barrier.error_at(values, tube, jnp.ones(values.shape, bool))
+        assert below is not None
+        assert above is not None
         xi = jnp.maximum(-below / tube.k_l, above / tube.k_u)
         return tube.q_d, tube.q_d + below, tube.q_d + above, tube.lower, tube.upper, xi
 
     found = jax.vmap(ends)(times)
     return GuaranteedTube(np.asarray(times), *(np.asarray(x) for x in found))
-
-
-def position_barrier(scenario: Scenario) -> tuple[Any, jax.Array]:
-    """The barrier of the positions and the weight of its V1."""
-    law: Any = scenario.controller
-    if plants.is_chain(scenario.plant):
-        return law.barriers[0], law.weights[0]
-    return law.barrier, law.weight

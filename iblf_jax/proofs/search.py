@@ -346,18 +346,11 @@ def search(
                 if found.status != PROVED:
                     break
                 proved += 1
-    worst = _worst_left(problem, ended, units[proved:])
+    worst = ended.worst
+    if ended.status == OUT_OF_BOXES:
+        left = [box for box in (worst, problem.worst(units[proved:])) if box is not None]
+        worst = max(left, key=lambda box: box.value, default=None)
     return SearchResult(STATUSES[ended.status], boxes, time.monotonic() - start, done, worst)
-
-
-def _worst_left(problem: _Problem, ended: _Found, units: np.ndarray) -> WorstBox | None:
-    """The worst box of the search that ended, and, if it ran out of boxes, of the units that are
-    left; None if there is none.
-    """
-    if ended.status != OUT_OF_BOXES:
-        return ended.worst
-    left = [box for box in (ended.worst, problem.worst(units)) if box is not None]
-    return max(left, key=lambda box: box.value, default=None)
 
 
 def _with_patterns(lower: Any, upper: Any, patterns: Any) -> tuple[np.ndarray, np.ndarray]:

@@ -2,21 +2,31 @@
 
 from __future__ import annotations
 
+import copy
+import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.control import controllers
 from iblf_jax.control.actuators import Ideal
+from iblf_jax.control.barriers import Barrier, Quadratic
 from iblf_jax.control.decays import Exponential
 from iblf_jax.core import checks
+from iblf_jax.core.time import jump_times_of
+from iblf_jax.proofs.examination import Examined, Operations, check_operations
 from iblf_jax.proofs.parameters import Uncertain
 from iblf_jax.proofs.periods import AperiodicError, period_of
-from iblf_jax.proofs.users_parts import BARRIERS
+from iblf_jax.proofs.users_barriers import check_barrier
+from iblf_jax.proofs.users_parts import BARRIERS, check_constant, check_time_functions
 from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.world import plants
+from iblf_jax.world.bounds import Bounds, Tube
 
+T = TypeVar("T")
 INSTANTS = 1024
 """Times at which the tube is examined before a proof."""
 REAL_NUMBERS = (
@@ -30,6 +40,21 @@ CONTINUOUS = "The proof is one of the continuous loop, with an ideal sensor."
 def unsupported(field: str, given: Any, expected: str, reason: str) -> ValueError:
     """The error for a part of a scenario whose V_w' is not known."""
     return checks.fail(f"prove: scenario.{field}", given, expected, reason)
+
+
+def check_unchanging(
+    name: str, part: plants.Plant | plants.Robot, expected: str, reason: str
+) -> None:
+    """Raises ValueError for a plant that is replaced during the run, or depends on the time."""
+    if part.nominal is not part or jnp.size(jump_times_of(name, part)):
+        raise unsupported(name, type(part).__name__, expected, reason)
+    check_constant(f"scenario.{name}", part)
+
+
+def unit_tube() -> Tube:
+    """The tube of one joint between -1 and 1, around a reference at rest."""
+    zero, one = jnp.zeros(1), jnp.ones(1)
+    return Tube(zero, zero, -one, one, zero, zero)
 
 
 def check_same_structure(scenario: Scenario, expected: str) -> None:
@@ -104,26 +129,120 @@ def time_interval(
         raise checks.fail("duration", None, "a duration", remedy) from None
 
 
+def position_barrier(scenario: Scenario) -> tuple[Barrier, jax.Array]:
+    """The barrier of the positions and the weight of its V1."""
+    law = scenario.controller
+    if isinstance(law, controllers.BarrierBackstepping):
+        return law.barriers[0], law.weights[0]
+    assert isinstance(law, controllers.Backstepping)
+    return law.barrier, law.weight
+
+
 @jax.enable_x64(True)
-def check_level(
-    level: float, xi_bound: Callable[[jax.Array], jax.Array], guard: float, duration: float, of: str
-) -> None:
-    """Raises ValueError if a level set reaches the guard of a barrier at one of some instants; the
-    bound examines all times.
+def check_level(level: float, scenario: Scenario, duration: float, of: str) -> None:
+    """Raises ValueError if a level set reaches the guard of the barrier of the positions at one of
+    some instants; the bound examines all times.
 
     Args:
       level: c.
-      xi_bound: bound of |xi| on the level set at a time.
-      guard: of the barrier.
+      scenario: the loop.
       duration: length of the time interval [s].
       of: the barrier in words.
     """
-    xi = float(jnp.max(jax.vmap(xi_bound)(jnp.linspace(0.0, duration, INSTANTS))))
-    if xi < 1.0 - guard:
+    barrier, weight = position_barrier(scenario)
+    if isinstance(barrier, Quadratic):
         return
-    expected = f"a level inside the guard of the {of}, |xi| < {1.0 - guard:g}"
+    value = level / weight * jnp.ones(scenario.n)
+
+    def xi_bound(t: jax.Array) -> jax.Array:
+        return barrier.xi_bound(  # type: ignore[return-value]
+            value, scenario.context.tube(t, acceleration=False)
+        )
+
+    xi = float(jnp.max(jax.vmap(xi_bound)(jnp.linspace(0.0, duration, INSTANTS))))
+    if xi < 1.0 - barrier.guard:
+        return
+    expected = f"a level inside the guard of the {of}, |xi| < {1.0 - barrier.guard:g}"
     remedy = f"It reaches |xi| = {xi:.6g}, where the law has another slope. Lower the level."
     raise checks.fail("level", level, expected, remedy)
+
+
+def without_guard(barrier: T) -> T:
+    """A barrier without its guard: only inside the guard is it evaluated."""
+    free = copy.copy(barrier)
+    # The constructor refuses such a guard.
+    object.__setattr__(free, "guard", -math.inf)
+    return free
+
+
+def bounds_of(scenario: Scenario) -> dict[str, Bounds | None]:
+    """The bounds of all levels, by name."""
+    return {f"bounds[{i}]": bounds for i, bounds in enumerate(scenario.bounds)}
+
+
+def examined(
+    scenario: Scenario,
+    digests: Sequence[str],
+    agreement: Callable[[Any], list[str]],
+    barriers: Mapping[str, tuple[Barrier, jax.Array | None]],
+    *,
+    homogeneous: bool,
+) -> Examined:
+    """What is assumed of the parts of a scenario.
+
+    Args:
+      scenario: the loop.
+      digests: of plant and disturbance.
+      agreement: function that compares the methods of a user's plant.
+      barriers: field of the law -> barrier without its guard, and the gain o with it.
+      homogeneous: whether a barrier with a length of its own is refused.
+
+    Raises:
+      ValueError: a part that may jump, or one that contradicts its contract.
+    """
+    sides = {
+        f"{name}.{side}": vars(bounds)[side]
+        for name, bounds in bounds_of(scenario).items()
+        if bounds is not None
+        for side in ("lower", "upper")
+    }
+    n = scenario.n
+    in_time = check_time_functions(scenario.reference, sides, n)
+    found = [*digests]
+    for field, (barrier, o) in barriers.items():
+        if type(barrier) not in BARRIERS:
+            name = f"scenario.controller.{field}"
+            found += check_barrier(name, barrier, o, n=n, homogeneous=homogeneous)
+    assumed = [*in_time.assumed, *agreement(scenario.plant)]
+    return Examined(assumed, [*found, *in_time.digests])
+
+
+def operations_of_plant(
+    function: Callable,
+    inputs: Sequence[jax.Array],
+    known: tuple[Any, ...],
+    uncertain: Uncertain,
+    *,
+    kinks: bool = True,
+) -> Operations:
+    """The operations of a function of plant and disturbance, which must not jump.
+
+    Args:
+      function: of the inputs, plant, disturbance and model.
+      inputs: arrays of the shapes of its first arguments, all of which vary.
+      known: plant, disturbance and model.
+      uncertain: parameters.
+      kinks: whether its derivative may jump.
+    """
+    leaves, structure = jax.tree.flatten(known)
+    count = len(inputs)
+
+    def of_numbers(*x: jax.Array) -> Any:
+        return function(*x[:count], *jax.tree.unflatten(structure, x[count:]))
+
+    varying = [*range(count), *(count + leaf for leaf in uncertain.places.varying_leaves)]
+    name = "scenario.plant and disturbance"
+    return check_operations(name, of_numbers, [*inputs, *leaves], varying, kinks=kinks)
 
 
 def infinite_unless_defined(rate: jax.Array, values: jax.Array) -> jax.Array:

@@ -39,7 +39,7 @@ from iblf_jax.core.progress import announced
 from iblf_jax.core.pytree import field_values, layers, unwrapped
 from iblf_jax.core.status import Status
 from iblf_jax.core.units import INPUT
-from iblf_jax.engine import Outcome, RunRequest, run_batch
+from iblf_jax.engine import Outcome, RunRequest, run_batch, takes_runs
 from iblf_jax.engine.simulate import simulate
 from iblf_jax.simulation.error_growth import errors_by_step
 from iblf_jax.simulation.metrics import (
@@ -70,6 +70,7 @@ ONLY_K = (
 
 @notices.each_warning_once
 @announced("comparing laws")
+@takes_runs
 def compare(
     scenario: Scenario,
     laws: Laws = LAWS,
@@ -100,7 +101,7 @@ def compare(
       laws: names (`iblf_jax.controllers.LAWS` or `KEEPERS`) or laws, or a dict of either by the
         name to show.  The first one sets the effort.  Names are laws of robots; for a plant
         without a robot give laws, such as {"mapping": BarrierBackstepping(...)}.
-      duration, dt, method, record_every: as `simulate`.
+      duration, dt, method, record_every, runs_as: as `simulate`.
       metrics: folds besides the standard ones.  A fold replaces the standard one of its class:
         `ij.metrics.Settling(tolerance=0.001)` sets the error at which a law has settled.
       equal_effort: whether to look for the factors; a few batches of 89 further runs a law.

@@ -14,6 +14,7 @@ import numpy as np
 
 from iblf_jax.core import checks, notices
 from iblf_jax.core.progress import announced, bar
+from iblf_jax.engine import takes_runs
 from iblf_jax.simulation.error_growth import errors_by_step
 from iblf_jax.simulation.metrics import Fold
 from iblf_jax.simulation.noise import has_noise
@@ -31,6 +32,7 @@ from iblf_jax.studies.time_step import warn_of_sampling, warn_of_step
 @notices.each_warning_once
 @checks.known_keywords
 @announced("compiling the program of a study")
+@takes_runs
 def monte_carlo(
     scenario: Scenario,
     perturbations: Mapping[str, Perturbation],
@@ -74,6 +76,7 @@ def monte_carlo(
         client's `get_executor()` or a process pool; or an `ij.studies.ThisProcess` with devices and
         a limit of memory.  None for this process and all its devices.
       progress: a progress bar; by default it is shown on a terminal.
+      runs_as: an `ij.Runs`, in place of its fields.
 
     Returns:
       A `Study`: metrics, status and samples of every run, run axis first.
@@ -87,16 +90,8 @@ def monte_carlo(
     """
     executor = executor_of(executor)
     options = RunOptions(
-        duration=duration,
-        dt=dt,
-        method=method,
-        backend=backend,
-        runs=runs,
-        seed=seed,
-        sampler=sampler,
-        replicates=replicates,
+        duration, dt, method, backend, seed, runs=runs, sampler=sampler, replicates=replicates
     )
-    options = options.checked()
     _check_not_all_the_same(scenario, perturbations)
     prepared = prepare(scenario, perturbations, options, metrics)
     checks.fits_memory("runs", options.runs, case_bytes(prepared))

@@ -10,70 +10,35 @@ import dataclasses
 import os
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from typing import Any, TypeVar
+from typing import Any
 
 import jax
 
 from iblf_jax.core import checks
-from iblf_jax.engine import STUDY_MEMORY
-from iblf_jax.simulation.integrators import tableau
+from iblf_jax.engine import STUDY_MEMORY, Runs
 from iblf_jax.studies.designs import MAX_RUNS, check_sampler
 
 MAX_MEMORY = 2.0**60
 """Largest accepted `memory` [bytes]."""
-T = TypeVar("T")
 WRITERS = ("client", "worker")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class RunOptions:
-    """The arguments that `monte_carlo`, `sweep`, `sensitivity` and `recommended_dt` share."""
+class RunOptions(Runs):
+    """The arguments that `monte_carlo`, `sweep`, `sensitivity` and `recommended_dt` share, with
+    valid values; ValueError names an invalid one.
+    """
 
-    duration: float
-    """Length of a run [s]."""
-    dt: float
-    """Time step [s]."""
-    method: str
-    """The integrator."""
-    backend: str
-    """As requested, "auto" included; `engine.RunRequest` checks it."""
     runs: int
     """Runs at each point."""
-    seed: int
     sampler: str = "independent"
     replicates: int = 1
     """Designs that the runs are made of."""
 
-    def checked(self) -> RunOptions:
-        """The same options with valid values; ValueError names an invalid one."""
-        options = checked_run_options(self)
-        replicates = check_sampler(self.sampler, options.runs, self.replicates)
-        return dataclasses.replace(options, replicates=replicates)
-
-    @property
-    def steps(self) -> int:
-        """Time steps of a run."""
-        return checks.whole_steps(self.duration, self.dt)
-
-
-def checked_run_options(options: T) -> T:
-    """The options of runs with a valid number of runs, integrator, duration, time step and seed;
-    ValueError names an invalid one.
-
-    Args:
-      options: dataclass with the fields `runs`, `method`, `duration`, `dt` and `seed`.
-    """
-    given: Any = options
-    runs = checks.positive_integer("runs", given.runs, most=MAX_RUNS)
-    tableau(given.method)
-    checks.whole_steps(given.duration, given.dt)
-    return dataclasses.replace(
-        given,
-        duration=float(given.duration),
-        dt=float(given.dt),
-        runs=runs,
-        seed=checks.seed(given.seed),
-    )
+    def __post_init__(self) -> None:
+        runs = checks.positive_integer("runs", self.runs, most=MAX_RUNS)
+        super().__post_init__()
+        vars(self).update(runs=runs, replicates=check_sampler(self.sampler, runs, self.replicates))
 
 
 @dataclasses.dataclass(frozen=True)

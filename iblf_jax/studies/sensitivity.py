@@ -26,6 +26,7 @@ from iblf_jax.core.presentation import Content, Result
 from iblf_jax.core.progress import announced, bar
 from iblf_jax.core.pytree import field_values
 from iblf_jax.core.status import FAILED, has_flag
+from iblf_jax.engine import takes_runs
 from iblf_jax.simulation.metrics import Fold, metric_units
 from iblf_jax.simulation.results import Metrics
 from iblf_jax.simulation.scenario import Scenario
@@ -99,6 +100,7 @@ class Sensitivity(Result):
 @notices.each_warning_once
 @checks.known_keywords
 @announced("compiling the program of a sensitivity analysis")
+@takes_runs
 def sensitivity(
     scenario: Scenario,
     perturbations: Mapping[str, Perturbation],
@@ -133,6 +135,7 @@ def sensitivity(
       backend: "auto", "native", "gpu" or "vmap".
       executor: where the runs are computed, as in `monte_carlo`.
       progress: a progress bar; by default it is shown on a terminal.
+      runs_as: an `ij.Runs`, in place of its fields.
 
     Returns:
       A `Sensitivity`, with bootstrap intervals.
@@ -145,10 +148,8 @@ def sensitivity(
     executor = executor_of(executor)
     points = _checked_points(points)
     _check_arguments(perturbations, output)
-    options = RunOptions(
-        duration=duration, dt=dt, method=method, backend=backend, runs=1, seed=seed
-    )
-    prepared = prepare(scenario, perturbations, options.checked(), metrics)
+    options = RunOptions(duration, dt, method, backend, seed, runs=1)
+    prepared = prepare(scenario, perturbations, options, metrics)
     if isinstance(output, str):
         checks.one_of("output", output, sorted(result_shapes(prepared).metrics))
     shapes = draw_shapes(prepared.program.targets, prepared.shared.uncertain.perturbations)

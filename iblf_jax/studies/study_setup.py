@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.engine import CompiledBatch, RunRequest, block_size, compile_batch
+from iblf_jax.engine import CompiledBatch, block_size, compile_batch
 from iblf_jax.simulation.metrics import Fold, as_folds
 from iblf_jax.simulation.noise import noise_values
 from iblf_jax.simulation.scenario import Scenario, canonical, fitted_to_step
@@ -138,9 +138,7 @@ def prepare(
       ValueError: an argument that is not valid.
     """
     scenario = fitted_to_step(canonical(scenario), options.dt)
-    request = RunRequest.of(
-        scenario, steps=options.steps, method=options.method, backend=options.backend
-    )
+    request = options.request(scenario)
     targets, by_path = targets_of(scenario, perturbations)
     dtype = scenario.initial.q.dtype
     folds = as_folds(metrics, dtype, scenario)

@@ -19,7 +19,7 @@ import numpy as np
 
 from iblf_jax.core import checks, notices
 from iblf_jax.core.progress import announced, bar
-from iblf_jax.engine import cases_per_unit, whole_blocks
+from iblf_jax.engine import cases_per_unit, takes_runs, whole_blocks
 from iblf_jax.simulation.error_growth import errors_by_step
 from iblf_jax.simulation.metrics import Fold, metric_units
 from iblf_jax.simulation.scenario import Scenario, canonical
@@ -52,6 +52,7 @@ if TYPE_CHECKING:
 @notices.each_warning_once
 @checks.known_keywords
 @announced("compiling the program of a sweep")
+@takes_runs
 def sweep(
     scenario: Scenario,
     grid: Mapping[str, Any],
@@ -103,6 +104,7 @@ def sweep(
         client's `get_executor()` or a process pool; or an `ij.studies.ThisProcess` with devices and
         a limit of memory.  None for this process and all its devices.
       progress: a progress bar; by default it is shown on a terminal.
+      runs_as: an `ij.Runs`, in place of its fields.
 
     Returns:
       An `xarray.Dataset` of the metrics and `status`, with one dimension for each path of a grid
@@ -128,16 +130,8 @@ def sweep(
     if perturbations is None:
         perturbations = {}
     options = RunOptions(
-        duration=duration,
-        dt=dt,
-        method=method,
-        backend=backend,
-        runs=runs,
-        seed=seed,
-        sampler=sampler,
-        replicates=replicates,
+        duration, dt, method, backend, seed, runs=runs, sampler=sampler, replicates=replicates
     )
-    options = options.checked()
     _check_something_varies(grid, perturbations, options.runs)
     points = make_points(canonical(scenario), grid, design.kind, design.points, options.seed)
     prepared = prepare(scenario, perturbations, options, metrics, points.values)

@@ -125,15 +125,9 @@ def _first_block(
     dt: float,
 ) -> Any:
     """The results of the first block of a study at a step."""
-    options = RunOptions(
-        duration=max(round(duration / dt), 1) * dt,
-        dt=dt,
-        method=method,
-        backend="auto",
-        runs=block_size(),
-        seed=seed,
-    )
-    prepared = prepare(scenario, perturbations, options.checked(), metrics=())
+    length = max(round(duration / dt), 1) * dt
+    options = RunOptions(length, dt, method, seed=seed, runs=block_size())
+    prepared = prepare(scenario, perturbations, options, metrics=())
     ((_, results),) = run_blocks(prepared, [0])
     return results
 

@@ -21,7 +21,7 @@ from iblf_jax.core import checks, notices
 from iblf_jax.core.progress import announced, bar
 from iblf_jax.core.pytree import astype
 from iblf_jax.core.status import UNTRUSTED, Status, has_flag
-from iblf_jax.engine import RunRequest, differentiates_forward
+from iblf_jax.engine import RunRequest, differentiates_forward, takes_runs
 from iblf_jax.simulation.metrics import Margin, RegionMargin, VelocityMargin, check_needs
 from iblf_jax.simulation.noise import check_method, has_noise
 from iblf_jax.simulation.paths import with_parameters
@@ -60,9 +60,9 @@ from iblf_jax.tuning.rollouts import WINDOWS
 from iblf_jax.tuning.runs import in_groups
 
 RUNS = {"subset": 4000, "importance": 4096, "monte_carlo": 10_000}
-"""Method -> default of `runs`."""
+"""Estimator -> default of `runs`."""
 LEAST_RUNS = {"subset": 100, "importance": 100, "monte_carlo": 1}
-"""Method -> least number of `runs`: 10 chains in each level of subset simulation, and enough
+"""Estimator -> least number of `runs`: 10 chains in each level of subset simulation, and enough
 weights for a fit of their tail."""
 FOLDS: dict[str, type[Any]] = {
     "positions": Margin,
@@ -102,16 +102,16 @@ NO_DESIGN_POINT = (
 MISSED_BY_IMPORTANCE = (
     "A subset simulation with few samples gave {coarse:.2g}, and even the lower end of its interval"
     " at {confidence:.1%} confidence, {low:.2g}, is larger: the design points probably do not"
-    " represent all failures. Use method='subset'."
+    " represent all failures. Use estimator='subset'."
 )
 NOT_REACHED_BY_IMPORTANCE = (
     "No sample around the design points failed; the subset simulation with few samples from which"
-    " they were searched is reported instead. Use method='subset' or take more runs."
+    " they were searched is reported instead. Use estimator='subset' or take more runs."
 )
 NOISE = (
     "The random numbers of the noise are drawn anew for each point, which the Markov chains of"
     " subset simulation cannot follow: where noise contributes to failures, the interval is too"
-    " narrow. Compare with method='monte_carlo' at a probability that it can show."
+    " narrow. Compare with estimator='monte_carlo' at a probability that it can show."
 )
 MISSED = (
     "Subset simulation gave {subset:.3g} and missed failures near a design point, because its"
@@ -131,7 +131,7 @@ NOT_REACHED = (
 class FailureOptions(NamedTuple):
     """The checked arguments of `failure_probability` that are not those of runs."""
 
-    method: str
+    estimator: str
     margin: str
     limit: float
     confidence: float
@@ -140,19 +140,20 @@ class FailureOptions(NamedTuple):
 
 @notices.each_warning_once
 @announced("compiling the programs of an estimate of a failure probability")
+@takes_runs
 def failure_probability(
     scenario: Scenario,
     perturbations: Mapping[str, Perturbation],
     *,
     duration: float,
     dt: float = 1e-3,
-    method: str = "subset",
+    estimator: str = "subset",
     runs: int | None = None,
     margin: str = "positions",
     limit: float = 0.0,
     confidence: float = 0.95,
     seed: int = 0,
-    integrator: str = "rk4",
+    method: str = "rk4",
     backend: str = "auto",
     executor: ThisProcess | Executor | None = None,
     progress: bool | None = None,
@@ -166,9 +167,10 @@ def failure_probability(
       perturbations: path -> `factor`, `offset` or `value` of a distribution.
       duration: length of a run [s], a whole number of steps.
       dt: time step [s].
-      method: "subset", subset simulation, for any margin; "importance", importance sampling around
-        the failures nearest to the nominal run, which are found by gradients: fewer runs where few
-        such points represent all failures; a note says where the samples show that they do not;
+      estimator: "subset", subset simulation, for any margin; "importance", importance sampling
+        around the failures nearest to the nominal run, which are found by gradients: fewer runs
+        where few such points represent all failures; a note says where the samples show that they
+        do not;
         "monte_carlo", independent draws.
       runs: number of runs; for "subset" of each level, of which there is one for each factor of
         ten; at least 100, for "monte_carlo" 1.  4000, 4096 and 10,000 if not given.  The search
@@ -178,11 +180,11 @@ def failure_probability(
       limit: margin at which a run fails, in its unit.
       confidence: of the interval, in (0, 1).
       seed: whole number that fixes all draws.
-      integrator: "rk4", "heun" or "euler", "euler_maruyama" or "stochastic_heun" with process
-        noise; as `method` of `simulate`.
+      method: "rk4", "heun" or "euler", "euler_maruyama" or "stochastic_heun" with process noise.
       backend: "auto", "native", "gpu" or "vmap".
       executor: where the runs are computed, as in `monte_carlo`.
       progress: a progress bar; by default it is shown on a terminal.
+      runs_as: an `ij.Runs`, in place of its fields.
 
     Returns:
       A `FailureProbability`: estimate, interval, coefficient of variation, levels, the most likely
@@ -191,32 +193,25 @@ def failure_probability(
       scenario, which subset simulation represents less well than Monte-Carlo simulation.
 
     Raises:
-      ValueError: bad arguments, or a discrete distribution with method="importance".
+      ValueError: bad arguments, or a discrete distribution with estimator="importance".
       ij.studies.WorkerError: as `monte_carlo`.
 
     Source: S. K. Au, J. L. Beck, Probabilistic Engineering Mechanics 16 (2001) 263-277; the modules
       of `iblf_jax.studies.rare_events`.
     """
-    options = _checked(method, margin, limit, confidence, runs)
+    options = _checked(estimator, margin, limit, confidence, runs)
     scenario = canonical(scenario)
-    _check_integrator(scenario, integrator)
+    check_method(scenario, method)
     executor = executor_of(executor)
-    run_options = RunOptions(
-        duration=duration,
-        dt=dt,
-        method=integrator,
-        backend=backend,
-        runs=options.runs,
-        seed=seed,
-    ).checked()
+    run_options = RunOptions(duration, dt, method, backend, seed, runs=options.runs)
     check_varied(perturbations)
     check_needs("margin", FOLDS[margin], scenario)
     prepared = prepare(scenario, perturbations, run_options, (FOLDS[margin](),))
-    if options.method == "importance" and is_discrete(prepared.perturbations):
+    if options.estimator == "importance" and is_discrete(prepared.perturbations):
         expected = "continuous distributions, as gradients are needed"
-        remedy = "Use method='subset', which needs none."
+        remedy = "Use estimator='subset', which needs none."
         raise checks.fail("perturbations", "a discrete distribution", expected, remedy)
-    expected_runs = {"subset": 5 * options.runs}.get(options.method, options.runs)
+    expected_runs = {"subset": 5 * options.runs}.get(options.estimator, options.runs)
     with bar(progress, expected_runs) as shown:
         space = NormalSpace(prepared, METRICS[margin], options.limit, executor, shown.update)
         checks.fits_memory("runs", options.runs, 8.0 * 4 * space.size)
@@ -225,38 +220,27 @@ def failure_probability(
     arguments: dict[str, Any] = {
         "duration": run_options.duration,
         "dt": run_options.dt,
-        "method": options.method,
+        "method": method,
+        "estimator": options.estimator,
         "runs": options.runs,
         "margin": options.margin,
         "limit": options.limit,
         "confidence": options.confidence,
         "seed": run_options.seed,
-        "integrator": integrator,
         "backend": backend,
     }
     return _result(space, options, found, arguments)
 
 
-def _checked(method: Any, margin: Any, limit: Any, confidence: Any, runs: Any) -> FailureOptions:
-    checks.one_of("method", method, tuple(RUNS))
+def _checked(estimator: Any, margin: Any, limit: Any, confidence: Any, runs: Any) -> FailureOptions:
+    checks.one_of("estimator", estimator, tuple(RUNS))
     checks.one_of("margin", margin, tuple(FOLDS))
     number = float(checks.number_between("limit", limit, -1e9, 1e9, "the margin's unit"))
     confidence = check_confidence(confidence)
     if runs is None:
-        runs = RUNS[method]
-    runs = checks.positive_integer("runs", runs, least=LEAST_RUNS[method], most=MAX_RUNS)
-    return FailureOptions(method, margin, number, confidence, runs)
-
-
-def _check_integrator(scenario: Scenario, integrator: Any) -> None:
-    """Raises ValueError for an integrator that does not fit, under the name that it has here: the
-    `method` of a run is called `integrator`.
-    """
-    try:
-        check_method(scenario, integrator)
-    except ValueError as error:
-        text = str(error).replace("method: got", "integrator: got")
-        raise ValueError(text.replace("method=", "integrator=")) from error
+        runs = RUNS[estimator]
+    runs = checks.positive_integer("runs", runs, least=LEAST_RUNS[estimator], most=MAX_RUNS)
+    return FailureOptions(estimator, margin, number, confidence, runs)
 
 
 class _Found(NamedTuple):
@@ -279,9 +263,9 @@ def _found(space: NormalSpace, options: FailureOptions) -> _Found:
     nominal = float(space(origin)[0])
     pieces = PiecesOfMargin(space, options)
     points = np.zeros((0, space.size))
-    if options.method == "importance":
+    if options.estimator == "importance":
         estimate, points = _by_importance(space, options, pieces, nominal)
-    elif options.method == "subset":
+    elif options.estimator == "subset":
         estimate = _by_subset(space, options, options.runs)
         estimate, points = _checked_by_importance(space, options, pieces, estimate, nominal)
     else:
@@ -313,9 +297,7 @@ class PiecesOfMargin:
         run = prepared.options
         windows: Any = np.arange(1, WINDOWS) / WINDOWS * run.duration
         self.peak = astype(Peak(one, SIGNAL_OF_MARGIN[options.margin], windows=windows), self.dtype)
-        self.request = RunRequest.of(
-            prepared.scenario, steps=run.steps, method=run.method, backend=run.backend
-        )
+        self.request = run.request(prepared.scenario)
         self.runs = 0
         """Runs with gradients until now."""
 
@@ -424,7 +406,7 @@ def _checked_by_importance(
     if nominal <= 0 or not pieces.is_available:
         return estimate, np.zeros((0, space.size))
     points, _ = design_points(pieces, _nearest(estimate.failures))
-    if not len(points) or estimate.method != "subset":
+    if not len(points) or estimate.estimator != "subset":
         return estimate, points
     second = _importance_estimate(space, options, points, CHECK_RUNS)
     if second.is_upper_bound or (not estimate.is_upper_bound and second.low <= estimate.high):
@@ -476,7 +458,7 @@ def _result(
     notes = list(estimate.notes)
     if found.nominal <= 0:
         notes.insert(0, NOMINAL_FAILS.format(margin=found.nominal, unit=unit))
-    if estimate.method == "subset" and has_noise(space.prepared.scenario):
+    if estimate.estimator == "subset" and has_noise(space.prepared.scenario):
         notes.append(NOISE)
     status = np.concatenate(space.status)
     failures = _samples(space, estimate.failures)
@@ -499,7 +481,7 @@ def _result(
         diverged=int(np.sum(has_flag(status, Status.NOT_FINITE))),
         started_outside=_started_outside(space, failures),
         notes=tuple(notes),
-        method=estimate.method,
+        estimator=estimate.estimator,
         unit=unit,
         arguments=arguments,
     )

@@ -35,7 +35,7 @@ from iblf_jax.core.presentation import Result
 from iblf_jax.core.progress import announced, bar
 from iblf_jax.core.pytree import astype
 from iblf_jax.core.status import VIOLATED, Status, describe, has_flag
-from iblf_jax.engine import RunRequest
+from iblf_jax.engine import RunRequest, Runs, takes_runs
 from iblf_jax.engine.simulate import simulate
 from iblf_jax.simulation.metrics import check_needs
 from iblf_jax.simulation.paths import with_parameters
@@ -44,6 +44,7 @@ from iblf_jax.simulation.scenario import Scenario, canonical, fitted_to_step
 from iblf_jax.simulation.units import status_words, unit_text
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.perturbation_cube import Cube, unit_cube
+from iblf_jax.studies.worst import Losses, WorstCase, search
 from iblf_jax.tuning.evaluation import Derivatives, Value
 from iblf_jax.tuning.margins import pieces_of_margins
 from iblf_jax.tuning.parameters import Box
@@ -58,6 +59,10 @@ is."""
 UNINFORMATIVE = Status.INFEASIBLE_REFERENCE | Status.STEP_TOO_LARGE
 """Flags of runs that say nothing about the law: no law could keep the bounds, or the time step is
 too large."""
+ALL_UNINFORMATIVE = (
+    "In every run that was tried the reference leaves the bounds (Assumption 2) or the step is too"
+    " large: narrow the perturbations, widen the bounds, or take a smaller dt."
+)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -79,7 +84,8 @@ class Attack(Result):
     nothing about the law (`UNINFORMATIVE`)."""
     runs: int
     """Number of rollouts with derivatives."""
-    timing: dict[str, Any]
+    run: Runs
+    """How the worst run is computed again."""
     unit: str = dataclasses.field(default="rad", kw_only=True)
     """Of the margins."""
 
@@ -92,7 +98,7 @@ class Attack(Result):
 
     def replay(self, record_every: int = 1) -> Rollout:
         """The worst run, in full."""
-        return simulate(self.scenario, record_every=record_every, **self.timing)
+        return simulate(self.scenario, record_every=record_every, runs_as=self.run)
 
     def __repr__(self) -> str:
         word = "not falsified"
@@ -113,6 +119,7 @@ class Attack(Result):
 @notices.each_warning_once
 @checks.known_keywords
 @announced("compiling the programs of a search for a failure")
+@takes_runs
 def falsify(
     scenario: Scenario,
     perturbations: Mapping[str, Perturbation],
@@ -147,6 +154,7 @@ def falsify(
       seed: of the starting points.
       margin: which one is minimised: of the "positions", the "velocities" or the "regions".
       progress: whether to show a progress bar; on a terminal or in a notebook, if not given.
+      runs_as: an `ij.Runs`, in place of its fields.
 
     Returns:
       An `Attack`: the worst run found, and whether it left its bounds.  That no such run is found
@@ -158,112 +166,74 @@ def falsify(
 
     Source: head of this module.
     """
-    steps = checks.whole_steps(duration, dt)
+    options = Runs(duration, dt, method, backend, seed)
     scenario = fitted_to_step(canonical(scenario), dt)
-    request = RunRequest.of(scenario, steps=steps, method=method, backend=backend)
+    request = options.request(scenario)
     starts = checks.positive_integer("starts", starts)
     checks.fits_memory("starts", starts, 8.0 * NUMBERS_A_RUN)
     iterations = checks.positive_integer("iterations", iterations, most=checks.MAX_STEPS)
     checks.fits_memory("iterations", iterations, 8 * starts)
-    seed = checks.seed(seed)
     cube = unit_cube(scenario, perturbations)
     checks.fits_memory("starts", starts, 8.0 * (1 + cube.size) * NUMBERS_A_RUN)
     checks.one_of("margin", margin, SIGNAL_OF_MARGIN)
     one: Any = 1.0
-    peak = Peak(one, SIGNAL_OF_MARGIN[margin])
+    dtype = scenario.initial.q.dtype
+    peak = astype(Peak(one, SIGNAL_OF_MARGIN[margin]), dtype)
     check_needs("margin", peak, scenario)
-    evaluate = MarginEvaluator(cube, peak, dt, request, starts)
+    unit = unit_text(scenario, DEFICITS[peak.signal])
+    losses = partial(_losses, cube, peak, jnp.asarray(dt, dtype), request)
+    problem = WorstCase(cube, losses, starts, (options.seed, 3))
     with bar(progress, iterations + 1, unit="steps") as shown:
-        _attack(cube, evaluate, seed, iterations, shown)
-    timing = {"duration": duration, "dt": dt, "method": method}
-    return _result(cube, evaluate, timing)
-
-
-def _result(cube: Cube, evaluate: MarginEvaluator, timing: dict[str, Any]) -> Attack:
-    """The worst run of all."""
-    worst = evaluate.worst
-    if worst is None:
-        remedy = (
-            "In every run that was tried the reference leaves the bounds (Assumption 2) or the step"
-            " is too large: narrow the perturbations, widen the bounds, or take a smaller dt."
-        )
-        raise cube.no_admissible_point(remedy)
-    point = cube.values(jnp.asarray(worst.u, evaluate.dtype))
+        worst = search(problem, partial(_attack, iterations, shown, unit), ALL_UNINFORMATIVE)
+    point = cube.values(jnp.asarray(worst.u, dtype))
     values = {path: np.asarray(x) for path, x in point.items()}
-    history = np.stack(evaluate.history)
+    history = np.stack(problem.history)
+    first = history[np.isfinite(history).any(axis=1)][0]
     return Attack(
-        scenario=with_parameters(cube.uncertain.scenario, values),
+        scenario=with_parameters(scenario, values),
         values=values,
-        margin=worst.margin,
-        first_margin=next(float(np.nanmin(row)) for row in history if not np.all(np.isnan(row))),
+        margin=worst.loss,
+        first_margin=float(np.min(first)),
         status=worst.status,
-        history=history,
+        history=np.where(np.isfinite(history), history, np.nan),
         runs=history.size,
-        timing=timing,
-        unit=evaluate.unit,
+        run=Runs(options.duration, options.dt, method),
+        unit=unit,
     )
 
 
-def _attack(cube: Cube, evaluate: MarginEvaluator, seed: int, iterations: int, shown: Any) -> None:
-    """All steps of all attacks; the results are in `evaluate`."""
-    starts = len(evaluate.active)
-    state = SOLVER.init(evaluate.space, cube.admissible_points(starts, [seed, 3]))
-    for step in range(iterations + 1):
-        for attack in state:
-            attack.trial = _admissible(cube.why_inadmissible, attack.z, attack.trial)
-        SOLVER.step(evaluate, state, SOLVER.tolerance)
-        converged = np.flatnonzero(SOLVER.converged(state)).tolist()
-        if converged:
-            points = cube.admissible_points(starts, [seed, 3, step + 1])
-            for s in converged:
-                SOLVER.restart(evaluate.space, state, s, points[s])
-        shown.update(1)
-        if evaluate.worst is not None:
-            shown.set_postfix_str(f"margin {evaluate.worst.margin:.4g} {evaluate.unit}")
+class _Attacks(NamedTuple):
+    """All attacks, as `solvers.sqp` evaluates them."""
 
-
-class Worst(NamedTuple):
-    """The run with the smallest margin so far."""
-
-    margin: float
-    u: np.ndarray
-    status: int
-
-
-class MarginEvaluator:
-    """Margins and their gradients at u, (S, d), for the solver; stores the worst run.
-
-    Args:
-      cube: the set.
-      peak: of the deficit that is minus the margin.
-      dt: time step [s].
-      request: what is run.
-      starts: number S of attacks.
-    """
-
-    def __init__(self, cube: Cube, peak: Peak, dt: float, request: RunRequest, starts: int):
-        self.dtype = cube.uncertain.scenario.initial.q.dtype
-        step = jnp.asarray(dt, self.dtype)
-        self.margins = partial(_margins, cube, astype(peak, self.dtype), step, request=request)
-        self.unit = unit_text(cube.uncertain.scenario, DEFICITS[peak.signal])
-        size = cube.size
-        self.space = SearchSpace(Box(np.full(size, 0.5), np.zeros(size), np.ones(size)))
-        self.active = np.ones(starts, bool)
-        self.worst: Worst | None = None
-        self.history: list[np.ndarray] = []
+    problem: WorstCase
+    space: SearchSpace
+    active: np.ndarray
 
     def __call__(self, u: np.ndarray) -> Derivatives:
-        """Value and derivatives; infinite where a run says nothing about the law."""
-        found = self.margins(jnp.asarray(u, self.dtype))
-        margins, gradients, status = (np.asarray(x) for x in found)
-        fine = np.isfinite(margins) & (status & int(UNINFORMATIVE) == 0)
-        self.history.append(np.where(fine, margins, np.nan))
-        losses = np.where(fine, margins, np.inf)
-        s = int(np.argmin(losses))
-        if fine[s] and (self.worst is None or margins[s] < self.worst.margin):
-            self.worst = Worst(float(margins[s]), u[s].copy(), int(status[s]))
+        """The margins and their gradients; infinite where a run says nothing about the law."""
+        found = self.problem(u)
         starts, size = u.shape
-        return Derivatives(Value(losses), gradients, np.zeros((starts, size, size)))
+        return Derivatives(Value(found.values), found.gradients, np.zeros((starts, size, size)))
+
+
+def _attack(iterations: int, shown: Any, unit: str, problem: WorstCase) -> None:
+    """All steps of all attacks."""
+    d, starts = problem.cube.size, problem.starts
+    space = SearchSpace(Box(np.full(d, 0.5), np.zeros(d), np.ones(d)))
+    attacks = _Attacks(problem, space, np.ones(starts, bool))
+    state = SOLVER.init(space, problem.points())
+    for step in range(iterations + 1):
+        for attack in state:
+            attack.trial = _admissible(problem.why_unusable, attack.z, attack.trial)
+        SOLVER.step(attacks, state, SOLVER.tolerance)
+        converged = np.flatnonzero(SOLVER.converged(state)).tolist()
+        if converged:
+            points = problem.points(step + 1)
+            for s in converged:
+                SOLVER.restart(space, state, s, points[s])
+        shown.update(1)
+        if problem.worst is not None:
+            shown.set_postfix_str(f"margin {problem.worst.loss:.4g} {unit}")
 
 
 def _admissible(
@@ -275,6 +245,14 @@ def _admissible(
             return trial
         trial = 0.5 * (accepted + trial)
     return accepted.copy()
+
+
+def _losses(cube: Cube, peak: Peak, dt: jax.Array, request: RunRequest, u: np.ndarray) -> Losses:
+    """The margins at u, (S, d), their gradients, and the status of each run."""
+    found = _margins(cube, peak, dt, jnp.asarray(u, dt.dtype), request=request)
+    margins, gradients, status = (np.asarray(x) for x in found)
+    fine = np.isfinite(margins) & (status & int(UNINFORMATIVE) == 0)
+    return Losses(np.where(fine, margins, np.inf), gradients, status)
 
 
 @programs.jit(static_argnames="request")

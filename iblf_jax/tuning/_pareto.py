@@ -38,7 +38,7 @@ import numpy as np
 from iblf_jax.core import checks, notices
 from iblf_jax.core.presentation import Result, present
 from iblf_jax.core.progress import announced, bar
-from iblf_jax.engine import MAX_FORWARD_NUMBERS, differentiates_forward
+from iblf_jax.engine import MAX_FORWARD_NUMBERS, differentiates_forward, takes_runs
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies.designs import MAX_RUNS
@@ -121,6 +121,7 @@ def non_dominated(points: np.ndarray) -> np.ndarray:
 
 @notices.each_warning_once
 @announced("compiling the programs of a search for a Pareto front")
+@takes_runs
 def pareto(
     scenario: Scenario,
     parameters: Sequence[str | Tunable],
@@ -154,6 +155,7 @@ def pareto(
       iterations: steps for each at most; an end may take three times as many.
       tolerance: relative change of the loss below which a point has converged.
       progress: whether to show a progress bar; on a terminal or in a notebook, if not given.
+      runs_as: an `ij.Runs`, in place of its fields.
 
     Returns:
       A `Front`.

@@ -18,6 +18,7 @@ import numpy as np
 from iblf_jax.core import checks, notices
 from iblf_jax.core.progress import announced, bar
 from iblf_jax.core.units import POSITION
+from iblf_jax.engine import takes_runs
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.units import unit_text
@@ -60,6 +61,7 @@ POLISH_STEPS = 15
 @notices.each_warning_once
 @checks.known_keywords
 @announced("compiling the programs of a search for gains")
+@takes_runs
 def tune(
     scenario: Scenario,
     parameters: Sequence[str | Tunable],
@@ -123,6 +125,7 @@ def tune(
         from it.
       progress: whether to show a progress bar, or a function that is called with the `Search` after
         each step.  If not given, a progress bar is shown on a terminal and in a notebook.
+      runs_as: an `ij.Runs`, in place of its fields.
 
     Returns:
       A `TuneResult`: scenario, history, report, plot.
@@ -154,7 +157,7 @@ def tune(
     solver, mode = chosen_solver(options.solver, problem.size)
     search = search_of(problem, solver, mode, options.effort)
     stopped = _run(search, mode, options.effort.iterations, checkpoint, options)
-    if not np.any(np.isfinite(search.state["incumbent_key"])):
+    if not np.any(np.isfinite(search.state.incumbent_key)):
         raise problem.unstable_error()
     outcome = _outcome(search, stopped)
     polished = _polished(search, outcome, mode)
@@ -223,7 +226,7 @@ def _run(
         mark = fingerprint(search.evaluate, search.solver, mode, iterations)
         if checkpoint.exists():
             load_checkpoint(checkpoint, search, mark)
-    with bar(options.show, iterations, int(search.state["iteration"]), unit="steps") as shown:
+    with bar(options.show, iterations, search.state.iteration, unit="steps") as shown:
         unit = unit_text(search.evaluate.problem.scenario, POSITION)
 
         def on_step(search: Search) -> None:
@@ -289,7 +292,7 @@ def _outcome(search: Search, stopped: str) -> Outcome:
     found = search.conditions()
     if stopped == "converged" or search.is_violated or found.hold:
         stopped = _reason_from_conditions(search, found)
-    z = search.state["incumbent_z"]
+    z = search.state.incumbent_z
     return Outcome(search, z, stopped, found.multipliers, found.residuals, _tried(search))
 
 
@@ -299,7 +302,7 @@ def _reason_from_conditions(search: Search, found: Conditions) -> str:
         return NO_GRADIENT
     if search.is_violated:
         # Without phases the search itself minimised the violation.
-        is_minimised = search.strategy is None or bool(search.state["repair_ended"])
+        is_minimised = search.strategy is None or search.state.repair_ended
         return INFEASIBLE if is_minimised and found.hold else NOT_FOUND_FEASIBLE
     if found.at_kink:
         return AT_KINK
@@ -310,7 +313,7 @@ def _tried(search: Search) -> tuple[str, ...]:
     """What a search in phases did, in words; empty for a search without phases."""
     if search.strategy is None:
         return ()
-    valleys, reached = search.state["valleys"].tolist()
+    valleys, reached = search.state.valleys.tolist()
     starts = search.strategy.starts
     lines = []
     if starts > 1:
@@ -321,10 +324,10 @@ def _tried(search: Search) -> tuple[str, ...]:
             f"searches from {starts} of {len(search.strategy.screening.points)} points: they were"
             f" in {valleys} {noun} when they ended or were dropped, {reached} in the best one"
         )
-    phase = int(search.state["phase"])
-    if phase == REPAIR or search.state["repair_ended"]:
-        least = float(search.state["incumbent_key"][0])
-        how = "to a stationary point" if search.state["repair_ended"] else "without converging"
+    phase = search.state.phase
+    if phase == REPAIR or search.state.repair_ended:
+        least = float(search.state.incumbent_key[0])
+        how = "to a stationary point" if search.state.repair_ended else "without converging"
         lines.append(
             f"no gains that keep the requirements were found; the largest excess was minimised from"
             f" up to {REPAIR_STARTS} points, {how}: {least:.3g}"
@@ -399,9 +402,9 @@ def _result(
         setup=setup,
         multipliers=tuple(map(float, outcome.multipliers)),
         residuals=tuple(map(float, outcome.residuals)),
-        probes=int(search.state["plain_values"]),
+        probes=search.state.plain_values,
         tried=outcome.tried,
-        objective=float(outcome.search.state["incumbent_key"][1]),
+        objective=float(outcome.search.state.incumbent_key[1]),
     )
 
 
@@ -413,7 +416,7 @@ def _tuned_values(problem: TuningProblem, z: np.ndarray) -> dict[str, np.ndarray
 
 def _history(search: Search) -> dict[str, np.ndarray]:
     """The history with the start that found the best result in the first column."""
-    starts = len(search.state["finished"])
+    starts = len(search.state.finished)
     order = sorted(range(starts), key=lambda s: s != search.best)
     history = {name: np.stack(x) for name, x in search.history.items()}
     return {name: x if name == "evaluations" else x[:, order] for name, x in history.items()}

@@ -25,7 +25,7 @@ from iblf_jax.core.pytree import field_values
 from iblf_jax.core.whole_files import written_whole
 from iblf_jax.studies.store_config import computed_by, structure
 from iblf_jax.tuning.evaluation import Evaluator
-from iblf_jax.tuning.search import Search
+from iblf_jax.tuning.search import Search, SearchState
 from iblf_jax.tuning.solvers import Solver
 
 NOT_PART_OF_THE_PROBLEM = ("patience",)
@@ -107,9 +107,9 @@ def _program_of(optimiser: Any) -> str:
         return _digest_of(jax.jit(steps).trace(jnp.zeros(1)))
 
 
-def _named_leaves(state: Any) -> dict[str, np.ndarray]:
+def _named_leaves(state: SearchState) -> dict[str, np.ndarray]:
     """Name -> array of every leaf of a state."""
-    pairs = jax.tree_util.tree_leaves_with_path(state)
+    pairs = jax.tree_util.tree_leaves_with_path(vars(state))
     return {f"state{jax.tree_util.keystr(path)}": np.asarray(x) for path, x in pairs}
 
 
@@ -157,8 +157,10 @@ def load_checkpoint(path: str | os.PathLike, search: Search, mark: str) -> None:
     if _shapes(found) != _shapes(expected):
         remedy = "An array is missing in it: delete it or name another file."
         raise checks.fail("checkpoint", str(path), "a complete checkpoint", remedy)
-    structure = jax.tree.structure(search.state)
-    search.state = jax.tree.unflatten(structure, [found[name] for name in expected])
+    before = vars(search.state)
+    loaded = jax.tree.unflatten(jax.tree.structure(before), [found[name] for name in expected])
+    numbers = {k: type(x)(loaded[k]) for k, x in before.items() if isinstance(x, int)}
+    search.state = SearchState(**loaded | numbers)
     search.history = {
         name.removeprefix("history_"): list(x)
         for name, x in arrays.items()

@@ -20,7 +20,7 @@ together by small changes of the gains.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -101,7 +101,7 @@ def conditions(
 
 
 def conditions_of_penalty(
-    evaluate: Evaluator, found: Derivatives, row: int, z: np.ndarray, state: dict[str, Any]
+    evaluate: Evaluator, found: Derivatives, row: int, z: np.ndarray, y: np.ndarray, mu: float
 ) -> Conditions:
     """The conditions for a solver with the requirements in an augmented Lagrangian.
 
@@ -110,10 +110,10 @@ def conditions_of_penalty(
 
     Args:
       evaluate, found, row, z: as `conditions`.
-      state: of the search, with y and mu of each start.
+      y, mu: multipliers, (R,), and penalty parameter of the start.
     """
     excess = found.value.smooth_excess[row]
-    multipliers = np.maximum(state["multipliers"][row] + state["penalty"][row] * excess, 0.0)
+    multipliers = np.maximum(y + mu * excess, 0.0)
     worst = float(np.max(found.value.exact_excess[row], initial=0.0))
     complementarity = float(np.sum(np.abs(multipliers * excess)))
     stationarity = free_slope(evaluate.space.box, z, found.gradient[row])

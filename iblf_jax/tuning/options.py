@@ -11,9 +11,8 @@ import jax
 
 from iblf_jax.core import checks
 from iblf_jax.core.families import required_members
-from iblf_jax.engine import check_backend, differentiates_forward
+from iblf_jax.engine import Runs, differentiates_forward
 from iblf_jax.studies.designs import MAX_RUNS
-from iblf_jax.studies.options import checked_run_options
 from iblf_jax.studies.statistics import check_confidence
 from iblf_jax.tuning.robust import as_risk
 from iblf_jax.tuning.solvers import SOLVERS, Solver
@@ -25,29 +24,26 @@ from iblf_jax.tuning.solvers import SOLVERS, Solver
     meta_fields=("method", "backend", "runs", "risk"),
 )
 @dataclasses.dataclass(frozen=True, eq=False)
-class TuningRunOptions:
+class TuningRunOptions(Runs):
     """The options of the runs of a tuning, which its problem, its result and its report share.
 
     To add an option, add a field of this class and a keyword argument of `tune`, which passes it to
     `TuningProblem.build`.
     """
 
-    duration: float
-    """Length of a run [s]."""
-    dt: float = 1e-3
-    """Time step [s]."""
-    method: str = "rk4"
-    """Integrator."""
-    backend: str = "auto"
-    """Executor of runs without derivatives and in forward mode."""
     perturbations: Any = None
     """Path -> `Perturbation`; if empty, there is one nominal run."""
     runs: int = 1
     """Number of perturbed runs in the loss."""
-    seed: Any = 0
-    """Seed of the draws of the perturbed runs."""
     risk: Any = "mean"
     """How the losses of the runs are combined; a `Risk` once it is checked."""
+
+    # Objects with traced numbers have no value to compare.
+    __eq__ = object.__eq__
+    __hash__ = object.__hash__
+
+    def __post_init__(self) -> None:
+        """Checks nothing, because JAX makes the object with traced numbers too."""
 
     def checked(self) -> Self:
         """The options after a check, converted to their types.
@@ -57,12 +53,14 @@ class TuningRunOptions:
         Raises:
           ValueError: an option that is not valid; the message names it and the remedy.
         """
-        return dataclasses.replace(
-            checked_run_options(self),
-            backend=check_backend(self.backend),
+        checked = dataclasses.replace(
+            self,
+            runs=checks.positive_integer("runs", self.runs, most=MAX_RUNS),
             perturbations={} if self.perturbations is None else self.perturbations,
             risk=as_risk(self.risk),
         )
+        Runs.__post_init__(checked)
+        return checked
 
 
 @dataclasses.dataclass(frozen=True)

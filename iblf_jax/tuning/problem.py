@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -136,18 +136,17 @@ class TuningProblem:
         # Terms without a scale are evaluated once with scale 1, for their values at the start.
         arrays = complete(goal, np.ones(len(goal.terms))), by_path, run.dt
         scaled, by_path, dt = jax.tree.map(lambda x: jnp.asarray(x, dtype), arrays)
-        steps = checks.whole_steps(run.duration, run.dt)
         problem = TuningProblem(
             cases=UncertainScenario(scenario, by_path, jax.random.PRNGKey(run.seed)),
             objective=scaled,
             dt=dt,
             box=box,
             options=dataclasses.replace(
-                run, seed=np.uint32(run.seed), perturbations=dict(run.perturbations)
+                run, seed=cast(int, np.uint32(run.seed)), perturbations=dict(run.perturbations)
             ),
             blocks=blocks,
             targets=targets,
-            request=RunRequest.of(scenario, steps=steps, method=run.method, backend=run.backend),
+            request=run.request(scenario),
             allowed=tuple(float(r.allowed) for r in goal.requirements),
             piece_counts=piece_counts(scaled, scenario, run.duration),
             on_front=on_front,

@@ -45,6 +45,7 @@ retired before the first step.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -113,27 +114,82 @@ class Strategy(NamedTuple):
     may begin at more points."""
 
 
+@dataclasses.dataclass
+class SearchState:
+    """The state of a search from S starts, which a checkpoint stores."""
+
+    solver: Any
+    """State of the solver."""
+    best_z: np.ndarray
+    """Best trial of each start, (S, p)."""
+    best_key: np.ndarray
+    """Violation and objective at these trials, (S, 2)."""
+    incumbent_z: np.ndarray
+    """(p,)."""
+    multipliers: np.ndarray
+    """y of the augmented Lagrangian, (S, R)."""
+    penalty: np.ndarray
+    """mu of the augmented Lagrangian, (S,)."""
+    largest_excess: np.ndarray
+    """Largest G at the last update of y, (S,)."""
+    steps_since_update: np.ndarray
+    """Steps since y was updated, (S,)."""
+    updates: np.ndarray
+    """Updates of y in this stage, (S,)."""
+    finished: np.ndarray
+    """See the head of this module, (S,) bool."""
+    retired: np.ndarray
+    """See the head of this module, (S,) bool."""
+    incumbent_key: np.ndarray = dataclasses.field(default_factory=lambda: np.full(2, np.inf))
+    """Violation and objective of the incumbent, (2,)."""
+    valleys: np.ndarray = dataclasses.field(default_factory=lambda: np.asarray([1, 1]))
+    """See `Search._valleys`, (2,)."""
+    iteration: int = 0
+    """Steps in all."""
+    phase: int = OPTIMISE
+    """OPTIMISE, REPAIR or SECOND_SEARCH."""
+    phase_steps: int = 0
+    """Steps in this phase."""
+    stage: int = 0
+    """0 to the number of sharpenings."""
+    stage_steps: int = 0
+    """Steps in this stage."""
+    steps_without_better: int = 0
+    """Steps since the best result of all starts improved."""
+    evaluations: int = 0
+    """Points that were evaluated with derivatives."""
+    plain_values: int = 0
+    """Points that were evaluated without derivatives."""
+    repair_ended: bool = False
+    """Whether REPAIR ended at a stationary point of the largest excess."""
+
+    @staticmethod
+    def first(solver: Any, z: np.ndarray, requirements: int) -> SearchState:
+        """The state before the first step.
+
+        Args:
+          solver: state of the solver.
+          z: starting points, (S, p).
+          requirements: their number R.
+        """
+        starts = len(z)
+        return SearchState(
+            solver=solver,
+            best_z=z.copy(),
+            best_key=np.full((starts, 2), np.inf),
+            incumbent_z=z[0].copy(),
+            multipliers=np.zeros((starts, requirements)),
+            penalty=np.full(starts, FIRST_PENALTY),
+            largest_excess=np.full(starts, np.inf),
+            steps_since_update=np.zeros(starts, int),
+            updates=np.zeros(starts, int),
+            finished=np.zeros(starts, bool),
+            retired=np.zeros(starts, bool),
+        )
+
+
 class Search:
     """A search from S starts; `run` continues from its `state`.
-
-    The state is a pytree of arrays, which a checkpoint stores.  Its entries are
-
-    | Entry | Shape | Meaning |
-    |---|---|---|
-    | `solver` | | state of the solver |
-    | `iteration`, `phase_steps`, `stage_steps` | () | steps in all, in this phase, in this stage |
-    | `evaluations`, `plain_values` | () | points evaluated with derivatives, and without |
-    | `phase`, `stage` | () | OPTIMISE, REPAIR or SECOND_SEARCH; 0 to the number of sharpenings |
-    | `steps_without_better` | () | steps since the best result of all starts improved |
-    | `multipliers`, `penalty` | (S, R), (S,) | y and mu of the augmented Lagrangian |
-    | `steps_since_update`, `updates` | (S,) | steps since y was updated, updates in this stage |
-    | `largest_excess` | (S,) | largest G at the last update of y |
-    | `finished`, `retired` | (S,) | see above |
-    | `best_z` | (S, p) | best trial of each start |
-    | `best_key` | (S, 2) | violation and objective at these trials |
-    | `incumbent_z`, `incumbent_key` | (p,), (2,) | the same for the incumbent |
-    | `valleys` | (2,) | see `_valleys` |
-    | `repair_ended` | () | whether REPAIR ended at a stationary point of the largest excess |
 
     Args:
       evaluate: the problem.
@@ -156,48 +212,24 @@ class Search:
         self.stages = 0
         if is_smoothed(self.smoothest):
             self.stages = solver.sharpenings
-        starts = len(z)
-        requirements = len(evaluate.problem.allowed)
         self.history: dict[str, list[np.ndarray]] = {}
         self.last_conditions: tuple[int, Conditions] | None = None
         """The number of steps before the conditions were determined, and the conditions."""
-        self.state: dict[str, Any] = {
-            "solver": solver.init(evaluate.space, z),
-            "iteration": np.asarray(0),
-            "evaluations": np.asarray(0),
-            "stage": np.asarray(0),
-            "stage_steps": np.asarray(0),
-            "steps_without_better": np.asarray(0),
-            "multipliers": np.zeros((starts, requirements)),
-            "penalty": np.full(starts, FIRST_PENALTY),
-            "steps_since_update": np.zeros(starts, int),
-            "updates": np.zeros(starts, int),
-            "largest_excess": np.full(starts, np.inf),
-            "finished": np.zeros(starts, bool),
-            "retired": np.zeros(starts, bool),
-            "best_z": z.copy(),
-            "best_key": np.full((starts, 2), np.inf),
-            "phase": np.asarray(OPTIMISE),
-            "phase_steps": np.asarray(0),
-            "plain_values": np.asarray(0),
-            "incumbent_z": z[0].copy(),
-            "incumbent_key": np.full(2, np.inf),
-            "valleys": np.asarray([1, 1]),
-            "repair_ended": np.asarray(False),
-        }
+        requirements = len(evaluate.problem.allowed)
+        self.state = SearchState.first(solver.init(evaluate.space, z), z, requirements)
         evaluate.on_values = self.consider_values
         if strategy is not None:
             self.consider_values(strategy.screening.points, strategy.screening.found)
 
     def retire(self, starts: Any) -> None:
         """Ends some starts for the rest of the phase."""
-        self.state["finished"][starts] = True
-        self.state["retired"][starts] = True
+        self.state.finished[starts] = True
+        self.state.retired[starts] = True
 
     @property
     def best(self) -> int:
         """The start that found the best result so far."""
-        keys = self.state["best_key"]
+        keys = self.state.best_key
         return min(range(len(keys)), key=lambda s: tuple(keys[s]))
 
     @property
@@ -205,22 +237,22 @@ class Search:
         """Whether the incumbent violates a requirement or a bound, so that no feasible point is
         known.
         """
-        return bool(self.state["incumbent_key"][0] > 0)
+        return bool(self.state.incumbent_key[0] > 0)
 
     def consider_values(self, z: np.ndarray, found: Value) -> None:
         """Counts points, (N, p), that were evaluated without derivatives, and replaces the
         incumbent where one of them is better.
         """
-        self.state["plain_values"] = self.state["plain_values"] + len(z)
+        self.state.plain_values += len(z)
         keys = _keys(found)
         for i in np.flatnonzero(found.valid).tolist():
             self._consider(z[i], keys[i])
 
     def _consider(self, z: np.ndarray, key: tuple[float, float]) -> None:
         """Replaces the incumbent by a point, (p,), where that is better."""
-        if np.isfinite(key[1]) and key < tuple(self.state["incumbent_key"]):
-            self.state["incumbent_key"] = np.array(key)
-            self.state["incumbent_z"] = np.array(z)
+        if np.isfinite(key[1]) and key < tuple(self.state.incumbent_key):
+            self.state.incumbent_key = np.array(key)
+            self.state.incumbent_z = np.array(z)
 
     def run(self, iterations: int, on_step: Callable[[Search], None] = lambda search: None) -> str:
         """Runs all phases; returns why the last one ended.
@@ -238,14 +270,14 @@ class Search:
         """Takes steps until the phase ends; returns why it ended."""
         state = self.state
         patience = self.solver.patience
-        if state["phase"] == REPAIR:
+        if state.phase == REPAIR:
             iterations = min(iterations, REPAIR_STEPS)
-        while int(state["phase_steps"]) < iterations:
-            finished = bool(np.all(state["finished"]))
-            exhausted = int(state["steps_without_better"]) >= patience
-            if state["phase"] == REPAIR and not self.is_violated:
+        while state.phase_steps < iterations:
+            finished = bool(np.all(state.finished))
+            exhausted = state.steps_without_better >= patience
+            if state.phase == REPAIR and not self.is_violated:
                 return "the requirements are kept"
-            if int(state["stage"]) < self.stages:
+            if state.stage < self.stages:
                 if finished or exhausted or self._stage_is_long():
                     self._next_stage()
             elif finished:
@@ -254,36 +286,26 @@ class Search:
                 return f"no improvement in {patience} steps"
             self._step()
             on_step(self)
-        return "converged" if np.all(state["finished"]) else "iterations used up"
+        return "converged" if np.all(state.finished) else "iterations used up"
 
     # ------------------------------------------------------------------------------------ phases
 
     def _next_phase(self, stopped: str) -> bool:
         """Begins a further phase where one is needed; returns whether it has."""
-        phase = int(self.state["phase"])
+        phase = self.state.phase
         if self.strategy is None or phase == SECOND_SEARCH:
             return False
+        if phase == REPAIR and self.is_violated:
+            self.state.repair_ended = bool(self.conditions().hold)
+            return False
         if phase == OPTIMISE:
-            return self._after_optimise(stopped)
-        return self._after_repair()
-
-    def _after_optimise(self, stopped: str) -> bool:
-        """`_next_phase` after the first phase."""
-        self.state["valleys"] = self._valleys()
-        self._compare_multiples()
-        if self.is_violated:
-            self._begin_phase(REPAIR, self._repair_starts())
-            return True
-        if stopped == "converged" and self._is_incumbent_explored() and self.conditions().hold:
-            return False
-        self._begin_phase(SECOND_SEARCH, self._second_search_starts())
-        return True
-
-    def _after_repair(self) -> bool:
-        """`_next_phase` after the phase in which the largest excess was minimised."""
-        if self.is_violated:
-            self.state["repair_ended"] = np.asarray(self.conditions().hold)
-            return False
+            self.state.valleys = self._valleys()
+            self._compare_multiples()
+            if self.is_violated:
+                self._begin_phase(REPAIR, self._repair_starts())
+                return True
+            if stopped == "converged" and self._is_incumbent_explored() and self.conditions().hold:
+                return False
         self._begin_phase(SECOND_SEARCH, self._second_search_starts())
         return True
 
@@ -293,7 +315,7 @@ class Search:
         A sampling period is a whole number of steps, so that no derivative by it exists.
         """
         problem = self.evaluate.problem
-        z = self.state["incumbent_z"]
+        z = self.state.incumbent_z
         others = along(problem.blocks, problem.box, z, MOST_MULTIPLES)
         if len(others):
             self.evaluate.values(others)
@@ -302,7 +324,7 @@ class Search:
         """The optimality conditions at the incumbent, which is evaluated once more; determined once
         if no step follows.
         """
-        iteration = int(self.state["iteration"])
+        iteration = self.state.iteration
         if self.last_conditions is None or self.last_conditions[0] != iteration:
             self.last_conditions = iteration, self._conditions()
         return self.last_conditions[1]
@@ -318,16 +340,17 @@ class Search:
         row, z = self._converged_near_incumbent()
         found = self._derivatives_at(row, z)
         if self._is_as_good(found.value, row):
-            state["incumbent_z"] = np.array(z)
-            state["incumbent_key"] = np.array(_keys(found.value)[row])
-        elif not np.array_equal(z, state["incumbent_z"]):
-            z = state["incumbent_z"]
+            state.incumbent_z = np.array(z)
+            state.incumbent_key = np.array(_keys(found.value)[row])
+        elif not np.array_equal(z, state.incumbent_z):
+            z = state.incumbent_z
             found = self._derivatives_at(row, z)
         if not self.solver.handles_requirements:
-            return conditions_of_penalty(self.evaluate, found, row, z, state)
+            y, mu = state.multipliers[row], state.penalty[row]
+            return conditions_of_penalty(self.evaluate, found, row, z, y, mu)
         nearby = []
         if isinstance(self.solver, SQP):
-            nearby = self.solver.nearby_pieces(state["solver"], z, KINK_REACH)
+            nearby = self.solver.nearby_pieces(state.solver, z, KINK_REACH)
         return conditions(self.evaluate, found, row, z, violated=self.is_violated, nearby=nearby)
 
     def _converged_near_incumbent(self) -> tuple[int, np.ndarray]:
@@ -336,12 +359,12 @@ class Search:
         Where there is none, or the solver is not `SQP`: the start that found the best result, and
         the incumbent itself.
         """
-        z = self.state["incumbent_z"]
+        z = self.state.incumbent_z
         if not isinstance(self.solver, SQP):  # the state of another solver cannot be read
             return self.best, z
         converged = {}
         distances = {}
-        for s, own in enumerate(self.state["solver"]):
+        for s, own in enumerate(self.state.solver):
             distance = float(np.max(np.abs(own.z - z)))
             if own.done and distance <= SAME_VALLEY:
                 converged[s] = own.z
@@ -356,7 +379,7 @@ class Search:
         if not found.valid[row]:
             return False
         violation, objective = _keys(found)[row]
-        least, best = self.state["incumbent_key"]
+        least, best = self.state.incumbent_key
         small = self.solver.tolerance * max(1e-3, abs(float(best)))
         return violation <= least and objective <= best + small
 
@@ -367,16 +390,16 @@ class Search:
         self._prepare_evaluation()
         evaluate.active = np.arange(len(evaluate.active)) == row
         found = evaluate(np.tile(z, (len(evaluate.active), 1)))
-        self.state["evaluations"] = self.state["evaluations"] + evaluate.evaluations - before
-        self.history["evaluations"][-1] = self.state["evaluations"]
+        self.state.evaluations += evaluate.evaluations - before
+        self.history["evaluations"][-1] = np.array(self.state.evaluations)
         return found
 
     def _is_incumbent_explored(self) -> bool:
         """Whether a start that was not retired has its best trial in the valley of the incumbent.
         Otherwise only screened points or retired starts are known there.
         """
-        distance = np.max(np.abs(self.state["best_z"] - self.state["incumbent_z"]), axis=1)
-        return bool(np.any((distance <= SAME_VALLEY) & ~self.state["retired"]))
+        distance = np.max(np.abs(self.state.best_z - self.state.incumbent_z), axis=1)
+        return bool(np.any((distance <= SAME_VALLEY) & ~self.state.retired))
 
     def _begin_phase(self, phase: int, z: np.ndarray) -> None:
         """Begins a phase with the first k starts at the points z, (k, p), k <= S; the other starts
@@ -385,16 +408,16 @@ class Search:
         state = self.state
         self.retire(slice(None))
         for s, start in enumerate(z):
-            self.solver.restart(self._space(phase), state["solver"], s, start)
-            state["finished"][s] = False
-            state["retired"][s] = False
-            state["best_z"][s] = start
-            state["best_key"][s] = np.inf
-        state["phase"] = np.asarray(phase)
-        state["phase_steps"] = np.asarray(0)
-        state["stage"] = np.asarray(self.stages)
-        state["stage_steps"] = np.asarray(0)
-        state["steps_without_better"] = np.asarray(0)
+            self.solver.restart(self._space(phase), state.solver, s, start)
+            state.finished[s] = False
+            state.retired[s] = False
+            state.best_z[s] = start
+            state.best_key[s] = np.inf
+        state.phase = phase
+        state.phase_steps = 0
+        state.stage = self.stages
+        state.stage_steps = 0
+        state.steps_without_better = 0
 
     def _space(self, phase: int) -> SearchSpace:
         """The solver's view of the problem, in which REPAIR counts the largest excess only."""
@@ -417,20 +440,20 @@ class Search:
         points = spread_points(problem.box, count, int(problem.options.seed) + REPAIR_SEED_OFFSET)
         new = ranked(points, self.evaluate.values(points))
         both = Screening(*(_joined(x, y) for x, y in zip(first, new, strict=True)))
-        best = self.state["incumbent_z"][None]
+        best = self.state.incumbent_z[None]
         if not self.is_violated:
             return best
-        starts = min(REPAIR_STARTS, len(self.state["finished"])) - 1
+        starts = min(REPAIR_STARTS, len(self.state.finished)) - 1
         order = np.argsort(both.excess, kind="stable")
         return np.concatenate([best, self._distinct(both, order, starts, best)])
 
     def _second_search_starts(self) -> np.ndarray:
         """The incumbent and the best screened point that is far from all earlier starts, (k, p)."""
         assert self.strategy is not None
-        best = self.state["incumbent_z"][None]
-        explored = np.concatenate([best, self.history["z"][0], self.state["best_z"]])
+        best = self.state.incumbent_z[None]
+        explored = np.concatenate([best, self.history["z"][0], self.state.best_z])
         order = np.argsort(self.strategy.screening.merit, kind="stable")
-        count = min(2, len(self.state["finished"])) - 1
+        count = min(2, len(self.state.finished)) - 1
         further = self._distinct(self.strategy.screening, order, count, explored)
         return np.concatenate([best, further])
 
@@ -447,8 +470,8 @@ class Search:
         """Number of valleys in which the starts ended or were retired, and number of starts in the
         best valley, (2,).
         """
-        reached = np.flatnonzero(np.isfinite(self.state["best_key"][:, 1]))
-        z = self.state["best_z"][reached]
+        reached = np.flatnonzero(np.isfinite(self.state.best_key[:, 1]))
+        z = self.state.best_z[reached]
         near = np.max(np.abs(z[:, None] - z[None]), axis=2) <= SAME_VALLEY
         # Two starts are in one valley if a chain of near starts connects them: each product of
         # the matrix with itself doubles the length of the chains.
@@ -462,10 +485,10 @@ class Search:
         """Retires the worse half of the starts after `selection` steps of the phase, and all but
         the best one after twice as many.
         """
-        if self.strategy is None or self.state["phase"] == REPAIR:
+        if self.strategy is None or self.state.phase == REPAIR:
             return
-        steps = int(self.state["phase_steps"])
-        remaining = np.flatnonzero(~self.state["retired"]).tolist()
+        steps = self.state.phase_steps
+        remaining = np.flatnonzero(~self.state.retired).tolist()
         order = sorted(remaining, key=self._rank)
         if steps == self.strategy.selection:
             self.retire(order[checks.ceil_div(len(order), 2) :])
@@ -478,8 +501,8 @@ class Search:
 
         Starts are not ranked by the violation first, because a small violation may still vanish.
         """
-        violation, objective = self.state["best_key"][start]
-        size = max(abs(float(self.state["incumbent_key"][1])), 1e-12)
+        violation, objective = self.state.best_key[start]
+        size = max(abs(float(self.state.incumbent_key[1])), 1e-12)
         return float(objective) / size + EXCESS_WEIGHT * float(violation)
 
     # ------------------------------------------------------------------------------------ stages
@@ -488,34 +511,28 @@ class Search:
         """Whether a stage has taken its largest number of steps, which only problems without
         requirements have.
         """
-        if self.state["multipliers"].shape[1] > 0:
+        if self.state.multipliers.shape[1] > 0:
             return False
-        if np.sum(~self.state["retired"]) > 1:
-            return int(self.state["stage_steps"]) >= COARSE_STEPS
-        return int(self.state["stage_steps"]) >= STEPS_PER_UPDATE
+        if np.sum(~self.state.retired) > 1:
+            return self.state.stage_steps >= COARSE_STEPS
+        return self.state.stage_steps >= STEPS_PER_UPDATE
 
     def _next_stage(self) -> None:
         """Reduces the smoothing and retires the worse half of the starts."""
         state = self.state
-        remaining = np.flatnonzero(~state["retired"]).tolist()
-        order = sorted(remaining, key=lambda s: tuple(state["best_key"][s]))
+        remaining = np.flatnonzero(~state.retired).tolist()
+        order = sorted(remaining, key=lambda s: tuple(state.best_key[s]))
         half = checks.ceil_div(len(order), 2)
         for s in order[:half]:
-            state["finished"][s] = False
-            state["steps_since_update"][s] = 0
-            state["updates"][s] = 0
+            state.finished[s] = False
+            state.steps_since_update[s] = 0
+            state.updates[s] = 0
             if is_smoothed(self.smoothest):  # otherwise the loss is still the same
-                self.solver.restart(self.evaluate.space, state["solver"], s)
+                self.solver.restart(self.evaluate.space, state.solver, s)
         self.retire(order[half:])
-        state["stage"] = state["stage"] + 1
-        state["stage_steps"] = np.asarray(0)
-        state["steps_without_better"] = np.asarray(0)
-
-    def _tolerance(self) -> float:
-        """The tolerance of the solver in the present stage."""
-        if int(self.state["stage"]) == self.stages:
-            return self.solver.tolerance
-        return max(self.solver.tolerance, COARSE_TOLERANCE)
+        state.stage += 1
+        state.stage_steps = 0
+        state.steps_without_better = 0
 
     # ------------------------------------------------------------------------------------- steps
 
@@ -525,21 +542,24 @@ class Search:
         self._prepare_evaluation()
         before = self.evaluate.evaluations
         evaluate: Any = self.evaluate
-        if state["phase"] == REPAIR:
+        if state.phase == REPAIR:
             evaluate = ExcessOnly(self.evaluate, self._space(REPAIR))
-        z, found = self.solver.step(evaluate, state["solver"], self._tolerance())
-        state["evaluations"] = state["evaluations"] + self.evaluate.evaluations - before
+        tolerance = self.solver.tolerance
+        if state.stage < self.stages:
+            tolerance = max(tolerance, COARSE_TOLERANCE)
+        z, found = self.solver.step(evaluate, state.solver, tolerance)
+        state.evaluations += self.evaluate.evaluations - before
         improved = self._keep_best(z, found)
-        state["steps_without_better"] = state["steps_without_better"] + 1
+        state.steps_without_better += 1
         if improved:
-            state["steps_without_better"] = np.asarray(0)
+            state.steps_without_better = 0
         self._record(z, found)
-        converged = self.solver.converged(state["solver"])
+        converged = self.solver.converged(state.solver)
         for s in range(len(z)):
             self._update_start(s, bool(converged[s]), found)
-        state["iteration"] = state["iteration"] + 1
-        state["phase_steps"] = state["phase_steps"] + 1
-        state["stage_steps"] = state["stage_steps"] + 1
+        state.iteration += 1
+        state.phase_steps += 1
+        state.stage_steps += 1
         self._select()
 
     def _prepare_evaluation(self) -> None:
@@ -547,18 +567,18 @@ class Search:
         state = self.state
         evaluate = self.evaluate
         if self.stages:
-            objective = sharper(self.smoothest, SHARPENING ** -int(state["stage"]))
+            objective = sharper(self.smoothest, SHARPENING**-state.stage)
             evaluate.problem = evaluate.problem.with_objective(objective)
         candidates = evaluate.candidates._replace(
-            multipliers=state["multipliers"].copy(), penalty=state["penalty"].copy()
+            multipliers=state.multipliers.copy(), penalty=state.penalty.copy()
         )
         if self.solver.resample:
             runs = candidates.index.shape[1]
-            first = np.uint32(runs * int(state["iteration"]))
+            first = np.uint32(runs * state.iteration)
             index = np.arange(runs, dtype=np.uint32) + first
             candidates = candidates._replace(index=np.broadcast_to(index, candidates.index.shape))
         evaluate.candidates = candidates
-        evaluate.active = ~state["finished"]
+        evaluate.active = ~state.finished
 
     def _keep_best(self, z: np.ndarray, found: Derivatives) -> bool:
         """Stores the best trial of each start; returns whether the best of all has improved by
@@ -571,15 +591,15 @@ class Search:
         for s in np.flatnonzero(found.value.valid).tolist():
             key = keys[s]
             self._consider(z[s], key)
-            if not np.isfinite(key[1]) or key >= tuple(state["best_key"][s]):
+            if not np.isfinite(key[1]) or key >= tuple(state.best_key[s]):
                 continue
-            overall = tuple(min(map(tuple, state["best_key"])))
+            overall = tuple(min(map(tuple, state.best_key)))
             small = tolerance * max(1e-3, abs(key[1]))
             is_less_violated = key[0] < overall[0] - tolerance
             is_lower = key[0] <= overall[0] and key[1] < overall[1] - small
             improved |= is_less_violated or is_lower
-            state["best_key"][s] = key
-            state["best_z"][s] = z[s]
+            state.best_key[s] = key
+            state.best_z[s] = z[s]
         return improved
 
     def _record(self, z: np.ndarray, found: Derivatives) -> None:
@@ -594,7 +614,7 @@ class Search:
             "margin": value.margin,
             "gradient_norm": np.linalg.norm(found.gradient, axis=-1),
             "valid": value.valid,
-            "evaluations": self.state["evaluations"],
+            "evaluations": self.state.evaluations,
         }
         for name, x in entries.items():
             self.history.setdefault(name, []).append(np.array(x))
@@ -602,31 +622,31 @@ class Search:
     def _update_start(self, s: int, converged: bool, found: Derivatives) -> None:
         """Updates the multipliers of one start if an update is due, or marks it as finished."""
         state = self.state
-        state["steps_since_update"][s] += 1
-        is_due = converged or state["steps_since_update"][s] >= STEPS_PER_UPDATE
-        if state["finished"][s] or not is_due:
+        state.steps_since_update[s] += 1
+        is_due = converged or state.steps_since_update[s] >= STEPS_PER_UPDATE
+        if state.finished[s] or not is_due:
             return
-        in_loss = not self.solver.handles_requirements and state["multipliers"].shape[1] > 0
+        in_loss = not self.solver.handles_requirements and state.multipliers.shape[1] > 0
         if not in_loss or not found.value.valid[s]:
-            state["finished"][s] = converged
+            state.finished[s] = converged
             return
         excess = found.value.smooth_excess[s]
-        multipliers = state["multipliers"][s]
-        penalty = state["penalty"][s]
+        multipliers = state.multipliers[s]
+        penalty = state.penalty[s]
         worst = float(np.max(np.maximum(excess, -multipliers / penalty)))
-        if converged and (abs(worst) < EXCESS_TOLERANCE or state["updates"][s] >= MAX_UPDATES):
-            state["finished"][s] = True
+        if converged and (abs(worst) < EXCESS_TOLERANCE or state.updates[s] >= MAX_UPDATES):
+            state.finished[s] = True
             return
         # The multipliers are updated with the penalty parameter of the past steps, and only then
         # is that increased.
-        state["multipliers"][s] = np.maximum(0.0, multipliers + penalty * excess)
-        if max(worst, 0.0) > 0.25 * state["largest_excess"][s]:
-            state["penalty"][s] = min(PENALTY_FACTOR * penalty, MAX_PENALTY)
-        state["largest_excess"][s] = max(worst, 0.0)
-        state["steps_since_update"][s] = 0
-        state["updates"][s] += 1
-        state["steps_without_better"] = np.asarray(0)
-        self.solver.restart(self.evaluate.space, state["solver"], s)
+        state.multipliers[s] = np.maximum(0.0, multipliers + penalty * excess)
+        if max(worst, 0.0) > 0.25 * state.largest_excess[s]:
+            state.penalty[s] = min(PENALTY_FACTOR * penalty, MAX_PENALTY)
+        state.largest_excess[s] = max(worst, 0.0)
+        state.steps_since_update[s] = 0
+        state.updates[s] += 1
+        state.steps_without_better = 0
+        self.solver.restart(self.evaluate.space, state.solver, s)
 
 
 def _joined(first: Any, second: Any) -> Any:

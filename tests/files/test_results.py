@@ -139,7 +139,7 @@ def _tuned() -> Any:
 def _failure() -> Any:
     law = ij.with_parameters(PAPER, {"initial.q": 0.88})
     start = {"initial.q": ij.offset(ij.normal(0.0, 0.03))}
-    return ij.failure_probability(law, start, method="monte_carlo", runs=400, **TIMES, **QUIET)
+    return ij.failure_probability(law, start, estimator="monte_carlo", runs=400, **TIMES, **QUIET)
 
 
 def _pendulum() -> tuple[ij.Scenario, dict[str, Any]]:

@@ -354,7 +354,8 @@ def with_a_design(scenario, kind, points):
 ENTRIES = {
     "simulate": (
         ij.simulate,
-        {"scenario": None, "method": "rk4", "record_every": 1, "throw": False, "backend": "auto"},
+        {"scenario": None, "method": "rk4", "record_every": 1, "throw": False, "backend": "auto"}
+        | {"runs_as": None},
     ),
     "compare": (
         ij.compare,
@@ -457,13 +458,13 @@ ENTRIES = {
         {
             "scenario": None,
             "perturbations": WAYS,
-            "method": "subset",
+            "estimator": "subset",
             "runs": 100,
             "margin": "positions",
             "limit": 0.0,
             "confidence": 0.9,
             "seed": 0,
-            "integrator": "rk4",
+            "method": "rk4",
             "executor": None,
             "progress": False,
         },
@@ -850,7 +851,7 @@ def results(paper, no_runs, monkeypatch):
     monkeypatch.setattr("iblf_jax.tuning.result._slice", entered)
     run = made_up(paper.plant, duration=0.1)
     options = RunOptions(duration=0.01, dt=1e-3, method="rk4", backend="vmap", runs=4, seed=0)
-    setup = prepare(paper, WAYS, options.checked(), metrics=None)
+    setup = prepare(paper, WAYS, options, metrics=None)
     found = Metrics(
         {"margin": np.full((4, 2), 0.1), "rmse": np.full((4, 2), 0.01)},
         (("margin", "rad"), ("rmse", "rad")),

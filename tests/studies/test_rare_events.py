@@ -279,7 +279,7 @@ def test_the_limit_of_levels_is_reported():
 
 def test_a_frequent_failure_needs_one_level():
     found = by_subset(linear(4, 0.5), 0)
-    assert found.method == "monte_carlo"
+    assert found.estimator == "monte_carlo"
     assert len(found.levels) == 1
     assert found.low < stats.norm.sf(0.5) < found.high
 

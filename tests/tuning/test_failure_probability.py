@@ -16,7 +16,7 @@ from iblf_jax.studies.rare_events.design_points import Pieces
 from iblf_jax.studies.rare_events.result import FailureProbability
 from iblf_jax.tuning import _failure_probability
 
-RUN = {"duration": 0.02, "dt": 1e-3, "integrator": "euler", "progress": False}
+RUN = {"duration": 0.02, "dt": 1e-3, "method": "euler", "progress": False}
 """So short that a run leaves its bounds only if it starts outside, where the probability is
 known: joint i starts outside where |offset| is at least the distance to its bound."""
 
@@ -63,7 +63,7 @@ def test_a_probability_of_runs_that_is_known(rare):
     found, _, probability = rare
     low, high = found.interval
     assert low < probability < high
-    assert found.method == "subset"
+    assert found.estimator == "subset"
     assert found.coefficient_of_variation < 0.5
     assert found.started_outside == len(found.failures)
     assert found.diverged == found.excluded == 0
@@ -106,11 +106,11 @@ def test_the_words_of_a_result(rare):
 @pytest.mark.slow
 def test_importance_sampling_and_monte_carlo_agree(scenario, rare):
     _, perturbations, probability = rare
-    found = ij.failure_probability(scenario, perturbations, method="importance", runs=600, **RUN)
+    found = ij.failure_probability(scenario, perturbations, estimator="importance", runs=600, **RUN)
     assert found.interval[0] < probability < found.interval[1]
     assert found.coefficient_of_variation < 0.15
     frequent, distance = start_perturbations(scenario, 2.0)
-    crude = ij.failure_probability(scenario, frequent, method="monte_carlo", runs=2000, **RUN)
+    crude = ij.failure_probability(scenario, frequent, estimator="monte_carlo", runs=2000, **RUN)
     assert crude.interval[0] < exact(distance, 2.0) < crude.interval[1]
     again = ij.failure_probability(scenario, frequent, **crude.arguments, progress=False)
     assert again.estimate == crude.estimate
@@ -168,7 +168,9 @@ def test_without_failures_the_estimate_is_a_bound(scenario):
     figure = found.plot()
     assert "No failure reachable was found" in figure.get_suptitle()
     assert [text.get_text() for text in figure.axes[1].texts] == ["no failure found"]
-    crude = ij.failure_probability(scenario, perturbations, method="monte_carlo", runs=100, **RUN)
+    crude = ij.failure_probability(
+        scenario, perturbations, estimator="monte_carlo", runs=100, **RUN
+    )
     assert crude.is_upper_bound and not crude.margins_stagnate
     assert "no sample failed in 101 runs; at most" in repr(crude)  # with the nominal one
     with pytest.raises(ValueError, match="draws near failure"):
@@ -185,19 +187,19 @@ def test_discrete_distributions(scenario):
     found = ij.failure_probability(scenario, perturbations, runs=1000, **RUN)
     assert found.interval[0] < 0.001 < found.interval[1]
     with pytest.raises(ValueError, match="continuous distributions"):
-        ij.failure_probability(scenario, perturbations, method="importance", **RUN)
+        ij.failure_probability(scenario, perturbations, estimator="importance", **RUN)
 
 
 def test_bad_arguments(scenario):
     perturbations = {"plant.mass": ij.factor(ij.uniform(0.9, 1.1))}
     for words, given in {
-        "method": {"method": "sorm"},
+        "estimator": {"estimator": "sorm"},
         "margin": {"margin": "torques"},
         "runs": {"runs": 3},
-        ">= 100|100": {"runs": 99, "method": "importance"},
+        ">= 100|100": {"runs": 99, "estimator": "importance"},
         "confidence": {"confidence": 1.0},
         "limit": {"limit": np.nan},
-        "integrator: got 'leapfrog'": {"integrator": "leapfrog"},
+        "method: got 'leapfrog'": {"method": "leapfrog"},
         "region_margin|regions": {"margin": "regions"},
     }.items():
         with pytest.raises(ValueError, match=words):
@@ -257,7 +259,7 @@ def test_a_run_without_a_margin_fails(scenario, monkeypatch):
 
     monkeypatch.setattr(normal_space, "run_all_cases", without_margins)
     perturbations, _ = start_perturbations(scenario, 4.0)
-    found = ij.failure_probability(scenario, perturbations, method="monte_carlo", runs=50, **RUN)
+    found = ij.failure_probability(scenario, perturbations, estimator="monte_carlo", runs=50, **RUN)
     assert found.estimate == 1
     assert not found.is_upper_bound
     assert found.excluded == 0
@@ -288,8 +290,8 @@ def test_importance_sampling_without_failures_reports_subset_simulation(
         return sample(lambda z: np.ones(len(z)), points, **options)
 
     monkeypatch.setattr(_failure_probability, "importance_sampling", without_failures)
-    found = ij.failure_probability(scenario, perturbations, method="importance", runs=100, **RUN)
-    assert found.method == "subset"
+    found = ij.failure_probability(scenario, perturbations, estimator="importance", runs=100, **RUN)
+    assert found.estimator == "subset"
     assert not found.is_upper_bound
     assert 0.1 < found.estimate / probability < 10  # from 500 samples of a level
     assert "reported instead" in found.notes[0]
@@ -362,9 +364,9 @@ def test_failures_that_subset_simulation_misses_are_found_by_the_check():
 
     first, reported = checked_estimate(AnalyticSpace(pieces, [[-0.1, 0.0], [0.0, -10.0]]))
     exact = norm.sf(5.2) + norm.sf(4.0)
-    assert first.method == "subset"
+    assert first.estimator == "subset"
     assert first.high < exact
-    assert reported.method == "importance"
+    assert reported.estimator == "importance"
     assert reported.low < exact < reported.high
     assert "missed failures" in reported.notes[0]
 
@@ -404,7 +406,7 @@ def test_the_check_keeps_an_estimate_that_it_confirms():
     for seed in range(50):
         space.prepared = SimpleNamespace(options=SimpleNamespace(seed=seed))
         first, reported = checked_estimate(space)
-        replaced += reported.method != first.method
+        replaced += reported.estimator != first.estimator
     assert replaced <= 2
 
 
@@ -412,13 +414,15 @@ def test_the_check_keeps_an_estimate_that_it_confirms():
 def test_a_note_says_that_chains_cannot_follow_noise(scenario):
     noisy = ij.with_parts(scenario, process_noise=ij.process_noise.Additive(0.2))
     perturbations, distance = start_perturbations(scenario, 4.0)
-    with pytest.raises(ValueError, match=r"integrator: got 'rk4'.*integrator=.euler_maruyama"):
+    with pytest.raises(ValueError, match=r"method: got 'rk4'.*method=.euler_maruyama"):
         ij.failure_probability(noisy, perturbations, duration=0.02)
-    options = RUN | {"integrator": "euler_maruyama"}
+    options = RUN | {"method": "euler_maruyama"}
     found = ij.failure_probability(noisy, perturbations, runs=300, **options)
     assert "Markov chains" in found.notes[-1]
     assert found.interval[0] < exact(distance, 4.0) < found.interval[1]
-    crude = ij.failure_probability(noisy, perturbations, runs=300, method="monte_carlo", **options)
+    crude = ij.failure_probability(
+        noisy, perturbations, runs=300, estimator="monte_carlo", **options
+    )
     assert not any("Markov chains" in note for note in crude.notes)
 
 
@@ -514,7 +518,7 @@ def test_the_command(tmp_path, capsys, monkeypatch):
     from iblf_jax import cli
 
     monkeypatch.chdir(tmp_path)
-    text = cases.STUDY.split("[study]")[0] + '[failure]\nmethod = "monte_carlo"\nruns = 400\n'
+    text = cases.STUDY.split("[study]")[0] + '[failure]\nestimator = "monte_carlo"\nruns = 400\n'
     (tmp_path / "failure.toml").write_text(text)
     code = cli.main(["failure", "failure.toml", "--quiet", "--seed", "2", "--out", "found.nc"])
     out, err = capsys.readouterr()
@@ -522,8 +526,8 @@ def test_the_command(tmp_path, capsys, monkeypatch):
     assert "FailureProbability(" in out
     xarray = pytest.importorskip("xarray")
     assert xarray.load_dataset(tmp_path / "found.nc", engine="scipy").attrs["runs"] > 400
-    assert cli.main(["failure", "failure.toml", "--method", "sorm", "--quiet"]) == 2
-    assert "method" in capsys.readouterr().err
+    assert cli.main(["failure", "failure.toml", "--estimator", "sorm", "--quiet"]) == 2
+    assert "estimator" in capsys.readouterr().err
 
 
 def arm(stiffness):
@@ -566,14 +570,14 @@ def test_fifty_estimates_of_a_few_in_a_thousand():
     scenario, perturbations = arm(35.0)
     options = OF_ARM | {"progress": False}
     crude = ij.failure_probability(
-        scenario, perturbations, method="monte_carlo", runs=200_000, **options
+        scenario, perturbations, estimator="monte_carlo", runs=200_000, **options
     )
     assert 1e-3 < crude.estimate < 5e-3
     found = [
         ij.failure_probability(scenario, perturbations, runs=1000, seed=seed, **options)
         for seed in range(1, 51)
     ]
-    assert {x.method for x in found} == {"subset"}
+    assert {x.estimator for x in found} == {"subset"}
     estimates = np.array([x.estimate for x in found])
     error = np.hypot(
         np.std(estimates) / np.sqrt(50), crude.coefficient_of_variation * crude.estimate

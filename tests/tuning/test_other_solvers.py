@@ -192,7 +192,7 @@ def test_a_search_that_was_stopped_goes_on_to_the_same_result(arm, goal, tmp_pat
         pass
 
     def stop(search):
-        if int(search.state["iteration"]) == 3:
+        if search.state.iteration == 3:
             raise StoppedError
 
     file = tmp_path / "state.npz"

@@ -553,6 +553,6 @@ def test_runs_that_differ_in_noise_only_are_fresh_too(paper):
 @pytest.mark.parametrize(("valleys", "words"), [(1, "in 1 valley when"), (3, "in 3 valleys when")])
 def test_the_number_of_valleys_is_a_grammatical_phrase(valleys, words):
     strategy = SimpleNamespace(starts=6, screening=SimpleNamespace(points=range(385)))
-    state = {"valleys": np.asarray([valleys, 2]), "phase": 0, "repair_ended": False}
+    state = SimpleNamespace(valleys=np.asarray([valleys, 2]), phase=0, repair_ended=False)
     (line,) = _tried(SimpleNamespace(strategy=strategy, state=state))
     assert words in line

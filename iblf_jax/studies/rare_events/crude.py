@@ -64,7 +64,7 @@ def estimate_of_draws(z: np.ndarray, margins: np.ndarray, confidence: float) -> 
         failures=failures,
         nearby=failures,
         nearby_probability=p,
-        method="monte_carlo",
+        estimator="monte_carlo",
         effective_samples=float(count),
         notes=notes,
     )

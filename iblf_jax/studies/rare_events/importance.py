@@ -52,7 +52,7 @@ FEWEST_IN_TAIL = 5
 DEGENERATE = (
     "The weights are degenerate: {effective:.1f} effective failures, {largest:.0%} of the weight"
     " in one sample, shape of the tail {shape:.2f}. The interval is not reliable; take more runs"
-    " or method='subset'."
+    " or estimator='subset'."
 )
 NONE_FAILED = (
     "No sample around the design points failed, so the estimate is an upper bound, and a large one"
@@ -119,7 +119,7 @@ def importance_sampling(
         failures=samples,
         nearby=samples,
         nearby_probability=p,
-        method="importance",
+        estimator="importance",
         effective_samples=effective,
         notes=notes,
     )
@@ -137,7 +137,7 @@ def _upper_bound(bound: float, note: str, margins: np.ndarray, dimension: int) -
         failures=none,
         nearby=none,
         nearby_probability=1.0,
-        method="importance",
+        estimator="importance",
         effective_samples=0.0,
         notes=(note,),
     )

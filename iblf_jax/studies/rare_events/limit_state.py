@@ -86,7 +86,7 @@ class Estimate(NamedTuple):
     simulation, or the failures."""
     nearby_probability: float
     """Estimated probability of the set that they are samples of."""
-    method: str
+    estimator: str
     """"subset", "importance" or "monte_carlo"."""
     effective_samples: float
     """Number of equally weighted independent failures with the same information."""

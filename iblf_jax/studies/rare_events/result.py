@@ -146,8 +146,8 @@ class FailureProbability(Result):
     """Number of failures that were drawn outside their bounds at t = 0, where no law can act."""
     notes: tuple[str, ...]
     """What limits the estimate, in sentences."""
-    method: str
-    """The method that gave the estimate: "subset", "importance", or "monte_carlo", which is also
+    estimator: str
+    """What gave the estimate: "subset", "importance", or "monte_carlo", which is also
     that of a probability so large that subset simulation needs no second level."""
     unit: str
     """Of the margins."""
@@ -160,7 +160,7 @@ class FailureProbability(Result):
         """Whether the levels of subset simulation ended at a margin above the limit without a
         failure. `estimate` then only counts levels, and the probability may be 0.
         """
-        return self.is_upper_bound and self.method == "subset" and stagnate(self.levels)
+        return self.is_upper_bound and self.estimator == "subset" and stagnate(self.levels)
 
     @property
     def rare_draws(self) -> dict[str, Perturbation]:
@@ -171,7 +171,7 @@ class FailureProbability(Result):
           ValueError: there are none, because no sample failed.
         """
         if not len(self.nearby):
-            remedy = "Take more runs, or method='subset'."
+            remedy = "Take more runs, or estimator='subset'."
             raise checks.fail(
                 "rare_draws", "an estimate without them", "draws near failure", remedy
             )
@@ -209,7 +209,7 @@ class FailureProbability(Result):
             entries = [f"{path}_{k}" for k in range(x.ndim - 1)]
             variables[path] = (("failure", *entries), x)
         attributes = {
-            "method": self.method,
+            "estimator": self.estimator,
             "estimate": self.estimate,
             "interval": list(self.interval),
             "confidence": self.confidence,
@@ -261,9 +261,9 @@ class FailureProbability(Result):
         return [*lines, *notes]
 
     def _method_in_words(self) -> str:
-        if self.method == "importance":
+        if self.estimator == "importance":
             return f"Importance sampling with {self.effective_samples:.0f} effective failures."
-        if self.method == "subset":
+        if self.estimator == "subset":
             thresholds = ", ".join(f"{level.threshold:.3g}" for level in self.levels)
             return (
                 f"Subset simulation with {len(self.levels)} levels, at margins {thresholds}"

@@ -233,7 +233,7 @@ def _estimate(
             failures=Samples.none(last.z.shape[1]),
             nearby=nearby,
             nearby_probability=before,
-            method="subset",
+            estimator="subset",
             effective_samples=0.0,
             notes=(NO_FAILURE, *_note_of_convergence(levels), *notes),
         )
@@ -252,7 +252,7 @@ def _estimate(
         failures=Samples(last.z[failed], last.margins[failed], np.ones(count)),
         nearby=nearby,
         nearby_probability=before,
-        method="subset",
+        estimator="subset",
         effective_samples=1 / max(variation, 1e-8) ** 2,
         notes=tuple(notes),
     )
