@@ -190,7 +190,7 @@ def eigenvalues(robot, width: float) -> tuple[float, float]:
 
 def loop(case: Case) -> ij.Scenario:
     """The barrier law with the gains of a case; the start is on the reference, with f_hat = 0."""
-    paper = ij.presets.zhang_yan_2024(reading="corrected")
+    paper = ij.presets.zhang_yan_2024(variant="corrected")
     tube = paper.context.tube(jnp.asarray(0.0))
     base = ij.with_parts(
         paper,

@@ -39,7 +39,7 @@ from iblf_jax.simulation.metrics import standard
 
 
 def numpy_loop(t: float, x: np.ndarray) -> np.ndarray:
-    """The paper's closed loop (integral barrier, printed reading) as one writes it in NumPy, its
+    """The paper's closed loop (integral barrier, printed variant) as one writes it in NumPy, its
     derivatives by hand.
     """
     q, dq, eta = x[:2], x[2:4], x[4:]

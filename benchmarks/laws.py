@@ -87,21 +87,23 @@ def _box(limit: float) -> ij.Bounds:
 
 NODES = 16
 """Of the networks; the time to compile grows with them."""
-CORRECTED = controllers.Backstepping(k1=2.0, K2=K2, reading="corrected")
+CORRECTED = controllers.Backstepping(k1=2.0, K2=K2, variant="corrected")
 POSITIONS = ij.presets.zhang_yan_2024().bounds[0]
 CHOICES = {
     "Backstepping(Integral)": Choice("integral"),
     "Backstepping(Log)": Choice("log"),
     "Backstepping(Tan)": Choice("tan"),
-    "Backstepping(Mapping)": Choice(
-        controllers.Backstepping(k1=2.0, K2=K2, barrier=barriers.Mapping(), reading="corrected")
+    "Backstepping(TransformedError)": Choice(
+        controllers.Backstepping(
+            k1=2.0, K2=K2, barrier=barriers.TransformedError(), variant="corrected"
+        )
     ),
-    "Backstepping(Mapping), finite time": Choice(
+    "Backstepping(TransformedError), finite time": Choice(
         controllers.Backstepping(
             k1=2.0,
             K2=K2,
-            barrier=barriers.Mapping(),
-            reading="corrected",
+            barrier=barriers.TransformedError(),
+            variant="corrected",
             decays=decays.FiniteTime(k_a=0.2),
         )
     ),
@@ -126,7 +128,7 @@ CHOICES = {
         )
     ),
     "Backstepping, no bounds": Choice("backstepping"),
-    "BarrierBackstepping(Mapping)": Choice(controllers.BarrierBackstepping(k=(2.0, 20.0))),
+    "BarrierBackstepping(TransformedError)": Choice(controllers.BarrierBackstepping(k=(2.0, 20.0))),
     "BarrierBackstepping(Integral, Integral)": Choice(
         "full_state", {"bounds": (POSITIONS, _box(3.0))}
     ),
@@ -175,7 +177,7 @@ def row(name: str, duration: float = DURATION) -> list[Any]:
 
 def _first(gain: float) -> ij.Scenario:
     """The paper's scenario under the first law."""
-    paper = ij.presets.zhang_yan_2024(reading="corrected")
+    paper = ij.presets.zhang_yan_2024(variant="corrected")
     return ij.with_parameters(paper, {"controller.K2": gain})
 
 

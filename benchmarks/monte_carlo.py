@@ -166,7 +166,7 @@ def _study(backend: str, dtype: str, runs: int, steps: int, method: str):
     }
 
     def run(devices=None, runs=runs) -> None:
-        executor = ij.studies.ThisProcess(devices)
+        executor = ij.studies.LocalExecutor(devices)
         ij.monte_carlo(ij.presets.zhang_yan_2024(), ways, runs=runs, executor=executor, **options)
 
     run(runs=2 * block_size())

@@ -49,7 +49,7 @@ def two_links() -> ij.Scenario:
 
 def disturbed() -> ij.Scenario:
     """The paper's loop, corrected."""
-    return ij.presets.zhang_yan_2024(reading="corrected")
+    return ij.presets.zhang_yan_2024(variant="corrected")
 
 
 def chain(joints: int) -> ij.Scenario:
@@ -67,7 +67,7 @@ def chain(joints: int) -> ij.Scenario:
         bounds=ij.Bounds(
             lower=ij.bounds.Constant([0.0] * joints), upper=ij.bounds.Constant([1.0] * joints)
         ),
-        controller=ij.controllers.Backstepping(k1=2.0, K2=3.0, reading="corrected"),
+        controller=ij.controllers.Backstepping(k1=2.0, K2=3.0, variant="corrected"),
         observer=ij.observers.Momentum(kf=100.0),
         initial=ij.Initial(q=middle, dq=[0.0] * joints),
     )

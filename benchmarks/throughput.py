@@ -419,7 +419,7 @@ SAMPLED = {
 def soft_paper():
     """The paper's loop, soft enough to be sampled every 4 ms."""
     return ij.with_parameters(
-        ij.presets.zhang_yan_2024(reading="corrected"), {"controller.K2": 4.0, "observer.kf": 4.0}
+        ij.presets.zhang_yan_2024(variant="corrected"), {"controller.K2": 4.0, "observer.kf": 4.0}
     )
 
 

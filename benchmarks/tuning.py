@@ -111,7 +111,7 @@ def chain(n: int) -> ij.Scenario:
             velocity_phase=0.0,
         ),
         controller=controllers.Backstepping(k1=2.0, K2=0.6 * softest / 1e-3, o=0.1),
-        observer=observers.Printed(kf=20.0),
+        observer=observers.AsPublished(kf=20.0),
         initial=ij.Initial(q=start),
     )
 
@@ -407,7 +407,7 @@ def limited_problem(
         scenario, duration = ij.presets.zhang_yan_2024_funnel(), 0.3 if quick else 2.0
         scenario = ij.with_parts(scenario, observer=observers.ExtendedState(bandwidth=[20.0, 20.0]))
     elif law == "perturbed":
-        scenario, duration = ij.presets.zhang_yan_2024(reading="corrected"), 0.3 if quick else 1.0
+        scenario, duration = ij.presets.zhang_yan_2024(variant="corrected"), 0.3 if quick else 1.0
         perturbed = {
             "plant.mass": ij.factor(ij.uniform(0.8, 1.2)),
             "initial.q": ij.offset(ij.uniform(-0.05, 0.05)),
@@ -419,7 +419,7 @@ def limited_problem(
         goal += o.violation_probability_below(0.01)
     else:
         scenario, duration = (
-            ij.presets.zhang_yan_2024(law=law, reading="corrected"),
+            ij.presets.zhang_yan_2024(law=law, variant="corrected"),
             (0.3 if quick else 2.0),
         )
         plant = dataclasses.replace(scenario.plant, payload=payload)
@@ -719,7 +719,7 @@ def attacked_problem(name: str) -> tuple[ij.Scenario, dict[str, Any], dict[str, 
     sets |= {"plant.payload": within(0.0, 0.4), "initial.dq": within(-15.9, 15.9)}
     sets |= {"disturbance.acceleration_amplitude": within(-42.4, 42.4)}
     return (
-        ij.presets.zhang_yan_2024(law="tan", reading="corrected"),
+        ij.presets.zhang_yan_2024(law="tan", variant="corrected"),
         sets,
         {"duration": 1.0, "dt": 1e-3},
     )

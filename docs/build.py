@@ -189,7 +189,7 @@ def assemble() -> None:
 
     (SOURCE / "extra").mkdir()
     laws = {
-        law: ij.presets.zhang_yan_2024(law=law, reading="corrected")
+        law: ij.presets.zhang_yan_2024(law=law, variant="corrected")
         for law in ("integral", "log", "tan", "pd")
     }
     ij.explore(laws).save(SOURCE / "extra" / "live_loop.html")

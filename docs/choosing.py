@@ -35,11 +35,11 @@ ADVICE = {
         "the loop is fast; it has the least error of the four barriers",
         "there is a delay of 2 ms or more: at the gains of this effort it leaves the bounds",
     ),
-    "Backstepping(Mapping)": Advice(
+    "Backstepping(TransformedError)": Advice(
         "the bounds are asymmetric and the law must be smooth",
         "the loop runs at 10 ms",
     ),
-    "Backstepping(Mapping), finite time": Advice(
+    "Backstepping(TransformedError), finite time": Advice(
         "the error must be in a band after a stated time; the error is 0.7 times that of the"
         " exponential decay at the same effort",
         "the loop runs at 10 ms; the gain near zero error is larger, and so is the ripple",
@@ -72,7 +72,7 @@ ADVICE = {
     "Backstepping, no bounds": Advice(
         "there are no bounds to keep", "a start or a disturbance comes near a bound"
     ),
-    "BarrierBackstepping(Mapping)": Advice(
+    "BarrierBackstepping(TransformedError)": Advice(
         "the plant has more than two levels, or several levels have bounds; it has the least error"
         " of the laws that keep bounds",
         "the sensor is noisy: its ripple is more than twice that of `Backstepping(Integral)`",

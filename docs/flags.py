@@ -109,7 +109,7 @@ def _slow() -> ij.Scenario:
 
 def _sampled(period: float, delay: float = 0.0) -> ij.Scenario:
     return ij.with_parts(
-        ij.presets.zhang_yan_2024(reading="corrected"), sampling=ij.Sampling(period, delay)
+        ij.presets.zhang_yan_2024(variant="corrected"), sampling=ij.Sampling(period, delay)
     )
 
 

@@ -102,7 +102,7 @@ def systems() -> list[str]:
     for name in (*controllers.LAWS, *controllers.KEEPERS):
         law = controllers.law_by_name(name)
         barrier = getattr(law, "barrier", None)
-        usual = observers.Printed(kf=20.0)
+        usual = observers.AsPublished(kf=20.0)
         inner = f" around {type(law.law).__name__}" if hasattr(law, "law") else ""
         parts = (
             type(law).__name__ + inner,

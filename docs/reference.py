@@ -57,7 +57,7 @@ PAGES: dict[str, tuple[str, str]] = {
     "tuning": (
         "Tuning",
         (
-            "tune TuneResult tunable pareto Front falsify Attack cvar tune_file"
+            "tune TuneResult tunable pareto ParetoFront falsify WorstCase cvar tune_file"
             " tuning.SQP tuning.LBFGS tuning.Adam tuning.Optax tuning.SLSQP"
             " tuning.TrustConstr tuning.DifferentialEvolution tuning.CMAES tuning.Optuna tuning.Uno"
             " tuning.Report tuning.Solver"

@@ -141,9 +141,9 @@ if TYPE_CHECKING:
     from iblf_jax.studies.sweep import load_sweep as load_sweep
     from iblf_jax.studies.sweep import sweep as sweep
     from iblf_jax.studies.time_step import recommended_dt as recommended_dt
-    from iblf_jax.tuning import Attack as Attack
-    from iblf_jax.tuning import Front as Front
+    from iblf_jax.tuning import ParetoFront as ParetoFront
     from iblf_jax.tuning import TuneResult as TuneResult
+    from iblf_jax.tuning import WorstCase as WorstCase
     from iblf_jax.tuning import cvar as cvar
     from iblf_jax.tuning import failure_probability as failure_probability
     from iblf_jax.tuning import falsify as falsify
@@ -153,7 +153,7 @@ if TYPE_CHECKING:
     from iblf_jax.tuning import tune as tune
 
 _ON_FIRST_USE = {
-    "Attack": ("iblf_jax.tuning", "Attack"),
+    "WorstCase": ("iblf_jax.tuning", "WorstCase"),
     "Certificate": ("iblf_jax.certificates", "Certificate"),
     "certificates": ("iblf_jax.certificates", None),
     "certify": ("iblf_jax.certificates", "certify"),
@@ -169,7 +169,7 @@ _ON_FIRST_USE = {
     "failure_probability": ("iblf_jax.tuning", "failure_probability"),
     "FailureProbability": ("iblf_jax.studies.rare_events.result", "FailureProbability"),
     "falsify": ("iblf_jax.tuning", "falsify"),
-    "Front": ("iblf_jax.tuning", "Front"),
+    "ParetoFront": ("iblf_jax.tuning", "ParetoFront"),
     "excitation": ("iblf_jax.identification", "excitation"),
     "gains_for_guarantee": ("iblf_jax.proofs", "gains_for_guarantee"),
     "GuaranteedGains": ("iblf_jax.proofs", "GuaranteedGains"),

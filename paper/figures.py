@@ -38,7 +38,7 @@ SPREAD = 0.2
 
 def bounds_figure() -> Figure:
     """Positions between their bounds and errors, for arms with other masses than the model."""
-    scenario = ij.presets.zhang_yan_2024(reading="corrected")
+    scenario = ij.presets.zhang_yan_2024(variant="corrected")
     factors = (1.0, 1.0 - SPREAD, 1.0 + SPREAD)
     runs = [ij.simulate(heavier(scenario, factor), duration=10.0, dt=1e-3) for factor in factors]
     figure, axes = plt.subplots(1, 3, figsize=(11.0, 3.2), layout="constrained")
@@ -66,11 +66,11 @@ def heavier(scenario: ij.Scenario, factor: float) -> ij.Scenario:
 def readings_figure() -> Figure:
     """V2 under the law as printed and as corrected, at gains that satisfy the conditions."""
     figure, axes = plt.subplots(figsize=(5.0, 3.0), layout="constrained")
-    for reading in ("printed", "corrected"):
-        run = ij.simulate(ij.presets.printed_gap(reading=reading), duration=0.1, dt=1e-5)
-        axes.plot(1e3 * np.asarray(run.t), run.V, label=reading)
+    for variant in ("printed", "corrected"):
+        run = ij.simulate(ij.presets.printed_gap(variant=variant), duration=0.1, dt=1e-5)
+        axes.plot(1e3 * np.asarray(run.t), run.V, label=variant)
     axes.set(xlabel="time $t$ [ms]", ylabel="$V_2$")
-    axes.legend(title="reading")
+    axes.legend(title="variant")
     return figure
 
 

@@ -10,7 +10,7 @@ import iblf_jax as ij
 from iblf_jax import barriers, bounds, controllers, disturbances, plants, references
 
 BARRIERS = {
-    other.mapping: barriers.Mapping,
+    other.mapping: barriers.TransformedError,
     other.quadratic: barriers.Quadratic,
     other.prescribed_performance: barriers.PrescribedPerformance,
 }

@@ -2,7 +2,7 @@
 second opinion.
 
 Two-link arm, sinusoidal reference and bounds, the disturbance (4.3), the law (3.14) with either
-barrier and either reading, its observer.  alpha' is derived by hand here, and by automatic
+barrier and either variant, its observer.  alpha' is derived by hand here, and by automatic
 differentiation there.
 """
 

@@ -4,7 +4,7 @@ opinion.
 `Powers` and `Prescribed` are the gains g(t, V) that are added to the constant gain of a level, for
 numbers and for the power series of `independent_chains`, whose cases may have one for each level.
 
-`Arm` is the closed loop of a two-link arm under Mapping and
+`Arm` is the closed loop of a two-link arm under TransformedError and
 
     tau = C alpha + G + M alpha' - K2 e2 - s - g2(t, W) M e2,   W = 1/2 e2^T M e2,
 
@@ -65,7 +65,7 @@ class Prescribed:
 
 @dataclass
 class Arm(independent.Loop):
-    """The paper's arm under Mapping in the corrected reading, with decays and without friction."""
+    """The paper's arm under TransformedError, corrected, with decays and without friction."""
 
     first: object = None
     second: object = None

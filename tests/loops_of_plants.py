@@ -33,7 +33,7 @@ def flexible_joint(**parts) -> ij.Scenario:
 def rigid_law(**parts) -> ij.Scenario:
     """A law for rigid arms on stiff joints with damped motors; its model is the robot inside."""
     plant = ij.plants.FlexibleJoint(ROBOT, stiffness=3e3, motor_inertia=0.02, motor_damping=3.0)
-    law = controllers.Backstepping(k1=3.0, K2=1.0, barrier=barriers.Mapping())
+    law = controllers.Backstepping(k1=3.0, K2=1.0, barrier=barriers.TransformedError())
     return flexible_joint(**({"plant": plant, "model": plant.robot, "controller": law} | parts))
 
 
@@ -43,7 +43,7 @@ def electric_drive(**parts) -> ij.Scenario:
         ROBOT, torque_constant=0.9, inductance=0.02, resistance=1.1, back_emf=0.9
     )
     law = controllers.BarrierBackstepping(
-        k=(3.0, 20.0, 60.0), barriers=(barriers.Mapping(),) * 3, c=(0.0, 0.1, 0.1)
+        k=(3.0, 20.0, 60.0), barriers=(barriers.TransformedError(),) * 3, c=(0.0, 0.1, 0.1)
     )
     levels = (band(0.1, 0.9), band(-4.0, 4.0), band(-60.0, 60.0))
     own = {"plant": plant, "controller": law, "bounds": levels}

@@ -26,7 +26,7 @@ BARRIERS = (
     ij.barriers.Log(),
     ij.barriers.Log(p=2),
     ij.barriers.Tan(),
-    ij.barriers.Mapping(),
+    ij.barriers.TransformedError(),
     ij.barriers.Integral(),
     ij.barriers.PrescribedPerformance(),
 )

@@ -168,9 +168,9 @@ BARRIERS = {
     "log": barriers.Log(),
     "log_p3": barriers.Log(p=3),
     "tan": barriers.Tan(),
-    "state": barriers.State(),
+    "state": barriers.StateBarrier(),
     "prescribed_performance": barriers.PrescribedPerformance(),
-    "mapping": barriers.Mapping(),
+    "mapping": barriers.TransformedError(),
     "quadratic": barriers.Quadratic(),
 }
 
@@ -183,8 +183,8 @@ DECAYS = {
 
 OBSERVERS = {
     "none": observers.NoObserver(),
-    "printed": observers.Printed(kf=[20.0, 10.0]),
-    "printed_matched": observers.Printed(kf=20.0, eta0=[0.1, -0.2], start="matched"),
+    "printed": observers.AsPublished(kf=[20.0, 10.0]),
+    "printed_matched": observers.AsPublished(kf=20.0, eta0=[0.1, -0.2], start="matched"),
     "momentum": observers.Momentum(kf=[20.0, 10.0]),
     "extended_state": observers.ExtendedState(bandwidth=[40.0, 30.0]),
     "extended_state_two_gains": observers.ExtendedState(l1=80.0, l2=[1600.0, 900.0]),
@@ -287,7 +287,7 @@ def keeps_velocities(law: Any) -> bool:
 LAWS = {
     "backstepping": controllers.Backstepping(k1=2.0, K2=20.0, o=0.1),
     "backstepping_corrected_log": controllers.Backstepping(
-        k1=[2.0, 3.0], K2=20.0, o=0.1, barrier=barriers.Log(p=2), reading="corrected"
+        k1=[2.0, 3.0], K2=20.0, o=0.1, barrier=barriers.Log(p=2), variant="corrected"
     ),
     "barrier_backstepping": controllers.BarrierBackstepping(k=(2.0, [20.0, 15.0])),
     "barrier_backstepping_weighted": controllers.BarrierBackstepping(
@@ -299,8 +299,8 @@ LAWS = {
     "backstepping_decays": controllers.Backstepping(
         k1=2.0,
         K2=[20.0, 15.0],
-        barrier=barriers.Mapping(),
-        reading="corrected",
+        barrier=barriers.TransformedError(),
+        variant="corrected",
         decays=(DECAYS["finite_time"], decays.PrescribedTime(T=1.0)),
     ),
     "barrier_backstepping_velocities": two_barriers(K2=[20.0, 15.0], o=0.1),
@@ -319,10 +319,10 @@ LAWS = {
         normalised=True,
     ),
     "adaptive_network": controllers.AdaptiveNetwork(
-        k1=2.0, K2=[20.0, 15.0], nodes=4, barrier=barriers.Mapping(), weight=[0.5, 2.0]
+        k1=2.0, K2=[20.0, 15.0], nodes=4, barrier=barriers.TransformedError(), weight=[0.5, 2.0]
     ),
     "adaptive_parameters": controllers.AdaptiveParameters(
-        law=controllers.Backstepping(k1=2.0, K2=[20.0, 15.0], reading="corrected"),
+        law=controllers.Backstepping(k1=2.0, K2=[20.0, 15.0], variant="corrected"),
         parameters=("mass[0]", "payload"),
         Gamma=[3.0, 2.0],
         lower=-0.5,
@@ -363,7 +363,7 @@ LAWS = {
         law=controllers.PDGravity(Kp=60.0, Kd=20.0), limit=[7.2, 1.5]
     ),
     "saturated_auxiliary": controllers.Saturated(
-        law=controllers.Backstepping(k1=2.0, K2=20.0, o=0.1, reading="corrected"),
+        law=controllers.Backstepping(k1=2.0, K2=20.0, o=0.1, variant="corrected"),
         limit=[7.2, 1.5],
         auxiliary=[5.0, 8.0],
     ),

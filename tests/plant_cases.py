@@ -12,7 +12,7 @@ from iblf_jax.bounds import Bounds, Constant
 
 import iblf_jax as ij
 
-WITH_MAPPING = (ij.barriers.Mapping(),) * 3
+WITH_MAPPING = (ij.barriers.TransformedError(),) * 3
 
 
 def _pendulum_drift(t: jax.Array, x: jax.Array) -> jax.Array:

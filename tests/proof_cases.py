@@ -20,7 +20,7 @@ def pendulum(*, K2=3.0, kf=100.0, **parts) -> ij.Scenario:
             lower=ij.bounds.Sinusoid(offset=[0.2], **side),
             upper=ij.bounds.Sinusoid(offset=[0.9], **side),
         ),
-        controller=ij.controllers.Backstepping(k1=2.0, K2=[K2], o=0.1, reading="corrected"),
+        controller=ij.controllers.Backstepping(k1=2.0, K2=[K2], o=0.1, variant="corrected"),
         observer=ij.observers.Momentum(kf=[kf]),
         initial=ij.Initial(q=[0.8], dq=[0.0]),
     )

@@ -12,7 +12,7 @@ import members
 
 import iblf_jax as ij
 
-PAPER = ij.presets.zhang_yan_2024(reading="corrected")
+PAPER = ij.presets.zhang_yan_2024(variant="corrected")
 CHAIN = ij.presets.motor_driven_two_link()
 FLEXIBLE = ij.presets.flexible_joint_two_link()
 VESSEL = ij.presets.vessel()
@@ -64,7 +64,7 @@ FITTING: dict[str, Callable[[Any], ij.Scenario]] = {
     "decay": lambda part: ij.with_parts(
         PAPER,
         controller=ij.controllers.Backstepping(
-            k1=2.0, K2=20.0, barrier=ij.barriers.Mapping(), decays=(part, part)
+            k1=2.0, K2=20.0, barrier=ij.barriers.TransformedError(), decays=(part, part)
         ),
     ),
     "observer": lambda part: ij.with_parts(PAPER, observer=part),

@@ -59,19 +59,19 @@ def check_run(backend: str) -> None:
 
 def structures() -> dict[str, ij.Scenario]:
     """Scenarios of different structure: barriers, laws, observers, sensors, actuators, plants."""
-    paper = ij.presets.zhang_yan_2024(reading="corrected")
+    paper = ij.presets.zhang_yan_2024(variant="corrected")
     paper = ij.with_parameters(paper, {"controller.K2": 4.0, "observer.kf": 4.0})
     found = {}
     for barrier in (
         ij.barriers.Integral(),
         ij.barriers.Log(),
         ij.barriers.Tan(),
-        ij.barriers.State(),
+        ij.barriers.StateBarrier(),
         ij.barriers.PrescribedPerformance(),
-        ij.barriers.Mapping(),
+        ij.barriers.TransformedError(),
         ij.barriers.Quadratic(),
     ):
-        law = ij.controllers.Backstepping(k1=2.0, K2=4.0, barrier=barrier, reading="corrected")
+        law = ij.controllers.Backstepping(k1=2.0, K2=4.0, barrier=barrier, variant="corrected")
         found[type(barrier).__name__] = ij.with_parts(paper, controller=law)
     computed = ij.controllers.ComputedTorque(Kp=25.0, Kd=10.0)
     found["ComputedTorque"] = ij.with_parts(paper, controller=computed)

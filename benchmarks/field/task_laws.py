@@ -29,9 +29,9 @@ BARRIERS = {
     "Integral": barriers.Integral(),
     "Log": barriers.Log(),
     "Tan": barriers.Tan(),
-    "State": barriers.State(),
+    "State": barriers.StateBarrier(),
     "PrescribedPerformance": barriers.PrescribedPerformance(),
-    "Mapping": barriers.Mapping(),
+    "TransformedError": barriers.TransformedError(),
     "no bounds": barriers.Quadratic(),
 }
 """Name in the table -> barrier of every level that has bounds."""
@@ -167,7 +167,7 @@ def robot_law(
     """A law of `benchmarks/laws.py` at the scales of a task."""
     law = choice.law
     if isinstance(law, str):
-        law = law_by_name(law, reading="corrected")
+        law = law_by_name(law, variant="corrected")
     parts = dict(choice.parts)
     if "bounds" in parts:
         first, second, *others = task.scenario.bounds

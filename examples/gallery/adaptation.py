@@ -10,7 +10,7 @@ import numpy as np
 import iblf_jax as ij
 from iblf_jax import controllers, observers, plotting
 
-scenario = ij.presets.zhang_yan_2024(reading="corrected")
+scenario = ij.presets.zhang_yan_2024(variant="corrected")
 law = scenario.controller
 adaptive = controllers.AdaptiveParameters(
     law=law, parameters=("payload",), Gamma=2.0, lower=-0.1, upper=2.0

@@ -6,7 +6,7 @@ import numpy as np
 import iblf_jax as ij
 
 scenario = ij.with_parts(
-    ij.presets.zhang_yan_2024(reading="corrected"),
+    ij.presets.zhang_yan_2024(variant="corrected"),
     observer=ij.observers.Momentum(kf=20.0, start="matched"),
 )
 limit = [6.0, 1.2]

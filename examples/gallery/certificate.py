@@ -2,7 +2,7 @@
 
 import iblf_jax as ij
 
-scenario = ij.presets.zhang_yan_2024(reading="corrected")
+scenario = ij.presets.zhang_yan_2024(variant="corrected")
 certificate = ij.certify(scenario, duration=4.0, dt=1e-3)
 figure = certificate.plot()
 

@@ -3,7 +3,7 @@
 import iblf_jax as ij
 
 printed, corrected = (
-    ij.presets.printed_gap(reading=reading) for reading in ("printed", "corrected")
+    ij.presets.printed_gap(variant=variant) for variant in ("printed", "corrected")
 )
 certificate = ij.certify(printed, duration=0.1, dt=1e-5)
 figure = certificate.plot()

@@ -42,7 +42,7 @@ errors = plotting.errors(runs)
 # %% The compensation bounds the Lyapunov rate whatever the threshold is. On the paper's arm it
 # sends more commands than the law itself, because its term, a steep function of e2, holds the
 # weight of the arm.
-arm = ij.presets.zhang_yan_2024(reading="corrected")
+arm = ij.presets.zhang_yan_2024(variant="corrected")
 trigger = ij.EventTrigger(relative=0.05, absolute=0.1)
 laws = {
     "law": arm.controller,

@@ -5,7 +5,7 @@ import numpy as np
 
 import iblf_jax as ij
 
-paper = ij.presets.zhang_yan_2024(reading="corrected")
+paper = ij.presets.zhang_yan_2024(variant="corrected")
 pd = ij.with_parts(
     paper,
     controller=ij.controllers.PDGravity(Kp=60.0, Kd=20.0),

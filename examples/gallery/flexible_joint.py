@@ -17,7 +17,7 @@ rigid = ij.with_parts(
     paper,
     plant=plant,
     model=plant.rigid(),
-    controller=ij.controllers.Backstepping(k1=2.0, K2=0.9, reading="corrected"),
+    controller=ij.controllers.Backstepping(k1=2.0, K2=0.9, variant="corrected"),
 )
 order_4 = ij.with_parts(
     paper, robot=plant, controller=ij.controllers.BarrierBackstepping(k=(3.0, 20.0, 60.0, 150.0))

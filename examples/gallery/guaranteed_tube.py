@@ -12,7 +12,7 @@ scenario = ij.Scenario(
         lower=ij.bounds.Sinusoid(offset=[0.2], phase=[np.pi / 2], **wave),
         upper=ij.bounds.Sinusoid(offset=[0.9], phase=[np.pi / 2], **wave),
     ),
-    controller=ij.controllers.Backstepping(k1=2.0, K2=3.0, reading="corrected"),
+    controller=ij.controllers.Backstepping(k1=2.0, K2=3.0, variant="corrected"),
     observer=ij.observers.Momentum(kf=100.0),
     initial=ij.Initial(q=[0.8], dq=[0.0]),
 )

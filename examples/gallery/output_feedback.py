@@ -12,7 +12,7 @@ import iblf_jax as ij
 
 push = ij.disturbances.Sinusoids(amplitude=[0.5, 0.2], frequency=2.0)
 base = ij.with_parts(
-    ij.with_parameters(ij.presets.zhang_yan_2024(reading="corrected"), {"controller.K2": 4.0}),
+    ij.with_parameters(ij.presets.zhang_yan_2024(variant="corrected"), {"controller.K2": 4.0}),
     sampling=ij.Sampling(period=1e-3),
     disturbance=push,
 )

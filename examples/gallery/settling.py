@@ -28,7 +28,7 @@ def scenario(name, size, **parts):
         "prescribed time": decays.PrescribedTime(T=1.2, gain=size, cap=40.0),
     }[name]
     law = ij.controllers.Backstepping(
-        k1=k1, K2=4.0, barrier=ij.barriers.Mapping(), reading="corrected", decays=decay
+        k1=k1, K2=4.0, barrier=ij.barriers.TransformedError(), variant="corrected", decays=decay
     )
     return ij.with_parts(paper, controller=law, **parts)
 

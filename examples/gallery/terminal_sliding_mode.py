@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 import iblf_jax as ij
 
 scenario = ij.with_parts(
-    ij.presets.zhang_yan_2024(reading="corrected"),
+    ij.presets.zhang_yan_2024(variant="corrected"),
     disturbance=ij.disturbances.Sinusoids(amplitude=[0.5, 0.2], frequency=2.0),
 )
 laws = {

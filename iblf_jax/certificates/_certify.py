@@ -267,7 +267,7 @@ def _checked_claims(run: Rollout) -> Certificate:
 
 
 def _heading_of(scenario: Scenario) -> str:
-    """Law, barriers, reading and observer, in words."""
+    """Law, barriers, variant and observer, in words."""
     law = unwrapped(scenario.controller)
     adaptive = adaptive_law(scenario)
     parts = [type(law).__name__]
@@ -277,8 +277,8 @@ def _heading_of(scenario: Scenario) -> str:
         parts.append(f"barrier {type(law.barrier).__name__}")
     if law.barriers:
         parts.append("barriers " + " ".join(type(x).__name__ for x in law.barriers))
-    if law.reading:
-        parts.append(f"reading {law.reading}")
+    if law.variant:
+        parts.append(f"variant {law.variant}")
     return ", ".join([*parts, f"observer {type(scenario.observer).__name__}"])
 
 

@@ -45,7 +45,7 @@ from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.perturbation_cube import Cube, unit_cube
-from iblf_jax.studies.worst import Losses, WorstCase, search
+from iblf_jax.studies.worst import Losses, WorstCaseSearch, search
 
 EXCLUDED = "The guard or a torque limit is active at the start, where nothing is claimed."
 
@@ -114,7 +114,7 @@ def counterexample(
     seed = checks.positive_integer("seed", seed, least=0, most=2**32 - 1)
     cube = unit_cube(scenario, perturbations, signs=False)
     checks.fits_memory("starts", starts, 8.0 * 2 * cube.size)
-    problem = WorstCase(cube, _losses_of(scenario, cube), starts, (seed,), EXCLUDED)
+    problem = WorstCaseSearch(cube, _losses_of(scenario, cube), starts, (seed,), EXCLUDED)
     worst = search(problem, _ascend)
     values = cube.values(jnp.asarray(worst.u, scenario.initial.q.dtype))
     found = {path: np.asarray(value) for path, value in values.items()}
@@ -148,7 +148,7 @@ def _losses_of(scenario: Scenario, cube: Cube) -> Callable[[np.ndarray], Losses]
     return losses
 
 
-def _ascend(problem: WorstCase) -> None:
+def _ascend(problem: WorstCaseSearch) -> None:
     """Ascends from each starting point. Points that are not usable have a constant value below that
     of the start, from which the line search turns back.
     """

@@ -92,7 +92,7 @@ class Certificate(Result):
     """
 
     heading: str
-    """Law, barrier, reading and observer of the certificate."""
+    """Law, barrier, variant and observer of the certificate."""
     lines: tuple[Line, ...]
     numbers: dict[str, Any]
     """The constants of the claim: rho, rho2, lambda_min, lambda_max, V2(0), F_d, F_m, the case."""

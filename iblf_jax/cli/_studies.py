@@ -101,10 +101,10 @@ def _set_devices(number: int | None) -> None:
 @contextlib.contextmanager
 def _executor(args: argparse.Namespace) -> Iterator[Any]:
     """Yields the executor of the runs: this process, or the workers of --dask."""
-    from iblf_jax.studies import ThisProcess, initialize_worker
+    from iblf_jax.studies import LocalExecutor, initialize_worker
 
     if args.dask is None:
-        yield ThisProcess(chunk=args.chunk).checked()
+        yield LocalExecutor(chunk=args.chunk).checked()
         return
     if args.chunk is not None or args.devices is not None:
         raise ValueError("--dask: got --chunk or --devices as well, which are of this process.")

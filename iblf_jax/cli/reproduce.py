@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--out", required=True, metavar="DIR", help="write everything into this folder"
     )
     parser.add_argument(
-        "--reading",
+        "--variant",
         choices=("printed", "corrected"),
         default="printed",
         help=(
@@ -67,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
     folder = output_folder(args.out)
     runs, seconds = _simulate_both(args)
     print(
-        f"Zhang & Yan 2024, section 4, as {args.reading}: {args.duration:g} s, dt = {args.dt:g} s,"
+        f"Zhang & Yan 2024, section 4, as {args.variant}: {args.duration:g} s, dt = {args.dt:g} s,"
         " rk4, float64"
     )
     print("; ".join(f"{name}: {describe(int(one.status))}" for name, one in runs.items()) + "\n")
@@ -112,7 +112,7 @@ def _simulate_both(args: argparse.Namespace) -> tuple[dict[str, Rollout], dict[s
         start = time.perf_counter()
         runs = {
             name: simulate(
-                zhang_yan_2024(law=law, reading=args.reading), duration=args.duration, dt=args.dt
+                zhang_yan_2024(law=law, variant=args.variant), duration=args.duration, dt=args.dt
             )
             for law, name in NAMES.items()
         }
@@ -158,7 +158,7 @@ def _write_data(
     save_rollouts(runs, folder / "rollouts.nc")
     report: dict[str, Any] = {
         "source": "Zhang & Yan 2024, section 4",
-        "run": {"reading": args.reading, "duration": args.duration, "dt": args.dt, "method": "rk4"},
+        "run": {"variant": args.variant, "duration": args.duration, "dt": args.dt, "method": "rk4"},
         "versions": {"iblf_jax": iblf_jax.__version__, "jax": jax.__version__},
         "runs": {name: status_and_metrics(one) for name, one in runs.items()},
         "assumed": findings["assumed"],

@@ -174,7 +174,7 @@ def _level_remedy(scenario: Scenario, level: int) -> str:
     if level <= len(barriers) and isinstance(barriers[level - 1], Quadratic):
         return (
             "The law has barriers.Quadratic() on that level, which keeps no bounds: give it"
-            " barriers.Mapping() there."
+            " barriers.TransformedError() there."
         )
     return (
         f"Widen {field}, start nearer to the virtual control, reduce the disturbances or take a"

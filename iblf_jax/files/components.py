@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Container, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -162,6 +162,9 @@ FORMER: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {"full_state": _
 """Name of a member of earlier versions, which files may contain -> its table as that of a member
 of today."""
 
+FORMER_KEYS = {"reading": "variant"}
+"""Name of a field or an argument in files of earlier versions -> the present one."""
+
 
 # --- to tables
 
@@ -293,10 +296,18 @@ def _decode_member(table: dict[str, Any], hint: Any, path: str) -> Any:
     return decode_fields(members[kind], {key: x for key, x in table.items() if key != "kind"}, path)
 
 
+def with_present_names(table: Mapping[str, Any], known: Container[str]) -> dict[str, Any]:
+    """A table with the present names of fields and arguments that earlier versions named
+    otherwise.
+    """
+    return {key if key in known else FORMER_KEYS.get(key, key): x for key, x in table.items()}
+
+
 def decode_fields(cls: Any, table: Any, path: str) -> Any:
     """A component of class `cls` from its table; checks every key."""
     checks.flat_enough(path, as_table(table, path))
     fields = {field.name: field for field in dataclasses.fields(cls) if field.init}
+    table = with_present_names(table, fields)
     known_keys(table, path, fields)
     hints = field_hints(cls)
     values = {}

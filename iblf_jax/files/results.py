@@ -77,7 +77,7 @@ EXPECTED = "a file that a result's save wrote"
 SAME_KIND = "a node of the form that iblf_jax.files.results describes"
 
 RECORDS: dict[str, tuple[str, str]] = {
-    "Attack": ("tuning._falsify", "Attack"),
+    "Attack": ("tuning._falsify", "WorstCase"),
     "Attempt": ("proofs.result", "Attempt"),
     "AtLimit": ("tuning.result", "AtLimit"),
     "Block": ("tuning.parameters", "Block"),
@@ -94,7 +94,7 @@ RECORDS: dict[str, tuple[str, str]] = {
     "FailureSamples": ("studies.rare_events.result", "FailureSamples"),
     "FirstExit": ("studies.first_exit", "FirstExit"),
     "Fit": ("identification.result", "Fit"),
-    "Front": ("tuning._pareto", "Front"),
+    "Front": ("tuning._pareto", "ParetoFront"),
     "GrowthPoint": ("proofs.result", "GrowthPoint"),
     "GuaranteedGains": ("proofs.gains", "GuaranteedGains"),
     "GuaranteedTube": ("proofs.result", "GuaranteedTube"),

@@ -26,7 +26,7 @@ from iblf_jax.plotting._panels import (
 from iblf_jax.studies.summaries import LEVELS, initial_margins
 
 if TYPE_CHECKING:
-    from iblf_jax.tuning import Front, TuneResult
+    from iblf_jax.tuning import ParetoFront, TuneResult
 
 MAX_NAMED = 28
 """Largest number of gains in the legend."""
@@ -324,7 +324,7 @@ def _draw_iterates(axes: Axes, iterates: Mapping[str, np.ndarray], tuned: np.nda
 
 
 @_style.styled()
-def pareto(front: Front) -> Figure:
+def pareto(front: ParetoFront) -> Figure:
     """A front of two objectives, with all trials.
 
     Args:
@@ -335,9 +335,7 @@ def pareto(front: Front) -> Figure:
 
     Source: design of this package.
     """
-    from iblf_jax.tuning import Front  # a result exists only where its package is loaded
-
-    check_class("front", front, Front, "ij.pareto returns one.")
+    check_class("front", front, ParetoFront, "ij.pareto returns one.")
     figure = _style.new_figure(0.7 * _style.WIDTH, 3.6)
     axes = figure.subplots()
     dots: dict[str, Any] = {"linestyle": "none", "marker": ".", "markersize": 3}

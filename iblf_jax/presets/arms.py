@@ -41,7 +41,7 @@ import numpy as np
 from iblf_jax.control.barriers import Barrier
 from iblf_jax.control.controllers import LAWS, PDGravity, TrackingLaw, law_by_name, within_effort
 from iblf_jax.control.controllers.systems import observer_of
-from iblf_jax.control.observers import Momentum, Printed
+from iblf_jax.control.observers import AsPublished, Momentum
 from iblf_jax.core import checks
 from iblf_jax.core.disk_cache import keep_programs
 from iblf_jax.core.progress import announced
@@ -72,7 +72,7 @@ TIMES = np.linspace(0.0, 20.0, 81)
 FINE_TIMES = np.linspace(0.0, 20.0, 2001)
 """Times at which the nearest bound is sought [s].  A reference at 1 rad/s moves 0.01 rad between
 them; the slope of a barrier at a bound 0.1 rad away then differs by at most a tenth."""
-OBSERVERS: dict[str, Any] = {"printed": Printed, "corrected": Momentum}
+OBSERVERS: dict[str, Any] = {"printed": AsPublished, "corrected": Momentum}
 """Reading of the paper -> its observer."""
 
 
@@ -231,7 +231,7 @@ def arm_scenario(
     reference: Reference,
     *,
     law: str = "integral",
-    reading: str = "corrected",
+    variant: str = "corrected",
     bounds: Bounds | None = None,
     disturbance: Disturbance | None = None,
     initial: Initial | None = None,
@@ -248,7 +248,7 @@ def arm_scenario(
     Args:
       robot: the plant, with `limits` and `effort`, as `iblf_jax.robots.load` returns it.
       reference: the reference.
-      law, reading: as for `iblf_jax.presets.zhang_yan_2024`.
+      law, variant: as for `iblf_jax.presets.zhang_yan_2024`.
       bounds: bounds of the joints; the joint limits if not given.
       disturbance: the disturbance; none if not given.
       initial: the initial state; at rest on the reference if not given.
@@ -258,12 +258,12 @@ def arm_scenario(
       A Scenario; all its numbers are leaves.
 
     Raises:
-      ValueError: an unknown law or reading; a joint without limits and no bounds given.
+      ValueError: an unknown law or variant; a joint without limits and no bounds given.
 
     Source: this package.
     """
     checks.one_of("law", law, LAWS)
-    checks.one_of("reading", reading, ("printed", "corrected"))
+    checks.one_of("variant", variant, ("printed", "corrected"))
     checks.conforms("robot", robot, Robot)
     checks.conforms("reference", reference, Reference)
     keep_programs()
@@ -274,7 +274,7 @@ def arm_scenario(
         disturbance = Nothing()
     if initial is None:
         initial = Initial(q=start)
-    controller = _arm_law(robot if model is None else model, reference, bounds, law, reading)
+    controller = _arm_law(robot if model is None else model, reference, bounds, law, variant)
     return Scenario(
         plant=robot,
         model=model,  # type: ignore[arg-type]
@@ -282,26 +282,26 @@ def arm_scenario(
         bounds=bounds,
         disturbance=disturbance,
         controller=within_effort(controller, robot),
-        observer=observer_of(law, OBSERVERS[reading](kf=20.0)),
+        observer=observer_of(law, OBSERVERS[variant](kf=20.0)),
         initial=initial,
     )
 
 
 def _arm_law(
-    model: Robot, reference: Reference, bounds: Bounds, law: str, reading: str
+    model: Robot, reference: Reference, bounds: Bounds, law: str, variant: str
 ) -> TrackingLaw:
     """The law of `arm_scenario`, without saturation."""
     K2 = _coupled_gain(model, reference)
     if law == "pd":  # The default gains of "pd" are for one size of joint.
         return PDGravity(Kp=3.0 * K2, Kd=K2)
-    controller: Any = law_by_name(law, k1=2.0, K2=K2, o=0.1, reading=reading, p=1)
+    controller: Any = law_by_name(law, k1=2.0, K2=K2, o=0.1, variant=variant, p=1)
     if "weight" in type(controller).factors:
         weight = inertial_weight(model, reference, bounds, controller.barrier)
         controller = dataclasses.replace(controller, weight=weight)
     return controller
 
 
-def ur5(*, law: str = "integral", reading: str = "corrected", payload: float = 2.0) -> Scenario:
+def ur5(*, law: str = "integral", variant: str = "corrected", payload: float = 2.0) -> Scenario:
     """A Universal Robots UR5 that moves its tool through half a metre, with a payload that its
     model does not contain.
 
@@ -310,7 +310,7 @@ def ur5(*, law: str = "integral", reading: str = "corrected", payload: float = 2
     respects the torque limits of the actuators, and the disturbance is about 3 % of these.
 
     Args:
-      law, reading: as for `zhang_yan_2024`; gains as in `iblf_jax.presets.arms.arm_scenario`.
+      law, variant: as for `zhang_yan_2024`; gains as in `iblf_jax.presets.arms.arm_scenario`.
       payload: mass at the tip of the plant, which the model does not contain [kg].  (The
         manufacturer allows 5 kg.)
 
@@ -318,7 +318,7 @@ def ur5(*, law: str = "integral", reading: str = "corrected", payload: float = 2
       A Scenario of 6 joints, for runs of 10 s.
 
     Raises:
-      ValueError: an unknown law or reading, or a negative payload.
+      ValueError: an unknown law or variant, or a negative payload.
 
     Source: this package; the arm as `iblf_jax.presets.arms.arm` says.
     """
@@ -330,25 +330,25 @@ def ur5(*, law: str = "integral", reading: str = "corrected", payload: float = 2
         push=[4.0, 4.0, 4.0, 0.8, 0.8, 0.5],
         payload=payload,
         law=law,
-        reading=reading,
+        variant=variant,
     )
 
 
-def iiwa14(*, law: str = "integral", reading: str = "corrected", payload: float = 3.0) -> Scenario:
+def iiwa14(*, law: str = "integral", variant: str = "corrected", payload: float = 3.0) -> Scenario:
     """A KUKA LBR iiwa 14 that moves its flange through half a metre, with a payload that its model
     does not contain.
 
     Motion and bounds are chosen as for `ur5`.  The manufacturer allows a payload of 14 kg.
 
     Args:
-      law, reading: as for `zhang_yan_2024`; gains as in `iblf_jax.presets.arms.arm_scenario`.
+      law, variant: as for `zhang_yan_2024`; gains as in `iblf_jax.presets.arms.arm_scenario`.
       payload: mass at the tip of the plant, which the model does not contain [kg].
 
     Returns:
       A Scenario of 7 joints, for runs of 10 s.
 
     Raises:
-      ValueError: an unknown law or reading, or a negative payload.
+      ValueError: an unknown law or variant, or a negative payload.
 
     Source: this package; the arm as `iblf_jax.presets.arms.arm` says.
     """
@@ -360,7 +360,7 @@ def iiwa14(*, law: str = "integral", reading: str = "corrected", payload: float 
         push=[6.0, 6.0, 4.0, 4.0, 0.3, 0.3, 0.1],
         payload=payload,
         law=law,
-        reading=reading,
+        variant=variant,
     )
 
 
@@ -372,7 +372,7 @@ def _swinging(
     push: Any,
     payload: float,
     law: str,
-    reading: str,
+    variant: str,
 ) -> Scenario:
     """A scenario in which every joint follows a cosine, from rest, between time-varying bounds."""
     middle = np.asarray(middle)
@@ -388,7 +388,7 @@ def _swinging(
         dataclasses.replace(robot, payload=payload),
         reference,
         law=law,
-        reading=reading,
+        variant=variant,
         bounds=Bounds(lower=lower, upper=upper),
         disturbance=disturbances.Sinusoids(
             amplitude=push, frequency=2.0, phase=np.linspace(0.0, 3.0, robot.n)

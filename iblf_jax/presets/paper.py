@@ -31,7 +31,7 @@ def customary_two_link() -> TwoLink:
     return TwoLink(mass=mass, length=length, centre=length / 2, inertia=mass * length**2 / 4)
 
 
-def zhang_yan_2024(*, law: str = "integral", reading: str = "printed", p: int = 1) -> Scenario:
+def zhang_yan_2024(*, law: str = "integral", variant: str = "printed", p: int = 1) -> Scenario:
     """The simulation of the paper's section 4, equations (4.1) to (4.3).
 
     Args:
@@ -39,7 +39,7 @@ def zhang_yan_2024(*, law: str = "integral", reading: str = "printed", p: int = 
         that the paper names, at the same gains k1, K2 and o, and the baselines "computed_torque"
         and "pd" at their own gains.  "backstepping" has no constraints; "adaptive_rbf" and "pd" run
         without an observer.  A law of `controllers.KEEPERS` must not need bounds on velocities.
-      reading: "printed", or "corrected" (law with C0 alpha, observer in momentum form), for which
+      variant: "printed", or "corrected" (law with C0 alpha, observer in momentum form), for which
         Theorem 2 is exact.
       p: exponent of the logarithmic barrier.
 
@@ -47,12 +47,12 @@ def zhang_yan_2024(*, law: str = "integral", reading: str = "printed", p: int = 
       A Scenario of 2 joints; the paper runs it for 20 s.
 
     Raises:
-      ValueError: an unknown law or reading.
+      ValueError: an unknown law or variant.
 
     Source: Zhang & Yan 2024, section 4; the arm's parameters are an assumption, see
       `customary_two_link`.
     """
-    checks.one_of("reading", reading, tuple(OBSERVERS))
+    checks.one_of("variant", variant, tuple(OBSERVERS))
     cosine = math.pi / 2
     wave = {"amplitude": 0.14, "frequency": 1.0}
     return Scenario(
@@ -70,13 +70,13 @@ def zhang_yan_2024(*, law: str = "integral", reading: str = "printed", p: int = 
             velocity_frequency=0.5,
             velocity_phase=[cosine, 0.0],
         ),
-        controller=law_by_name(law, k1=2.0, K2=20.0, o=0.1, reading=reading, p=p),
-        observer=observer_of(law, OBSERVERS[reading](kf=20.0)),
+        controller=law_by_name(law, k1=2.0, K2=20.0, o=0.1, variant=variant, p=p),
+        observer=observer_of(law, OBSERVERS[variant](kf=20.0)),
         initial=Initial(q=0.8, dq=0.0),
     )
 
 
-def printed_gap(*, reading: str = "printed") -> Scenario:
+def printed_gap(*, variant: str = "printed") -> Scenario:
     """An initial state at which the law as printed violates the inequality (3.18), (3.20), and the
     corrected law satisfies it.
 
@@ -87,18 +87,18 @@ def printed_gap(*, reading: str = "printed") -> Scenario:
     K2 >= 0.6, 1.1 <= kf <= 40, and rounded; f_hat(0) = (-0.5, 1.4) N m.
 
     Args:
-      reading: "printed" or "corrected"; gains and initial state, including f_hat(0), are the same.
+      variant: "printed" or "corrected"; gains and initial state, including f_hat(0), are the same.
 
     Returns:
-      A Scenario of 2 joints; the readings differ in the first 0.1 s.
+      A Scenario of 2 joints; the variants differ in the first 0.1 s.
 
     Raises:
-      ValueError: an unknown reading.
+      ValueError: an unknown variant.
 
     Source: this package.
     """
     return with_parameters(
-        zhang_yan_2024(reading=reading),
+        zhang_yan_2024(variant=variant),
         {
             "disturbance.acceleration_amplitude": 0.0,
             "disturbance.velocity_amplitude": 0.0,
@@ -114,7 +114,7 @@ def printed_gap(*, reading: str = "printed") -> Scenario:
 def zhang_yan_2024_saturated(
     *,
     law: str = "integral",
-    reading: str = "corrected",
+    variant: str = "corrected",
     limit: float | tuple[float, ...] = (7.2, 1.5),
     edge: str = "hard",
 ) -> Scenario:
@@ -127,23 +127,23 @@ def zhang_yan_2024_saturated(
     gravity, (6, 2) N m, the arm violates its bounds.
 
     Args:
-      law, reading: as for `zhang_yan_2024`.
+      law, variant: as for `zhang_yan_2024`.
       limit: largest torque, one number or one per joint [N m].
       edge: "hard", or "smooth" for gradients.
 
     Raises:
-      ValueError: an unknown law, reading or edge; a limit that is not positive.
+      ValueError: an unknown law, variant or edge; a limit that is not positive.
 
     Source: this package; the paper leaves saturation to future work.
     """
-    scenario = zhang_yan_2024(law=law, reading=reading)
+    scenario = zhang_yan_2024(law=law, variant=variant)
     return dataclasses.replace(
         scenario, controller=Saturated(law=scenario.controller, limit=limit, edge=edge)
     )
 
 
 def zhang_yan_2024_funnel(
-    *, law: str = "prescribed_performance", reading: str = "corrected"
+    *, law: str = "prescribed_performance", variant: str = "corrected"
 ) -> Scenario:
     """The paper's arm, reference and disturbance with prescribed performance: funnels inside the
     paper's bounds.
@@ -154,15 +154,15 @@ def zhang_yan_2024_funnel(
     from 1 s on, and finally within 0.05 rad.
 
     Args:
-      law, reading: as for `zhang_yan_2024`.
+      law, variant: as for `zhang_yan_2024`.
 
     Raises:
-      ValueError: an unknown law or reading.
+      ValueError: an unknown law or variant.
 
     Source: Zhang & Yan 2024, section 4, with a funnel as in its references [10, 11]; the funnel's
       numbers are this package's.
     """
-    scenario = zhang_yan_2024(law=law, reading=reading)
+    scenario = zhang_yan_2024(law=law, variant=variant)
     lower = Funnel(initial=[-0.15, -0.4], final=-0.05, rate=2.0)
     upper = Funnel(initial=[0.5, 0.25], final=0.05, rate=2.0)
     return dataclasses.replace(scenario, bounds=Bounds(lower=lower, upper=upper))
@@ -189,7 +189,7 @@ def zhang_yan_2024_full_state(*, kf: float = 100.0, c: float = 8.0) -> Scenario:
     """
     lower = SinusoidalBound(offset=[-1.6, -1.4], amplitude=[-0.1, 0.0])
     upper = SinusoidalBound(offset=[0.6, 0.5], amplitude=[0.1, 0.0], phase=0.5 * math.pi)
-    paper = zhang_yan_2024(reading="corrected")
+    paper = zhang_yan_2024(variant="corrected")
     return dataclasses.replace(
         paper,
         controller=BarrierBackstepping(

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from iblf_jax.control.barriers import Barrier, Mapping, Quadratic
+from iblf_jax.control.barriers import Barrier, Quadratic, TransformedError
 from iblf_jax.control.controllers import BarrierBackstepping
 from iblf_jax.control.observers import LevelObserver, Momentum
 from iblf_jax.presets.arms import iiwa14
@@ -115,7 +115,7 @@ def vessel(*, current: float = 0.05, waves: float = 0.5) -> Scenario:
             Bounds(lower=Constant([-0.2, -0.3, -0.5]), upper=Constant([0.8, 0.3, 0.5])),
         ),
         disturbance=Sum((Levels((drift,)), force)),
-        controller=_law((0.2, 1.0), Mapping(), Mapping()),
+        controller=_law((0.2, 1.0), TransformedError(), TransformedError()),
         observer=_observer(0.5, 2.0),
         initial=Initial(q=[5.3, -0.3, 1.5], dq=0.0),
     )
@@ -159,7 +159,9 @@ def motor_driven_pendulum() -> Scenario:
             _within(2.6),
         ),
         disturbance=Levels((None, Sinusoids(amplitude=1.5, frequency=3.0))),
-        controller=_law((2.0, 15.0, 60.0), Mapping(), Mapping(), Mapping()),
+        controller=_law(
+            (2.0, 15.0, 60.0), TransformedError(), TransformedError(), TransformedError()
+        ),
         observer=_observer(0.0, 20.0, 0.0),
         initial=Initial(q=0.6, dq=0.0),
     )
@@ -179,7 +181,7 @@ def motor_driven_two_link() -> Scenario:
     Source: Zhang & Yan 2024, section 4 (arm, reference, bounds, disturbance); Dawson, Hu and Burg
       1998 (motor).
     """
-    paper = zhang_yan_2024(reading="corrected")
+    paper = zhang_yan_2024(variant="corrected")
     plant: Any = ElectricDrive(
         robot=customary_two_link(),
         torque_constant=0.9,
@@ -192,7 +194,9 @@ def motor_driven_two_link() -> Scenario:
         plant=plant,
         model=plant,
         bounds=(paper.bounds[0], _within(1.5), _within([16.0, 6.0])),
-        controller=_law((2.0, 10.0, 40.0), Mapping(), Mapping(), Mapping()),
+        controller=_law(
+            (2.0, 10.0, 40.0), TransformedError(), TransformedError(), TransformedError()
+        ),
         observer=Momentum(kf=20.0),
     )
 
@@ -213,7 +217,7 @@ def flexible_joint_two_link(*, stiffness: float = 300.0) -> Scenario:
     Source: Zhang & Yan 2024, section 4 (arm, reference, bounds, disturbance); otherwise this
       package.
     """
-    paper = zhang_yan_2024(reading="corrected")
+    paper = zhang_yan_2024(variant="corrected")
     plant: Any = FlexibleJoint(
         robot=customary_two_link(), stiffness=stiffness, motor_inertia=0.02, motor_damping=0.1
     )
@@ -222,7 +226,13 @@ def flexible_joint_two_link(*, stiffness: float = 300.0) -> Scenario:
         plant=plant,
         model=plant,
         bounds=(paper.bounds[0], _within(1.0), None, _within(2.0)),
-        controller=_law((2.0, 10.0, 30.0, 60.0), Mapping(), Mapping(), Quadratic(), Mapping()),
+        controller=_law(
+            (2.0, 10.0, 30.0, 60.0),
+            TransformedError(),
+            TransformedError(),
+            Quadratic(),
+            TransformedError(),
+        ),
         observer=Momentum(kf=20.0),
     )
 
@@ -257,7 +267,7 @@ def flexible_joint_iiwa14() -> Scenario:
         plant=plant,
         model=plant,
         bounds=(rigid.bounds[0], from_speed_limits(arm)),
-        controller=_law((2.0, 8.0, 20.0, 50.0), Mapping()),
+        controller=_law((2.0, 8.0, 20.0, 50.0), TransformedError()),
         observer=Momentum(kf=40.0),
         initial=Initial(q=np.asarray(rigid.initial.q) + 0.07),
     )

@@ -1,6 +1,6 @@
 """The rate of V_w of a rigid arm whose plant is not the model.
 
-The law is the corrected reading of `controllers.Backstepping`, the observer is `Momentum`:
+The law is the corrected variant of `controllers.Backstepping`, the observer is `Momentum`:
 
     tau = C0 alpha + G0 + M0 alpha' - f_hat - K2 e2 - w s,   f_tilde' = f' - kf f_tilde
     V_w = sum_i w_i V1_i + 1/2 e2^T M0 e2 + w_f/2 |f_tilde|^2

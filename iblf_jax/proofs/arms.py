@@ -279,9 +279,9 @@ def _check_law(law: Any) -> None:
         if isinstance(law, controllers.Saturated):
             reason += " Without its limit: with_parts(s, controller=s.controller.law)."
         raise unsupported("controller", type(law).__name__, "controllers.Backstepping", reason)
-    if law.reading != "corrected":
+    if law.variant != "corrected":
         reason = "The printed law leaves 1/2 e2^T M0' e2 in V_w', and its proof fails."
-        raise unsupported("controller.reading", law.reading, '"corrected"', reason)
+        raise unsupported("controller.variant", law.variant, '"corrected"', reason)
     check_exponential(law, "V_w'")
     barrier, tube = law.barrier, unit_tube()
     zero, one = jnp.zeros(1), jnp.ones(1)

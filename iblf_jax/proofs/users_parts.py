@@ -22,7 +22,13 @@ from iblf_jax.world import bounds, plants, references, robots
 
 BARRIERS = frozenset(
     [
-        *(barriers.Integral, barriers.Log, barriers.Tan, barriers.State, barriers.Mapping),
+        *(
+            barriers.Integral,
+            barriers.Log,
+            barriers.Tan,
+            barriers.StateBarrier,
+            barriers.TransformedError,
+        ),
         *(barriers.PrescribedPerformance, barriers.Quadratic),
     ]
 )

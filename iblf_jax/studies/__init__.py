@@ -21,15 +21,15 @@ from iblf_jax.core.first_use import on_first_use as _on_first_use
 
 if TYPE_CHECKING:
     from iblf_jax.studies.options import Design as Design
+    from iblf_jax.studies.options import LocalExecutor as LocalExecutor
     from iblf_jax.studies.options import StoreOptions as StoreOptions
-    from iblf_jax.studies.options import ThisProcess as ThisProcess
     from iblf_jax.studies.workers import WorkerError as WorkerError
     from iblf_jax.studies.workers import initialize_worker as initialize_worker
 
 _ON_FIRST_USE = {
     "Design": ("iblf_jax.studies.options", "Design"),
     "StoreOptions": ("iblf_jax.studies.options", "StoreOptions"),
-    "ThisProcess": ("iblf_jax.studies.options", "ThisProcess"),
+    "LocalExecutor": ("iblf_jax.studies.options", "LocalExecutor"),
     "WorkerError": ("iblf_jax.studies.workers", "WorkerError"),
     "initialize_worker": ("iblf_jax.studies.workers", "initialize_worker"),
 }

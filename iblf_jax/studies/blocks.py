@@ -34,7 +34,7 @@ from iblf_jax.core.thread_options import with_options_of_caller
 from iblf_jax.engine import block_size, blocks_in_flight, wait_until_ready
 from iblf_jax.studies.dataset import DRAWN
 from iblf_jax.studies.draws import CaseInputs
-from iblf_jax.studies.options import ThisProcess
+from iblf_jax.studies.options import LocalExecutor
 from iblf_jax.studies.study_setup import PreparedStudy, SharedInputs, StudyProgram, drawn_leaves
 
 
@@ -112,7 +112,7 @@ def _execute(
 def run_blocks(
     prepared: PreparedStudy,
     blocks: Iterable[int],
-    here: ThisProcess | None = None,
+    here: LocalExecutor | None = None,
     *,
     record_every: int | None = None,
 ) -> Iterator[tuple[int, Any]]:
@@ -125,7 +125,7 @@ def run_blocks(
       record_every: steps between two records; if given, trajectories are returned instead of
         metrics.
     """
-    here = here or ThisProcess()
+    here = here or LocalExecutor()
     remaining = iter(blocks)
     devices = here.devices or default_devices()
     # No more devices are used than there are blocks.
@@ -184,7 +184,7 @@ def _compile(execute: partial, copies: list[SharedInputs], inputs: list[CaseInpu
 def run_spans_here(
     prepared: PreparedStudy,
     spans: Iterable[slice],
-    here: ThisProcess,
+    here: LocalExecutor,
     advance: Callable[[int], None] = lambda cases: None,
 ) -> Iterator[tuple[slice, BlockResults]]:
     """Computes spans of consecutive cases in this process, in their order, and yields each with its

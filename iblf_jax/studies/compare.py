@@ -88,8 +88,8 @@ def compare(
                    rms|tau - G0(q)| of law i, every leaf in its `gains` times c
                    =  that of the first law
 
-    Laws with barriers of different units, such as `Mapping` and `PrescribedPerformance`, are
-    different designs at equal weights: scale the weights before you compare them, see
+    Laws with barriers of different units, such as `TransformedError` and `PrescribedPerformance`,
+    are different designs at equal weights: scale the weights before you compare them, see
     `BarrierBackstepping`.
 
     Args:
@@ -193,7 +193,7 @@ def _with_law(scenario: Scenario, law: str | TrackingLaw) -> Scenario:
     if isinstance(law, str):
         own = unwrapped(scenario.controller)
         values = field_values(own)
-        given = {name: values.get(name) for name in ("k1", "K2", "o", "reading")}
+        given = {name: values.get(name) for name in ("k1", "K2", "o", "variant")}
         if own.barriers and given["o"] is not None:
             given["o"] = given["o"][0]  # of the first level
         kept = {name: value for name, value in given.items() if value is not None}

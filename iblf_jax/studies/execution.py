@@ -14,14 +14,14 @@ import numpy as np
 
 from iblf_jax.engine import block_size
 from iblf_jax.studies.blocks import BlockResults, run_spans_here
-from iblf_jax.studies.options import ThisProcess
+from iblf_jax.studies.options import LocalExecutor
 from iblf_jax.studies.study_setup import PreparedStudy
 
 
 def run_spans(
     prepared: PreparedStudy,
     spans: Iterable[slice],
-    executor: ThisProcess | Executor,
+    executor: LocalExecutor | Executor,
     advance: Callable[[int], None],
 ) -> Iterator[tuple[slice, BlockResults]]:
     """Computes spans of consecutive cases and yields each with its results.
@@ -33,7 +33,7 @@ def run_spans(
       executor: where they are computed.
       advance: called with a number of cases whenever so many are computed.
     """
-    if isinstance(executor, ThisProcess):
+    if isinstance(executor, LocalExecutor):
         yield from run_spans_here(prepared, spans, executor, advance)
         return
     from iblf_jax.studies.workers import run_on_workers
@@ -45,7 +45,7 @@ def run_spans(
 
 def run_all_cases(
     prepared: PreparedStudy,
-    executor: ThisProcess | Executor,
+    executor: LocalExecutor | Executor,
     advance: Callable[[int], None],
 ) -> BlockResults:
     """The results of all cases of a study in memory, case axis first."""

@@ -23,7 +23,7 @@ from iblf_jax.simulation.stability import RADIUS
 from iblf_jax.studies.blocks import case_bytes
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.execution import run_all_cases
-from iblf_jax.studies.options import RunOptions, ThisProcess, executor_of
+from iblf_jax.studies.options import LocalExecutor, RunOptions, executor_of
 from iblf_jax.studies.study import Study
 from iblf_jax.studies.study_setup import prepare
 from iblf_jax.studies.time_step import warn_of_sampling, warn_of_step
@@ -46,7 +46,7 @@ def monte_carlo(
     sampler: str = "independent",
     replicates: int = 1,
     backend: str = "auto",
-    executor: ThisProcess | Executor | None = None,
+    executor: LocalExecutor | Executor | None = None,
     progress: bool | None = None,
 ) -> Study:
     """Runs a scenario many times with parameters drawn at random.
@@ -73,8 +73,8 @@ def monte_carlo(
       replicates: number of independent designs that a Latin hypercube or Sobol study is made of.
       backend: "auto", "native", "gpu" or "vmap".
       executor: where the runs are computed: any `concurrent.futures.Executor`, such as a Dask
-        client's `get_executor()` or a process pool; or an `ij.studies.ThisProcess` with devices and
-        a limit of memory.  None for this process and all its devices.
+        client's `get_executor()` or a process pool; or an `ij.studies.LocalExecutor` with devices
+        and a limit of memory.  None for this process and all its devices.
       progress: a progress bar; by default it is shown on a terminal.
       runs_as: an `ij.Runs`, in place of its fields.
 

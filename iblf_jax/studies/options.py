@@ -42,7 +42,7 @@ class RunOptions(Runs):
 
 
 @dataclasses.dataclass(frozen=True)
-class ThisProcess:
+class LocalExecutor:
     """Computes the runs of a study in this process, on one or several devices."""
 
     devices: Sequence[jax.Device] | None = None
@@ -52,14 +52,14 @@ class ThisProcess:
     chunk: int | None = None
     """Number of runs in flight; None to derive it from `memory`."""
 
-    def checked(self) -> ThisProcess:
+    def checked(self) -> LocalExecutor:
         """The same options with valid values; ValueError names an invalid one."""
         chunk = self.chunk
         if chunk is not None:
             chunk = checks.positive_integer("chunk", chunk, most=checks.MAX_STEPS)
         remedy = "Such as memory=4e9."
         memory = checks.number_between("memory", self.memory, 1.0, MAX_MEMORY, "bytes", remedy)
-        return ThisProcess(checks.devices("devices", self.devices), memory, chunk)
+        return LocalExecutor(checks.devices("devices", self.devices), memory, chunk)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,21 +98,21 @@ class Design:
     """Number of points; None for a grid."""
 
 
-def executor_of(executor: Any) -> ThisProcess | Executor:
+def executor_of(executor: Any) -> LocalExecutor | Executor:
     """The checked `executor` of a study; None for this process.
 
     Raises:
-      ValueError: it is neither a `ThisProcess` nor a `concurrent.futures.Executor`.
+      ValueError: it is neither a `LocalExecutor` nor a `concurrent.futures.Executor`.
     """
     if executor is None:
-        executor = ThisProcess()
-    if isinstance(executor, ThisProcess):
+        executor = LocalExecutor()
+    if isinstance(executor, LocalExecutor):
         return executor.checked()
     if not isinstance(executor, Executor):
         raise checks.fail(
             "executor",
             executor,
-            "a concurrent.futures.Executor or an ij.studies.ThisProcess",
+            "a concurrent.futures.Executor or an ij.studies.LocalExecutor",
             "Of a Dask client give client.get_executor().",
         )
     return executor

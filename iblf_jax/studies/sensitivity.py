@@ -36,7 +36,7 @@ from iblf_jax.studies.designs import MAX_SOBOL, split
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.draws import draw_shapes
 from iblf_jax.studies.execution import run_all_cases
-from iblf_jax.studies.options import RunOptions, ThisProcess, executor_of
+from iblf_jax.studies.options import LocalExecutor, RunOptions, executor_of
 from iblf_jax.studies.study_setup import PreparedStudy, prepare
 
 if TYPE_CHECKING:
@@ -113,7 +113,7 @@ def sensitivity(
     method: str = "rk4",
     metrics: Sequence[Fold] | None = None,
     backend: str = "auto",
-    executor: ThisProcess | Executor | None = None,
+    executor: LocalExecutor | Executor | None = None,
     progress: bool | None = None,
 ) -> Sensitivity:
     """Which of the perturbed parameters matter for a metric: first-order and total Sobol indices.
@@ -236,7 +236,7 @@ class _Evaluation:
     shapes: dict[str, tuple[int, ...]]
     """Name of the draws -> shape of their uniform numbers."""
     output: str | Callable[[Metrics], Any]
-    executor: ThisProcess | Executor
+    executor: LocalExecutor | Executor
     advance: Callable[[int], None]
     failed: int = 0
     """Number of runs that failed until now."""

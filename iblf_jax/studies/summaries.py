@@ -24,7 +24,7 @@ from iblf_jax.simulation.units import signal_unit
 from iblf_jax.studies import statistics
 from iblf_jax.studies.blocks import run_blocks
 from iblf_jax.studies.dataset import status_attributes
-from iblf_jax.studies.options import ThisProcess
+from iblf_jax.studies.options import LocalExecutor
 from iblf_jax.studies.store_config import describe_component, values_of
 from iblf_jax.studies.study_setup import PreparedStudy
 from iblf_jax.world import plants
@@ -198,7 +198,7 @@ def bands(
         )
     size = block_size()
     blocks = range(checks.ceil_div(count, size))
-    one_block_at_a_time = ThisProcess(chunk=size)
+    one_block_at_a_time = LocalExecutor(chunk=size)
     parts = [
         (arrays, t[0])
         for _, (arrays, t) in run_blocks(

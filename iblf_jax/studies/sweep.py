@@ -33,9 +33,9 @@ from iblf_jax.studies.execution import run_all_cases, run_spans
 from iblf_jax.studies.interrupt import Interrupted, StopRequest
 from iblf_jax.studies.options import (
     Design,
+    LocalExecutor,
     RunOptions,
     StoreOptions,
-    ThisProcess,
     design_of,
     executor_of,
     store_of,
@@ -69,7 +69,7 @@ def sweep(
     replicates: int = 1,
     store: str | os.PathLike | StoreOptions | None = None,
     backend: str = "auto",
-    executor: ThisProcess | Executor | None = None,
+    executor: LocalExecutor | Executor | None = None,
     progress: bool | None = None,
 ) -> xarray.Dataset:
     """Runs a scenario over many values of its parameters, with perturbed runs at each.
@@ -101,8 +101,8 @@ def sweep(
         needs the extra `sweep`.
       backend: "auto", "native", "gpu" or "vmap".
       executor: where the cases are computed: any `concurrent.futures.Executor`, such as a Dask
-        client's `get_executor()` or a process pool; or an `ij.studies.ThisProcess` with devices and
-        a limit of memory.  None for this process and all its devices.
+        client's `get_executor()` or a process pool; or an `ij.studies.LocalExecutor` with devices
+        and a limit of memory.  None for this process and all its devices.
       progress: a progress bar; by default it is shown on a terminal.
       runs_as: an `ij.Runs`, in place of its fields.
 
@@ -211,7 +211,7 @@ def _variables(prepared: PreparedStudy, config: dict[str, Any]) -> dict[str, Var
 def _in_memory(
     prepared: PreparedStudy,
     config: dict[str, Any],
-    executor: ThisProcess | Executor,
+    executor: LocalExecutor | Executor,
     progress: bool | None,
 ) -> xarray.Dataset:
     with bar(progress, prepared.cases) as shown:
@@ -225,7 +225,7 @@ def _in_memory(
 def _into_store(
     prepared: PreparedStudy,
     config: dict[str, Any],
-    executor: ThisProcess | Executor,
+    executor: LocalExecutor | Executor,
     progress: bool | None,
     options: StoreOptions,
 ) -> xarray.Dataset:
@@ -257,13 +257,13 @@ def _into_store(
 def _results(
     prepared: PreparedStudy,
     spans: Iterator[slice],
-    executor: ThisProcess | Executor,
+    executor: LocalExecutor | Executor,
     store: Store,
     options: StoreOptions,
     advance: Callable[[int], None],
 ) -> Generator[tuple[slice, Any], None, None]:
     """Units with their results; None for those that a worker has written."""
-    if isinstance(executor, ThisProcess) or options.writer == "client":
+    if isinstance(executor, LocalExecutor) or options.writer == "client":
         yield from run_spans(prepared, spans, executor, advance)
         return
     from iblf_jax.studies.workers import SharedStore, run_on_workers

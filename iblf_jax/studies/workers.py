@@ -41,7 +41,7 @@ from iblf_jax.core.families import adopt_again
 from iblf_jax.core.pytree import is_component_class, register_component
 from iblf_jax.engine import uses_host_compiler
 from iblf_jax.studies.blocks import BlockResults, named_arrays, run_spans_here
-from iblf_jax.studies.options import ThisProcess
+from iblf_jax.studies.options import LocalExecutor
 from iblf_jax.studies.store import StoreError, load_store
 from iblf_jax.studies.study_setup import PreparedStudy
 
@@ -207,7 +207,7 @@ def run_task(payload: bytes, first: int, last: int) -> BlockResults | None:
         if store.marks()[unit] and store.read(unit) is not None:
             return None
     with thread_options.applied(task.jax_options):
-        ((_, results),) = run_spans_here(task.prepared, [slice(first, last)], ThisProcess())
+        ((_, results),) = run_spans_here(task.prepared, [slice(first, last)], LocalExecutor())
     if store is None:
         return results
     store.write(unit, named_arrays(results))

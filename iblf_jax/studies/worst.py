@@ -35,7 +35,7 @@ class Worst(NamedTuple):
     status: int
 
 
-class WorstCase:
+class WorstCaseSearch:
     """The problem that a solver gets: it evaluates points and keeps the best one.
 
     Args:
@@ -86,7 +86,9 @@ class WorstCase:
         return self.excluded
 
 
-def search(problem: WorstCase, solver: Callable[[WorstCase], None], remedy: str = "") -> Worst:
+def search(
+    problem: WorstCaseSearch, solver: Callable[[WorstCaseSearch], None], remedy: str = ""
+) -> Worst:
     """The best point that a solver finds.
 
     Args:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.control.controllers import Backstepping
-from iblf_jax.control.observers import Printed
+from iblf_jax.control.observers import AsPublished
 from iblf_jax.core import checks
 from iblf_jax.core.modules import is_module
 from iblf_jax.core.pytree import field_values, is_leaf_field
@@ -190,7 +190,7 @@ def scenario_of(n: int) -> Scenario:
         ),
         disturbance=Sinusoids(amplitude=0.01, frequency=1.0, phase=phases),
         controller=Backstepping(k1=2.0, K2=20.0, o=0.1),
-        observer=Printed(kf=20.0),
+        observer=AsPublished(kf=20.0),
         initial=Initial(q=0.8, dq=0.0),
     )
 

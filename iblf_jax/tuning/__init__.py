@@ -32,9 +32,9 @@ and validates the result on fresh runs.
 
 from iblf_jax.tuning import objectives as objectives
 from iblf_jax.tuning._failure_probability import failure_probability as failure_probability
-from iblf_jax.tuning._falsify import Attack as Attack
+from iblf_jax.tuning._falsify import WorstCase as WorstCase
 from iblf_jax.tuning._falsify import falsify as falsify
-from iblf_jax.tuning._pareto import Front as Front
+from iblf_jax.tuning._pareto import ParetoFront as ParetoFront
 from iblf_jax.tuning._pareto import pareto as pareto
 from iblf_jax.tuning._tune import tune as tune
 from iblf_jax.tuning.failures import FailedRuns as FailedRuns

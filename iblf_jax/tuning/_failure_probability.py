@@ -29,7 +29,7 @@ from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.simulation.units import unit_text
 from iblf_jax.studies.designs import MAX_RUNS
 from iblf_jax.studies.distributions import Perturbation
-from iblf_jax.studies.options import RunOptions, ThisProcess, executor_of
+from iblf_jax.studies.options import LocalExecutor, RunOptions, executor_of
 from iblf_jax.studies.rare_events.crude import crude_monte_carlo
 from iblf_jax.studies.rare_events.design_points import Pieces, design_points
 from iblf_jax.studies.rare_events.importance import importance_sampling
@@ -155,7 +155,7 @@ def failure_probability(
     seed: int = 0,
     method: str = "rk4",
     backend: str = "auto",
-    executor: ThisProcess | Executor | None = None,
+    executor: LocalExecutor | Executor | None = None,
     progress: bool | None = None,
 ) -> FailureProbability:
     """The probability that a run with random parameters fails, down to 1e-8 and below.

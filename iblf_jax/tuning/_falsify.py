@@ -44,7 +44,7 @@ from iblf_jax.simulation.scenario import Scenario, canonical, fitted_to_step
 from iblf_jax.simulation.units import status_words, unit_text
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.perturbation_cube import Cube, unit_cube
-from iblf_jax.studies.worst import Losses, WorstCase, search
+from iblf_jax.studies.worst import Losses, WorstCaseSearch, search
 from iblf_jax.tuning.evaluation import Derivatives, Value
 from iblf_jax.tuning.margins import pieces_of_margins
 from iblf_jax.tuning.parameters import Box
@@ -66,7 +66,7 @@ ALL_UNINFORMATIVE = (
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Attack(Result):
+class WorstCase(Result):
     """The worst run that `falsify` found."""
 
     scenario: Scenario
@@ -107,8 +107,8 @@ class Attack(Result):
         elif has_flag(self.status, Status.SAMPLING_TOO_SLOW):
             word = "bounds kept, but the sampled loop is unstable at this draw"
         lines = [
-            f"Attack({word}: smallest margin {self.margin:.4g} {self.unit}, {self.first_margin:.4g}"
-            f" at random; {self.runs} runs)",
+            f"WorstCase({word}: smallest margin {self.margin:.4g} {self.unit},"
+            f" {self.first_margin:.4g} at random; {self.runs} runs)",
             f"  status: {describe(self.status, status_words(self.scenario))}",
         ]
         for path, x in self.values.items():
@@ -133,7 +133,7 @@ def falsify(
     seed: int = 0,
     margin: str = "positions",
     progress: bool | None = None,
-) -> Attack:
+) -> WorstCase:
     """Searches for the run with the smallest margin within stated sets.
 
         minimise over u in [0, 1]^d:   min over t and joints of min(q - lower, upper - q)
@@ -157,7 +157,7 @@ def falsify(
       runs_as: an `ij.Runs`, in place of its fields.
 
     Returns:
-      An `Attack`: the worst run found, and whether it left its bounds.  That no such run is found
+      A `WorstCase`: the worst run found, and whether it left its bounds.  That no such run is found
       proves nothing.
 
     Raises:
@@ -182,14 +182,14 @@ def falsify(
     check_needs("margin", peak, scenario)
     unit = unit_text(scenario, DEFICITS[peak.signal])
     losses = partial(_losses, cube, peak, jnp.asarray(dt, dtype), request)
-    problem = WorstCase(cube, losses, starts, (options.seed, 3))
+    problem = WorstCaseSearch(cube, losses, starts, (options.seed, 3))
     with bar(progress, iterations + 1, unit="steps") as shown:
         worst = search(problem, partial(_attack, iterations, shown, unit), ALL_UNINFORMATIVE)
     point = cube.values(jnp.asarray(worst.u, dtype))
     values = {path: np.asarray(x) for path, x in point.items()}
     history = np.stack(problem.history)
     first = history[np.isfinite(history).any(axis=1)][0]
-    return Attack(
+    return WorstCase(
         scenario=with_parameters(scenario, values),
         values=values,
         margin=worst.loss,
@@ -205,7 +205,7 @@ def falsify(
 class _Attacks(NamedTuple):
     """All attacks, as `solvers.sqp` evaluates them."""
 
-    problem: WorstCase
+    problem: WorstCaseSearch
     space: SearchSpace
     active: np.ndarray
 
@@ -216,7 +216,7 @@ class _Attacks(NamedTuple):
         return Derivatives(Value(found.values), found.gradients, np.zeros((starts, size, size)))
 
 
-def _attack(iterations: int, shown: Any, unit: str, problem: WorstCase) -> None:
+def _attack(iterations: int, shown: Any, unit: str, problem: WorstCaseSearch) -> None:
     """All steps of all attacks."""
     d, starts = problem.cube.size, problem.starts
     space = SearchSpace(Box(np.full(d, 0.5), np.zeros(d), np.ones(d)))

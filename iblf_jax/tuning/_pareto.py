@@ -64,7 +64,7 @@ POINTS_BETWEEN = 8
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Front(Result):
+class ParetoFront(Result):
     """Gains of which none is dominated by another in both objectives, from low a to low b."""
 
     labels: tuple[str, str]
@@ -109,7 +109,7 @@ class Front(Result):
     def __repr__(self) -> str:
         pairs = zip(self.labels, self.objectives.T, strict=True)
         ends = ", ".join(f"{name} {x.min():.4g} to {x.max():.4g}" for name, x in pairs)
-        return f"Front({len(self)} points of {len(self.tried)} trials; {ends})"
+        return f"ParetoFront({len(self)} points of {len(self.tried)} trials; {ends})"
 
 
 def non_dominated(points: np.ndarray) -> np.ndarray:
@@ -139,7 +139,7 @@ def pareto(
     backend: str = "auto",
     tolerance: float = 1e-5,
     progress: bool | None = None,
-) -> Front:
+) -> ParetoFront:
     """The front of two objectives over some leaves of a scenario.
 
         an end:            minimise a                        or  minimise b
@@ -158,7 +158,7 @@ def pareto(
       runs_as: an `ij.Runs`, in place of its fields.
 
     Returns:
-      A `Front`.
+      A `ParetoFront`.
 
     Raises:
       ValueError: not two objectives of one term, or as `tune`.
@@ -350,13 +350,13 @@ class FrontSearch:
         z = np.stack([np.interp(at, along, x) for x in self.z[curve].T], axis=1)
         self._keep_values(z, values(self.problem, z))
 
-    def front(self, seconds: float) -> Front:
+    def front(self, seconds: float) -> ParetoFront:
         """The trials that are not dominated."""
         problem = self.problem
         front = non_dominated(self.terms)
         z = self.z[front]
         first, second = problem.objective.terms
-        return Front(
+        return ParetoFront(
             labels=(first.name, second.name),
             objectives=self.terms[front],
             x=in_units(problem.blocks, z),

@@ -19,11 +19,11 @@ STATES = 4096
 
 
 def loop(
-    reading: str = "corrected", observer: str = "momentum", barrier=None, wall: float = 1e-3
+    variant: str = "corrected", observer: str = "momentum", barrier=None, wall: float = 1e-3
 ) -> ij.Scenario:
     """The paper's loop with one law and one observer, to be varied by `random_loops`."""
     barrier = ij.barriers.Integral(guard=wall) if barrier is None else barrier
-    law = ij.controllers.Backstepping(k1=2.0, K2=20.0, barrier=barrier, reading=reading)
+    law = ij.controllers.Backstepping(k1=2.0, K2=20.0, barrier=barrier, variant=variant)
     paper = ij.presets.zhang_yan_2024()
     return canonical(
         dataclasses.replace(paper, controller=law, observer=ij.observers.MEMBERS[observer](kf=20.0))

@@ -50,7 +50,7 @@ def paper(parts: dict[str, Any] | None = None, **preset: Any) -> ij.Scenario:
 
 def under(law: Any, **parts: Any) -> ij.Scenario:
     """The paper's scenario under a law, with the momentum observer."""
-    return paper({"controller": law, **parts}, reading="corrected")
+    return paper({"controller": law, **parts}, variant="corrected")
 
 
 def backstepping(**fields: Any) -> Any:
@@ -67,7 +67,7 @@ def own(**fields: float) -> ij.Scenario:
 
 def without_disturbance() -> ij.Scenario:
     """Case 1: f' = 0."""
-    return paper({"disturbance": ij.disturbances.Nothing()}, reading="corrected")
+    return paper({"disturbance": ij.disturbances.Nothing()}, variant="corrected")
 
 
 def fourth_order() -> ij.Scenario:
@@ -135,15 +135,15 @@ def saturated(limit: Any, edge: str = "hard") -> ij.Scenario:
 CASES: dict[str, Callable[[], Any]] = {
     # Theorem 2
     "printed": paper,
-    "corrected": lambda: paper(reading="corrected"),
+    "corrected": lambda: paper(variant="corrected"),
     "printed gap, printed": ij.presets.printed_gap,
-    "printed gap, corrected": lambda: ij.presets.printed_gap(reading="corrected"),
+    "printed gap, corrected": lambda: ij.presets.printed_gap(variant="corrected"),
     "case 1": without_disturbance,
-    "barrier Log": lambda: paper(law="log", reading="corrected"),
-    "barrier Log, p = 2": lambda: paper(law="log", reading="corrected", p=2),
-    "barrier Tan": lambda: paper(law="tan", reading="corrected"),
-    "barrier State": lambda: paper(law="state", reading="corrected"),
-    "barrier Mapping": lambda: paper(law="mapping", reading="corrected"),
+    "barrier Log": lambda: paper(law="log", variant="corrected"),
+    "barrier Log, p = 2": lambda: paper(law="log", variant="corrected", p=2),
+    "barrier Tan": lambda: paper(law="tan", variant="corrected"),
+    "barrier State": lambda: paper(law="state", variant="corrected"),
+    "barrier TransformedError": lambda: paper(law="mapping", variant="corrected"),
     "funnel": ij.presets.zhang_yan_2024_funnel,
     "with a weight": lambda: under(backstepping(weight=0.3)),
     "with a weight, failing gains": lambda: under(
@@ -152,7 +152,7 @@ CASES: dict[str, Callable[[], Any]] = {
     "with decays": lambda: under(
         backstepping(
             o=None,
-            barrier=ij.barriers.Mapping(),
+            barrier=ij.barriers.TransformedError(),
             decays=(ij.decays.FixedTime(k_a=1.0, k_b=1.0),) * 2,
         )
     ),
@@ -162,12 +162,12 @@ CASES: dict[str, Callable[[], Any]] = {
     "saturated for a while": lambda: saturated((7.2, 1.5)),
     "saturated smoothly": lambda: saturated((20.0, 9.0), "smooth"),
     "without an observer": lambda: under(backstepping(), observer=ij.observers.NoObserver()),
-    "no barrier": lambda: paper(law="backstepping", reading="corrected"),
-    "dynamic surface": lambda: paper(law="dynamic_surface", reading="corrected"),
-    "adaptive": lambda: paper(law="adaptive_rbf", reading="corrected"),
-    "computed torque": lambda: paper(law="computed_torque", reading="corrected"),
-    "PD": lambda: paper(law="pd", reading="corrected"),
-    "sampled": lambda: paper({"sampling": ij.Sampling(period=2e-3)}, reading="corrected"),
+    "no barrier": lambda: paper(law="backstepping", variant="corrected"),
+    "dynamic surface": lambda: paper(law="dynamic_surface", variant="corrected"),
+    "adaptive": lambda: paper(law="adaptive_rbf", variant="corrected"),
+    "computed torque": lambda: paper(law="computed_torque", variant="corrected"),
+    "PD": lambda: paper(law="pd", variant="corrected"),
+    "sampled": lambda: paper({"sampling": ij.Sampling(period=2e-3)}, variant="corrected"),
     "actuator": lambda: under(backstepping(), actuator=ij.actuators.Motor(bandwidth=200.0)),
     "event trigger": event_triggered,
     "rigid law on springs": rigid_law_on_springs,

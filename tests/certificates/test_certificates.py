@@ -33,7 +33,7 @@ def between(low, high):
     return ij.value(ij.uniform(low, high))
 
 
-READINGS = (
+VARIANTS = (
     ("corrected", "momentum", "float64"),
     ("printed", "printed", "float32"),
     ("corrected", "printed", "float32"),
@@ -43,11 +43,11 @@ BARRIERS = {
     "integral": ij.barriers.Integral(),
     "log_p2": pytest.param(ij.barriers.Log(p=2), marks=pytest.mark.slow),
     "tan": ij.barriers.Tan(),
-    "state": pytest.param(ij.barriers.State(), marks=pytest.mark.slow),
+    "state": pytest.param(ij.barriers.StateBarrier(), marks=pytest.mark.slow),
     "prescribed_performance": pytest.param(
         ij.barriers.PrescribedPerformance(), marks=pytest.mark.slow
     ),
-    "mapping": pytest.param(ij.barriers.Mapping(), marks=pytest.mark.slow),
+    "mapping": pytest.param(ij.barriers.TransformedError(), marks=pytest.mark.slow),
     "quadratic": pytest.param(ij.barriers.Quadratic(), marks=pytest.mark.slow),
 }
 
@@ -87,9 +87,9 @@ def left_side(batch, proof):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("reading", "observer", "dtype"), READINGS)
-def test_the_rate_of_V2_is_the_proofs_plus_the_dropped_terms(reading, observer, dtype):
-    batch, t, state = random_loops(ij.astype(loop(reading, observer), dtype), nearest=0.998)
+@pytest.mark.parametrize(("variant", "observer", "dtype"), VARIANTS)
+def test_the_rate_of_V2_is_the_proofs_plus_the_dropped_terms(variant, observer, dtype):
+    batch, t, state = random_loops(ij.astype(loop(variant, observer), dtype), nearest=0.998)
     proof = terms_of(batch, t, state)
     assert proof.dV.dtype == dtype
     assert not np.any(proof.excluded)
@@ -99,7 +99,7 @@ def test_the_rate_of_V2_is_the_proofs_plus_the_dropped_terms(reading, observer, 
     # The tolerance is small beside what it judges, so that it hides nothing.
     assert np.median(allowed / np.abs(proof.dV)) < (1e-11 if dtype == "float64" else 5e-3)
     dropped = proof.claims["torque"]
-    assert np.any(np.asarray(dropped.dropped_e2) != 0) == (reading == "printed")
+    assert np.any(np.asarray(dropped.dropped_e2) != 0) == (variant == "printed")
     assert np.any(np.asarray(dropped.dropped_f) != 0) == (observer == "printed")
 
 
@@ -131,7 +131,7 @@ def test_inequality_is_an_equality_where_the_proof_leaves_nothing():
         controller=ij.controllers.Backstepping(
             k1=5.0,
             K2=0.5 + 0.5 * rate * float(arm.mass_matrix(jnp.zeros(1))[0, 0]),
-            reading="corrected",
+            variant="corrected",
         ),
         observer=ij.observers.Momentum(kf=1.0 + 0.5 * rate, start="matched"),
         initial=ij.Initial(q=0.5, dq=0.1 + 0.8),
@@ -227,7 +227,7 @@ def paper_certificate(paper, paper_run) -> Certificate:
 
 @pytest.fixture(scope="module")
 def corrected_run():
-    return ij.simulate(ij.presets.zhang_yan_2024(reading="corrected"), **PAPER)
+    return ij.simulate(ij.presets.zhang_yan_2024(variant="corrected"), **PAPER)
 
 
 @pytest.fixture(scope="module")
@@ -603,7 +603,7 @@ def one_joint(plant):
         plant=plant,
         reference=ij.references.Sinusoid(offset=0.5, amplitude=0.1),
         bounds=ij.bounds.Bounds(lower=ij.bounds.Constant(0.1), upper=ij.bounds.Constant(0.9)),
-        controller=ij.controllers.Backstepping(k1=2.0, K2=20.0, reading="corrected"),
+        controller=ij.controllers.Backstepping(k1=2.0, K2=20.0, variant="corrected"),
         observer=ij.observers.Momentum(kf=20.0),
         initial=ij.Initial(q=0.7),
     )
@@ -1041,14 +1041,14 @@ def test_a_study_in_place_of_the_scenario_is_refused_with_the_right_call():
 # --- the gap --------------------------------------------------------------------------------------
 
 
-def gap_certificate(reading):
-    scenario = ij.presets.printed_gap(reading=reading)
+def gap_certificate(variant):
+    scenario = ij.presets.printed_gap(variant=variant)
     return certify(scenario, ij.simulate(scenario, **PAPER))
 
 
 @pytest.mark.slow
 def test_printed_breaks_its_claim_where_corrected_keeps_it():
-    printed, corrected = (gap_certificate(reading) for reading in ("printed", "corrected"))
+    printed, corrected = (gap_certificate(variant) for variant in ("printed", "corrected"))
     for certificate in (printed, corrected):  # inside the paper's own conditions
         assert all(
             certificate[name].verdict == "holds"
@@ -1080,7 +1080,7 @@ def test_search_finds_the_gap_of_the_printed_law_only():
     for path, perturbation in perturbations.items():
         low, high = perturbation.distribution.support()
         assert np.all((found.parameters[path] >= low) & (found.parameters[path] <= high))
-    none = counterexample(ij.presets.printed_gap(reading="corrected"), perturbations, starts=4)
+    none = counterexample(ij.presets.printed_gap(variant="corrected"), perturbations, starts=4)
     assert none.growth < -1.0 + 1e-9
 
 

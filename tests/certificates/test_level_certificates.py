@@ -22,7 +22,7 @@ from iblf_jax.certificates.terms import rounding
 from iblf_jax.simulation.closed_loop import evaluate
 from iblf_jax.world import plants
 
-MAPPING, PERFORMANCE = ij.barriers.Mapping(), ij.barriers.PrescribedPerformance()
+MAPPING, PERFORMANCE = ij.barriers.TransformedError(), ij.barriers.PrescribedPerformance()
 DESIGNS = {
     "mapping, order 2": (2, MAPPING),
     "mapping, order 3": (3, MAPPING),
@@ -132,13 +132,13 @@ def test_both_sides_of_the_claim_are_equal(design):
 
 
 def state_sides(points, nearest, widths=None, monkeypatch=None):
-    """V' of a law with `State` on both levels of a plant with coupled gains: by compiled
+    """V' of a law with `StateBarrier` on both levels of a plant with coupled gains: by compiled
     differentiation, by the same operations one by one, and by the claim with the exact decay
     k e s; and whether alpha_1 is outside the bounds of level 2."""
     if widths is not None:
         monkeypatch.setattr(random_plants, "tube_widths", lambda order: np.array(widths))
     monkeypatch.setattr(random_plants, "STATES", points)
-    scenario = random_scenario(2, (ij.barriers.State(),) * 2, seed=2)
+    scenario = random_scenario(2, (ij.barriers.StateBarrier(),) * 2, seed=2)
     t, state = random_states(scenario, 2, nearest=nearest)
     law = scenario.controller
 

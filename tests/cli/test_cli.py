@@ -217,7 +217,7 @@ def test_simulate_a_preset(command):
         "--arg",
         "law=log",
         "--arg",
-        "reading=corrected",
+        "variant=corrected",
         "--record-every",
         "7",
     )
@@ -290,7 +290,7 @@ REFUSALS = [
     ([], "required: COMMAND"),
     (["bogus"], "invalid choice: 'bogus'"),
     (["reproduce"], "required: --out"),
-    (["reproduce", "--out", "out", "--reading", "x"], "invalid choice: 'x'"),
+    (["reproduce", "--out", "out", "--variant", "x"], "invalid choice: 'x'"),
     (["reproduce", "--out", "out", "--dt", "0"], "dt: got 0.0, expected a positive number [s]"),
     (
         ["reproduce", "--out", "file.toml"],

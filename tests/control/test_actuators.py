@@ -23,7 +23,7 @@ from iblf_jax.simulation.delays import STAGES, arriving
 
 LOOP = Loop(corrected=True, K2=np.full(2, 4.0), kf=np.full(2, 4.0))
 SLOW = ij.with_parameters(
-    ij.presets.zhang_yan_2024(reading="corrected"), {"controller.K2": 4.0, "observer.kf": 4.0}
+    ij.presets.zhang_yan_2024(variant="corrected"), {"controller.K2": 4.0, "observer.kf": 4.0}
 )
 DURATION = 0.1
 RHO, BIAS = np.array([0.6, 0.8]), np.array([0.3, -0.2])

@@ -18,7 +18,7 @@ from iblf_jax.certificates.claims import terms_at
 from iblf_jax.files.scenario import load_scenario, save_scenario
 from iblf_jax.simulation.closed_loop import LoopState, rate
 
-PAPER = ij.presets.zhang_yan_2024(reading="corrected")
+PAPER = ij.presets.zhang_yan_2024(variant="corrected")
 UNDISTURBED = dataclasses.replace(
     PAPER, observer=ij.observers.NoObserver(), disturbance=ij.disturbances.Nothing()
 )
@@ -192,7 +192,9 @@ def test_a_run_is_that_of_an_independent_program(name):
 # ------------------------------------------------------------------------- the claim (R.3)
 
 
-MAPPED = controllers.Backstepping(k1=2.0, K2=20.0, barrier=barriers.Mapping(), reading="corrected")
+MAPPED = controllers.Backstepping(
+    k1=2.0, K2=20.0, barrier=barriers.TransformedError(), variant="corrected"
+)
 ARM = dataclasses.replace(PAPER, observer=ij.observers.NoObserver(), controller=adapting(MAPPED))
 CHAIN = dataclasses.replace(pendulum(), disturbance=ij.presets.motor_driven_pendulum().disturbance)
 
@@ -340,7 +342,7 @@ def test_weights_of_both_layers_stay_below_their_bounds():
 
 
 SETTLING = controllers.Backstepping(
-    k1=2.0, K2=20.0, reading="corrected", decays=ij.decays.FiniteTime(k_a=1.0)
+    k1=2.0, K2=20.0, variant="corrected", decays=ij.decays.FiniteTime(k_a=1.0)
 )
 REFUSED = [
     ({"parameters": ("length[0]",)}, "affine"),

@@ -22,7 +22,7 @@ from iblf_jax.control.controllers.saturated import AuxiliaryState
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state
 from iblf_jax.simulation.scenario import canonical
 
-PAPER = ij.presets.zhang_yan_2024(reading="corrected")
+PAPER = ij.presets.zhang_yan_2024(variant="corrected")
 LIMIT = np.array([9.0, 3.0])
 K = 6.0
 SATURATED = controllers.Saturated(PAPER.controller, limit=LIMIT, auxiliary=K)
@@ -127,7 +127,7 @@ def test_the_input_of_a_chain_is_that_of_the_independent_program(coupled, rng):
 def test_the_rate_of_V2_of_an_arm(rng):
     """(A.3), with equality for a barrier that decays exactly, while the torque is limited."""
     law = controllers.Backstepping(
-        k1=2.0, K2=20.0, barrier=barriers.Mapping(), reading="corrected", weight=[0.5, 2.0]
+        k1=2.0, K2=20.0, barrier=barriers.TransformedError(), variant="corrected", weight=[0.5, 2.0]
     )
     scenario = with_numbers(ij.with_parts(LIMITED, controller=_limited(law)), [2.0, 1.0], K)
     terms, field = jax.jit(terms_at), jax.jit(evaluate)
@@ -181,7 +181,7 @@ def test_a_certificate_covers_the_limited_torque():
 @pytest.mark.parametrize("decay", [ij.decays.FiniteTime(k_a=2.0), ij.decays.PrescribedTime(T=0.5)])
 def test_a_certificate_covers_the_limited_torque_of_a_law_that_settles(decay):
     law = controllers.Backstepping(
-        k1=2.0, K2=20.0, barrier=barriers.Mapping(), reading="corrected", decays=decay
+        k1=2.0, K2=20.0, barrier=barriers.TransformedError(), variant="corrected", decays=decay
     )
     scenario = ij.with_parts(LIMITED, controller=_limited(law))
     run = ij.simulate(scenario, duration=0.6, dt=5e-4)
@@ -238,7 +238,7 @@ def test_the_rate_that_gives_the_limit_alone():
     """One joint without Coriolis torques: for k M0 = K2 the torque is that of the limit alone,
     and a large k does not tend to it."""
     chain = ij.robots.PlanarChain(mass=[1.0], length=0.4, centre=0.2, inertia=0.02)
-    law = controllers.Backstepping(k1=2.0, K2=0.6, reading="corrected")
+    law = controllers.Backstepping(k1=2.0, K2=0.6, variant="corrected")
     scenario = ij.with_parts(
         PAPER,
         plant=chain,

@@ -79,7 +79,7 @@ def flexible(**parts):
 
 
 def law(**fields):
-    given = {"k": (3.0, 20.0, 60.0), "barriers": (barriers.Mapping(),)}
+    given = {"k": (3.0, 20.0, 60.0), "barriers": (barriers.TransformedError(),)}
     return controllers.BarrierBackstepping(**(given | fields))
 
 
@@ -100,7 +100,7 @@ def third_order(**parts):
     return ij.Scenario(**(given | parts))
 
 
-MAPPING = barriers.Mapping()
+MAPPING = barriers.TransformedError()
 REFUSED = {
     "a kink of the slope on the first level": (
         {"controller": law(barriers=(barriers.Integral(), MAPPING, MAPPING))},
@@ -108,7 +108,7 @@ REFUSED = {
     ),
     "a ratio that jumps on a level in the middle": (
         {"controller": law(barriers=(MAPPING, barriers.Integral(), MAPPING))},
-        r"barriers\[1\].*Integral.*Mapping\(\)",
+        r"barriers\[1\].*Integral.*TransformedError\(\)",
     ),
     "the logarithmic form on a level in the middle": (
         {"controller": law(barriers=(MAPPING, barriers.Log(), MAPPING))},

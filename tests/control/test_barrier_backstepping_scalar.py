@@ -34,7 +34,7 @@ def scenario(amplitude):
         ]
         for level in SIDES
     ]
-    mapping = barriers.Mapping()
+    mapping = barriers.TransformedError()
     return ij.Scenario(
         plant=plants.StrictFeedback(drift, lambda t, x: jnp.ones_like(x), n=1, order=2),
         reference=references.Sinusoid(offset=0.0, amplitude=amplitude),
@@ -45,7 +45,7 @@ def scenario(amplitude):
 
 
 def mapped(i, t, x, centre, rate):
-    """Error, slope and virtual velocity of `Mapping` on row i, in NumPy."""
+    """Error, slope and virtual velocity of `TransformedError` on row i, in NumPy."""
     (low, low_size, low_phase), (high, high_size, high_phase) = SIDES[i]
     k_l = centre - low - low_size * np.sin(t + low_phase)
     k_u = high + high_size * np.sin(t + high_phase) - centre

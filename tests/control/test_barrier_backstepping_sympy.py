@@ -1,5 +1,5 @@
-"""`BarrierBackstepping` against a derivation by SymPy: a scalar plant of order 3, with `Mapping`
-and time-varying bounds on every level.
+"""`BarrierBackstepping` against a derivation by SymPy: a scalar plant of order 3, with
+`TransformedError` and time-varying bounds on every level.
 
 Each level of (S.2) is written once, as the formulas of the barrier, and its total derivatives are
 formed by the chain rule over the symbols of time, of the states and of what the level takes from
@@ -129,7 +129,7 @@ def scenario():
         reference=references.Sinusoid(offset=0.0, amplitude=0.5),
         bounds=levels,
         controller=controllers.BarrierBackstepping(
-            k=K, barriers=(barriers.Mapping(),) * ORDER, c=C, weights=WEIGHTS
+            k=K, barriers=(barriers.TransformedError(),) * ORDER, c=C, weights=WEIGHTS
         ),
         initial=ij.Initial(x=[[0.1], [0.0], [0.0]]),
     )

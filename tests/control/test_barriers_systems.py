@@ -106,7 +106,7 @@ def test_values_that_are_integrals_match_quadrature(e, p):
     state = quad(lambda s: s * kc**2 / (kc**2 - (s + y) ** 2), 0, e)[0]
     np.testing.assert_allclose(barriers.Integral().value(tube, q), integral, rtol=1e-10)
     np.testing.assert_allclose(barriers.Log(p=p).value(tube, q), log, rtol=1e-10)
-    np.testing.assert_allclose(barriers.State().value(tube, q), state, rtol=1e-10)
+    np.testing.assert_allclose(barriers.StateBarrier().value(tube, q), state, rtol=1e-10)
 
 
 @pytest.mark.parametrize("bounds", BOUNDS)
@@ -143,7 +143,7 @@ def test_decay_rate_holds(name, bounds):
 def test_state_rate_is_the_best_constant():
     # Reference near the wall, position nearer: V1' / V1 comes as near to -k1 as one likes.
     tube = simple_tube(1.0, 1e-5, dk_l=0.0, dk_u=0.0)
-    barrier, e = barriers.State(), jnp.full(2, -1e-2)
+    barrier, e = barriers.StateBarrier(), jnp.full(2, -1e-2)
     ratio = barrier.slope(tube, e) * e / barrier.value(tube, e)
     assert float(jnp.max(ratio)) < 1.02
     assert float(jnp.min(ratio)) >= 1.0
@@ -237,17 +237,19 @@ def test_symmetric_forms_are_those_of_the_literature():
         barriers.PrescribedPerformance().value(tube, e), 0.5 * jnp.arctanh(e / k) ** 2, rtol=1e-12
     )
     np.testing.assert_allclose(
-        barriers.Mapping().slope(tube, e), e * k**4 * (k**2 + e**2) / (k**2 - e**2) ** 3, rtol=1e-12
+        barriers.TransformedError().slope(tube, e),
+        e * k**4 * (k**2 + e**2) / (k**2 - e**2) ** 3,
+        rtol=1e-12,
     )
     # y = 0: the state's barrier is the error's, and alpha = q_d' (kc^2 - e^2)/kc^2 rho - k1 e
     rho = k / (2 * e) * jnp.log((k + e) / (k - e))
     np.testing.assert_allclose(
-        barriers.State().value(tube, e), -0.5 * k**2 * jnp.log(1 - (e / k) ** 2), rtol=1e-12
+        barriers.StateBarrier().value(tube, e), -0.5 * k**2 * jnp.log(1 - (e / k) ** 2), rtol=1e-12
     )
     fixed = tube._replace(dlower=jnp.zeros(2), dupper=jnp.zeros(2))
     expected = fixed.dq_d * (k**2 - e**2) / k**2 * rho - K1 * e
     np.testing.assert_allclose(
-        barriers.State().virtual_velocity(fixed, e, K1, None), expected, rtol=1e-12
+        barriers.StateBarrier().virtual_velocity(fixed, e, K1, None), expected, rtol=1e-12
     )
 
 

@@ -48,12 +48,12 @@ def of_package(decay):
 
 
 def arm_scenario(pair, K2=20.0, **parts):
-    """The paper's arm without disturbance, under Mapping with two decays."""
+    """The paper's arm without disturbance, under TransformedError with two decays."""
     law = controllers.Backstepping(
         k1=2.0,
         K2=K2,
-        barrier=barriers.Mapping(),
-        reading="corrected",
+        barrier=barriers.TransformedError(),
+        variant="corrected",
         decays=tuple(map(of_package, pair)),
     )
     given = {
@@ -296,9 +296,9 @@ BARRIERS = (
     barriers.Integral(),
     barriers.Log(p=2),
     barriers.Tan(),
-    barriers.State(),
+    barriers.StateBarrier(),
     barriers.PrescribedPerformance(),
-    barriers.Mapping(),
+    barriers.TransformedError(),
     barriers.Quadratic(),
 )
 
@@ -328,7 +328,7 @@ def test_v_decays_at_the_rate_of_the_gain_of_the_instant(barrier, rng):
         dV, decayed = rates(jnp.asarray(t), jnp.asarray(rng.uniform(-0.95, 0.95, 2)))
         excess.append((dV + decayed) / (1.0 + decayed))
     assert np.max(excess) < 1e-12
-    is_exact = isinstance(barrier, barriers.Mapping | barriers.Tan | barriers.Quadratic)
+    is_exact = isinstance(barrier, barriers.TransformedError | barriers.Tan | barriers.Quadratic)
     assert np.min(excess) > -1e-12 or not is_exact
 
 
@@ -478,7 +478,7 @@ def test_growth_that_no_period_changes_is_not_reported_as_sampling(decay):
     """At the start the derivatives of the loop grow slowly, at a rate that does not depend on the
     period, although the errors decay.  A period that is too long for the law is still reported."""
     law = controllers.Backstepping(
-        k1=1.0, K2=20.0, barrier=barriers.Mapping(), reading="corrected", decays=decay
+        k1=1.0, K2=20.0, barrier=barriers.TransformedError(), variant="corrected", decays=decay
     )
     growth, reported = [], []
     for period in (1e-3, 1e-4, 4e-3):

@@ -8,7 +8,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from iblf_jax.barriers import Mapping, Quadratic
+from iblf_jax.barriers import Quadratic, TransformedError
 
 import iblf_jax as ij
 from iblf_jax import bounds, references
@@ -104,7 +104,7 @@ def with_bounds(level, barriers):
     ("level", "name", "needed"), [(1, r"bounds\[0\].upper", 3), (2, r"bounds\[1\].upper", 2)]
 )
 def test_bounds_with_too_few_derivatives_are_refused(level, name, needed):
-    barriers = (Mapping(), Mapping() if level == 2 else Quadratic(), Quadratic())
+    barriers = (TransformedError(), TransformedError() if level == 2 else Quadratic(), Quadratic())
     expected = rf"{name}: got Rounded, which has 1, expected a side with {needed} continuous"
     with pytest.raises(ValueError, match=rf"{expected}.*Funnel are smooth"):
         ij.simulate(with_bounds(level, barriers), **SHORT)
@@ -112,11 +112,11 @@ def test_bounds_with_too_few_derivatives_are_refused(level, name, needed):
 
 @pytest.mark.slow
 def test_bounds_of_the_last_level_need_one_derivative():
-    scenario = with_bounds(3, (Mapping(), Quadratic(), Mapping()))
+    scenario = with_bounds(3, (TransformedError(), Quadratic(), TransformedError()))
     assert int(ij.simulate(scenario, **SHORT).status) == 0
 
 
 @pytest.mark.slow
 def test_bounds_of_a_level_without_a_barrier_need_none():
-    scenario = with_bounds(2, (Mapping(), Quadratic(), Quadratic()))
+    scenario = with_bounds(2, (TransformedError(), Quadratic(), Quadratic()))
     assert int(ij.simulate(scenario, **SHORT).status) == 0

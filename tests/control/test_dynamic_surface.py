@@ -75,7 +75,7 @@ def test_the_run_is_that_of_an_independent_program_at_random_gains_and_bounds(rn
         walls = bounds.Bounds(
             lower=bounds.Sinusoid(*loop.lower), upper=bounds.Sinusoid(*loop.upper)
         )
-        scenario = ij.presets.zhang_yan_2024(reading="corrected")
+        scenario = ij.presets.zhang_yan_2024(variant="corrected")
         scenario = dataclasses.replace(
             scenario, controller=law, bounds=walls, initial=ij.Initial(loop.q0)
         )
@@ -86,7 +86,7 @@ def test_the_run_is_that_of_an_independent_program_at_random_gains_and_bounds(rn
 
 @pytest.mark.slow
 def test_it_tends_to_the_backstepping_law_at_the_first_order_of_its_filter():
-    paper = ij.presets.zhang_yan_2024(reading="corrected")
+    paper = ij.presets.zhang_yan_2024(variant="corrected")
     exact = ij.simulate(paper, duration=2.0, dt=1e-4, record_every=100)
 
     def off(mu):
@@ -105,7 +105,7 @@ def test_it_tends_to_the_backstepping_law_at_the_first_order_of_its_filter():
 
 def test_it_costs_less_than_what_differentiates():
     """Operations of a step, as the state of the filter is more and alpha' less."""
-    paper = ij.presets.zhang_yan_2024(reading="corrected")
+    paper = ij.presets.zhang_yan_2024(variant="corrected")
     counts = [
         sum(sum(c.values()) for c in ij.explain(s).counts.values())
         for s in (paper, ij.presets.zhang_yan_2024(law="dynamic_surface"))

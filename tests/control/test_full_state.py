@@ -109,7 +109,7 @@ class FullLoop(Loop):
         barrier = barriers.Integral() if self.factor == 2.0 else barriers.Log()
         law = two_barriers(self.k1, self.K2, self.c, barrier, barrier, o=(self.o, self.o))
         return dataclasses.replace(
-            ij.presets.zhang_yan_2024(reading="corrected"),
+            ij.presets.zhang_yan_2024(variant="corrected"),
             controller=law,
             observer=ij.observers.Momentum(kf=self.kf),
             bounds=(
@@ -407,7 +407,7 @@ def test_no_velocity_bound_is_violated_from_random_feasible_starts(starts):
 
 @pytest.mark.slow
 def test_a_gradient_is_the_difference():
-    smooth = two_barriers(c=8.0, second=barriers.Mapping(), o=0.1)
+    smooth = two_barriers(c=8.0, second=barriers.TransformedError(), o=0.1)
 
     def loss(K2):
         scenario = ij.with_parts(ij.presets.zhang_yan_2024_full_state(), controller=smooth)
@@ -661,7 +661,7 @@ def test_a_barrier_states_whether_its_ratio_jumps(name):
 @pytest.mark.slow
 def test_it_stands_beside_other_laws_with_the_margin_of_the_velocities():
     scenario = ij.presets.zhang_yan_2024_full_state()
-    plain = controllers.Backstepping(k1=2.0, K2=20.0, o=0.1, reading="corrected")
+    plain = controllers.Backstepping(k1=2.0, K2=20.0, o=0.1, variant="corrected")
     filtered = controllers.SafetyFilter(law=plain, nearest="acceleration")
     compared = ij.compare(
         scenario,

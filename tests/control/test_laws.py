@@ -117,7 +117,7 @@ def test_backstepping_without_barrier_is_the_limit_of_state_and_mapping():
 
 @pytest.mark.parametrize("law", ij.presets.LAWS)
 def test_every_system_goes_through_a_scenario_file(law, tmp_path):
-    scenario = ij.presets.zhang_yan_2024(law=law, reading="corrected")
+    scenario = ij.presets.zhang_yan_2024(law=law, variant="corrected")
     limited = controllers.Saturated(law=scenario.controller, limit=[7.2, 1.5], edge="smooth")
     scenario = dataclasses.replace(
         scenario, controller=limited, observer=observers.ExtendedState(bandwidth=30.0)
@@ -406,7 +406,7 @@ def test_saturation_says_what_is_wrong():
 @pytest.mark.slow
 def test_extended_state_observer_obeys_its_error_equation():
     scenario = dataclasses.replace(
-        ij.presets.zhang_yan_2024(reading="corrected"),
+        ij.presets.zhang_yan_2024(variant="corrected"),
         observer=observers.ExtendedState(bandwidth=30.0),
         initial=ij.Initial(Q, DQ),
     )
@@ -439,7 +439,7 @@ def test_extended_state_observer_obeys_its_error_equation():
 
 @pytest.mark.slow
 def test_extended_state_observer_finds_a_constant_torque_and_its_gains_have_two_forms():
-    scenario = ij.presets.zhang_yan_2024(reading="corrected")
+    scenario = ij.presets.zhang_yan_2024(variant="corrected")
     push = ij.disturbances.Sinusoids(amplitude=0.0, frequency=1.0, offset=[1.0, -0.5])
     forms = [observers.ExtendedState(bandwidth=40.0), observers.ExtendedState(l1=80.0, l2=1600.0)]
     one, other = (dataclasses.replace(scenario, disturbance=push, observer=form) for form in forms)
@@ -543,7 +543,7 @@ def test_their_gains_can_be_tuned(name, path):
 WEIGHTED = {
     "backstepping": controllers.Backstepping(k1=2.0, K2=20.0),
     "corrected_mapping": controllers.Backstepping(
-        k1=2.0, K2=20.0, barrier=ij.barriers.Mapping(), reading="corrected"
+        k1=2.0, K2=20.0, barrier=ij.barriers.TransformedError(), variant="corrected"
     ),
     "dynamic_surface": controllers.DynamicSurface(k1=2.0, K2=20.0, filter=0.02),
     "adaptive_rbf": controllers.AdaptiveRBF(k1=2.0, K2=20.0, nodes=4),

@@ -85,7 +85,7 @@ def test_each_level_of_a_level_observer_obeys_its_equation(order, rng):
     "observer",
     [
         ij.observers.Momentum(kf=[20.0, 12.0]),
-        ij.observers.Printed(kf=[20.0, 12.0]),
+        ij.observers.AsPublished(kf=[20.0, 12.0]),
         ij.observers.ExtendedState(bandwidth=[40.0, 30.0]),
     ],
     ids=lambda observer: type(observer).__name__,
@@ -111,7 +111,7 @@ def test_an_observer_of_robots_serves_level_2(order, observer, rng):
             np.testing.assert_allclose(p_dot, expected, rtol=1e-8, atol=1e-8)
             continue
         expected = loop.observer.kf * (f - f_hat)
-        if isinstance(observer, ij.observers.Printed):
+        if isinstance(observer, ij.observers.AsPublished):
             expected = expected + loop.observer.kf * rest
         np.testing.assert_allclose(dot, expected, rtol=1e-8, atol=1e-8)
 

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from iblf_jax.observers import Momentum, NoObserver, Printed
+from iblf_jax.observers import AsPublished, Momentum, NoObserver
 from iblf_jax.robots import mass_matrix_rate
 
 import iblf_jax as ij
@@ -41,7 +41,7 @@ def estimate_rate():
 
 
 @pytest.mark.parametrize("payload", [0.0, 0.5], ids=["nominal", "unknown-payload"])
-@pytest.mark.parametrize("kind", [Momentum, Printed])
+@pytest.mark.parametrize("kind", [Momentum, AsPublished])
 def test_error_equation(estimate_rate, kind, payload, rng):
     """f_hat' = kf f_tilde: f_tilde' = f' - kf f_tilde exactly (momentum), and less kf M0' q' as
     printed."""
@@ -54,7 +54,7 @@ def test_error_equation(estimate_rate, kind, payload, rng):
         df_hat, f_tilde, rest = estimate_rate(
             scenario, jnp.asarray(0.4), *map(jnp.asarray, (q, dq, eta))
         )
-        expected = kf * f_tilde + (kf * rest if kind is Printed else 0.0)
+        expected = kf * f_tilde + (kf * rest if kind is AsPublished else 0.0)
         np.testing.assert_allclose(df_hat, expected, rtol=1e-9, atol=1e-9)
         assert np.max(np.abs(rest)) > 1e-3
 

@@ -157,7 +157,7 @@ def operations(scenario):
 @pytest.mark.slow
 def test_output_feedback_costs_at_most_three_times_the_measured_velocity():
     bare = ij.with_parts(
-        ij.presets.zhang_yan_2024(reading="corrected"), observer=ij.observers.NoObserver()
+        ij.presets.zhang_yan_2024(variant="corrected"), observer=ij.observers.NoObserver()
     )
     measured = operations(bare)
     for fields in ({"disturbance": False}, {"limit": 3.0, "disturbance_limit": 20.0}):

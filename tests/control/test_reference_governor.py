@@ -26,7 +26,7 @@ def scenario_of(law, q=(0.75, 0.3), dq=(0.0, 0.0), goal=(0.25, 0.8)):
     walls = bounds.Bounds(lower=bounds.Constant([0.2, 0.15]), upper=bounds.Constant([0.9, 0.85]))
     parts = {"controller": law, "reference": rest, "bounds": walls, "initial": ij.Initial(q, dq)}
     return ij.with_parts(
-        ij.presets.zhang_yan_2024(law="pd", reading="corrected"),
+        ij.presets.zhang_yan_2024(law="pd", variant="corrected"),
         **parts,
         disturbance=ij.disturbances.Nothing(),
     )
@@ -126,7 +126,7 @@ def test_V_stays_below_Gamma():
 
 @pytest.mark.slow
 def test_it_lags_behind_a_reference_that_moves():
-    paper = ij.presets.zhang_yan_2024(law="computed_torque", reading="corrected")
+    paper = ij.presets.zhang_yan_2024(law="computed_torque", variant="corrected")
     governed = ij.with_parts(paper, controller=controllers.ReferenceGovernor(law=paper.controller))
     runs = [ij.simulate(s, duration=6.0, dt=1e-3) for s in (paper, governed)]
     late = [float(jnp.max(jnp.abs(run.e1[run.t > 4.0]))) for run in runs]

@@ -20,7 +20,7 @@ LIMITED = {"limit": [60.0, 40.0]}
 def falling(speeds=None, **changes):
     """PD that overshoots: soft, from a fast start, towards a reference next to the bound."""
     law = controllers.PDGravity(Kp=30.0, Kd=0.4)
-    scenario = ij.presets.zhang_yan_2024(law="pd", reading="corrected")
+    scenario = ij.presets.zhang_yan_2024(law="pd", variant="corrected")
     rest = ij.references.Sinusoid(offset=[0.4, 0.5], amplitude=0.0)
     walls = bounds.Bounds(
         lower=bounds.Sinusoid(0.2, [0.02, 0.0], 2.0), upper=bounds.Sinusoid(0.9, [0.0, 0.05], 3.0)
@@ -283,7 +283,7 @@ def test_theorem_2_claims_nothing_while_it_works():
     """The certificate of a barrier law within a filter leaves out the samples at which the torque
     was changed."""
     base = dataclasses.replace(
-        ij.presets.zhang_yan_2024(reading="corrected"), initial=ij.Initial([0.95, 0.6], [0.5, 0.0])
+        ij.presets.zhang_yan_2024(variant="corrected"), initial=ij.Initial([0.95, 0.6], [0.5, 0.0])
     )
     scenario = filtered(base, nearest="acceleration", a1=20.0, a2=20.0)
     certificate = ij.certify(scenario, duration=0.3, dt=1e-3)

@@ -21,7 +21,7 @@ def speeds(low=(-1.6, -1.4), high=(0.6, 0.5), amplitude=(0.1, 0.0)):
     )
 
 
-PAPER = ij.presets.zhang_yan_2024(reading="corrected")
+PAPER = ij.presets.zhang_yan_2024(variant="corrected")
 WIDE = speeds()
 NARROW = speeds((-0.5, -0.3), (0.6, 0.5))
 

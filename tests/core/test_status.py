@@ -220,7 +220,7 @@ def test_two_flags_are_two_texts():
 
 def test_a_corrected_law_is_not_advised_about_K2():
     """Its claim with weights holds for every K2 > 0; a light joint cannot have K2 > 1/2."""
-    corrected = ij.presets.zhang_yan_2024(reading="corrected")
+    corrected = ij.presets.zhang_yan_2024(variant="corrected")
     assert ij.with_parameters(corrected, {"controller.K2": 0.1}).controller.advice() == []
 
 
@@ -229,7 +229,7 @@ def test_gains_below_the_theorem_are_advised_against(paper):
         weak = ij.with_parameters(paper, {path: [20.0, 0.4]})
         with pytest.warns(
             UserWarning,
-            match=rf"{path} = .*Theorem 2 needs {name} > 1/2.*of the paper.*reading=\"corrected\"",
+            match=rf"{path} = .*Theorem 2 needs {name} > 1/2.*of the paper.*variant=\"corrected\"",
         ):
             ij.simulate(weak, **SHORT)
         part = weak.controller if name == "K2" else weak.observer

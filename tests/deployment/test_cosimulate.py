@@ -16,7 +16,7 @@ from iblf_jax.deployment.mujoco_plant import MujocoPlant
 
 TIMING = {"duration": 0.4, "dt": 5e-4}
 PAPER = ij.with_parameters(
-    ij.presets.zhang_yan_2024(reading="corrected"), {"controller.K2": 4.0, "observer.kf": 4.0}
+    ij.presets.zhang_yan_2024(variant="corrected"), {"controller.K2": 4.0, "observer.kf": 4.0}
 )
 """Slow enough for a filter and a drive in the loop."""
 DRIVEN = ij.with_parts(

@@ -290,7 +290,7 @@ def test_a_sampled_run_says_how_accurate_it_is(method, actuator):
     """The torque jumps from step to step: the stages of each step tell its error, which is never
     told too small."""
     scenario = ij.with_parameters(
-        ij.presets.zhang_yan_2024(reading="corrected"), {"controller.K2": 4.0, "observer.kf": 5.0}
+        ij.presets.zhang_yan_2024(variant="corrected"), {"controller.K2": 4.0, "observer.kf": 5.0}
     )
     scenario = ij.with_parts(
         scenario, sampling=ij.Sampling(period=4e-3, delay=1.3e-3), actuator=actuator

@@ -11,7 +11,7 @@ from iblf_jax.core.status import Status
 from iblf_jax.engine import diagnosis
 from iblf_jax.engine.diagnosis import SimulationWarning
 
-Mapping, Quadratic = ij.barriers.Mapping, ij.barriers.Quadratic
+TransformedError, Quadratic = ij.barriers.TransformedError, ij.barriers.Quadratic
 
 
 def law(*barriers):
@@ -28,16 +28,16 @@ def message_of(scenario, duration=0.5, dt=1e-3) -> str:
 
 @pytest.mark.slow
 def test_a_violated_level_is_named_with_time_margin_unit_and_remedy():
-    plain = law(Mapping(), Quadratic(), Quadratic())
+    plain = law(TransformedError(), Quadratic(), Quadratic())
     text = message_of(pendulum(controller=plain, bounds=(ANGLES, None, symmetric(2.0))))
     assert "Level 3 (current) of pendulum left its bounds first, at t = 0.0" in text
     assert " A. The law has barriers.Quadratic() on that level" in text
-    assert "give it barriers.Mapping() there" in text
+    assert "give it barriers.TransformedError() there" in text
 
 
 @pytest.mark.slow
 def test_a_violated_second_level_has_the_unit_of_the_level():
-    plain = law(Mapping(), Quadratic(), Quadratic())
+    plain = law(TransformedError(), Quadratic(), Quadratic())
     text = message_of(pendulum(controller=plain, bounds=(ANGLES, symmetric(0.1))))
     assert "a bound of the second level was violated" in text
     assert "Level 2 (speed) of pendulum left its bounds first" in text
@@ -47,7 +47,7 @@ def test_a_violated_second_level_has_the_unit_of_the_level():
 
 @pytest.mark.slow
 def test_a_virtual_control_outside_its_level_is_reported_like_assumption_2():
-    plain = law(Mapping(), Quadratic(), Quadratic())
+    plain = law(TransformedError(), Quadratic(), Quadratic())
     scenario = pendulum(controller=plain, bounds=(ANGLES, symmetric(3.0), symmetric(2.0)))
     run = None
     with pytest.warns(SimulationWarning, match="Assumption 2") as found:
@@ -91,7 +91,7 @@ def test_a_gain_that_becomes_singular_is_named():
     scenario = pendulum(
         plant=plant,
         bounds=ANGLES,
-        controller=law(Mapping(), Quadratic(), Quadratic()),
+        controller=law(TransformedError(), Quadratic(), Quadratic()),
         disturbance=ij.disturbances.Nothing(),
     )
     with pytest.warns(SimulationWarning) as found:

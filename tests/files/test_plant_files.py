@@ -22,7 +22,11 @@ def test_a_file_gives_the_same_scenario(tmp_path, case):
 
 def test_a_level_without_bounds_stays_without(tmp_path):
     levels = (loops_of_plants.band(0.1, 0.9), None, loops_of_plants.band(-60.0, 60.0))
-    barriers = (ij.barriers.Mapping(), ij.barriers.Quadratic(), ij.barriers.Mapping())
+    barriers = (
+        ij.barriers.TransformedError(),
+        ij.barriers.Quadratic(),
+        ij.barriers.TransformedError(),
+    )
     law = ij.controllers.BarrierBackstepping(k=(3.0, 20.0, 60.0), barriers=barriers)
     scenario = loops_of_plants.electric_drive(bounds=levels, controller=law)
     ij.save_scenario(scenario, tmp_path / "scenario.toml")

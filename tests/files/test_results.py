@@ -148,7 +148,7 @@ def _pendulum() -> tuple[ij.Scenario, dict[str, Any]]:
         plant=arm,
         reference=ij.references.Sinusoid(0.0, 0.2),
         bounds=ij.bounds.Bounds(ij.bounds.Constant(-0.8), ij.bounds.Constant(0.8)),
-        controller=ij.controllers.Backstepping(2.0, 3.0, reading="corrected"),
+        controller=ij.controllers.Backstepping(2.0, 3.0, variant="corrected"),
         observer=ij.observers.Momentum(100.0),
         initial=ij.Initial(0.0),
     )
@@ -199,7 +199,7 @@ def _many() -> ij.Rollout:
 
 
 EXAMPLES: dict[str, tuple[Callable[[], Any], ...]] = {
-    "Attack": (lambda: ij.falsify(PAPER, MASS, starts=2, iterations=2, **TIMES, **QUIET),),
+    "WorstCase": (lambda: ij.falsify(PAPER, MASS, starts=2, iterations=2, **TIMES, **QUIET),),
     "Certificate": (
         lambda: _certificate(PAPER),
         lambda: _certificate(ij.presets.flexible_joint_two_link()),
@@ -213,7 +213,7 @@ EXAMPLES: dict[str, tuple[Callable[[], Any], ...]] = {
     "Explanation": (lambda: ij.explain(PAPER),),
     "FailureProbability": (_failure,),
     "FirstExit": (lambda: _study().first_exit(),),
-    "Front": (
+    "ParetoFront": (
         lambda: ij.pareto(
             PAPER,
             ["controller.k1", "controller.K2"],

@@ -336,8 +336,8 @@ WRONG = [
     ("controller.K2", [1.0, 2.0, 3.0], r"controller\.K2: .*one a joint.*shape is \(3,\)"),
     ("controller.K2", [1.0, [2.0]], r"controller\.K2: .*rectangular"),
     ("controller.K2", float("nan"), r"controller\.K2: got nan"),
-    ("controller.reading", "prnted", r"controller\.reading: got 'prnted'"),
-    ("controller.reading", ["printed"], r"controller\.reading: .*a string, not a list"),
+    ("controller.variant", "prnted", r"controller\.variant: got 'prnted'"),
+    ("controller.variant", ["printed"], r"controller\.variant: .*a string, not a list"),
     ("controller.barrier", "log", r"controller\.barrier: got 'log', expected a table"),
     ("controller.barrier.kind", "lg", r"controller\.barrier\.kind: .*Did you mean log"),
     (

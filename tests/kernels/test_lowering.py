@@ -57,7 +57,7 @@ SPECIAL = {
     "with_motors": lambda cls: cls(PRESET.plant, inertia=[0.02, 0.01], damping=0.1),
     "barrier_backstepping": lambda cls: cls(k=(2.0, 20.0)),
     "adaptive_parameters": lambda cls: cls(
-        ij.controllers.Backstepping(k1=2.0, K2=20.0, reading="corrected"),
+        ij.controllers.Backstepping(k1=2.0, K2=20.0, variant="corrected"),
         parameters=("mass[1]", "payload"),
         Gamma=2.0,
         lower=-0.5,
@@ -108,7 +108,7 @@ def with_member(family: str, name: str, cls):
         return dataclasses.replace(PRESET, bounds=ij.bounds.Bounds(POSITIONS.lower, upper))
     if family == "decays":
         law = ij.controllers.Backstepping(
-            2.0, 20.0, barrier=ij.barriers.Mapping(), decays=example(name, cls)
+            2.0, 20.0, barrier=ij.barriers.TransformedError(), decays=example(name, cls)
         )
         return dataclasses.replace(PRESET, controller=law)
     fields = {"robots": ("plant", "model")}.get(family, (family[:-1],))

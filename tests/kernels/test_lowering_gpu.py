@@ -446,7 +446,7 @@ def test_the_default_device_decides_on_a_machine_with_a_gpu(paper, monkeypatch):
     backend and its devices."""
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     perturbations = {"plant.mass[1]": ij.value(ij.uniform(0.7, 0.9))}
-    executor = ij.studies.ThisProcess(devices=jax.devices("cpu"))
+    executor = ij.studies.LocalExecutor(devices=jax.devices("cpu"))
     with pytest.raises(
         ValueError, match=r"platform that JAX computes on, gpu.*jax\.default_device"
     ):

@@ -207,7 +207,7 @@ def test_values_that_differ_by_rounding_do_not_vary():
 
 def test_a_front_shows_every_trial():
     tried = np.array([[0.5, 40.0], [0.9, 1.0], [3.0, 0.8]])
-    front = ij.Front(
+    front = ij.ParetoFront(
         labels=("tracking", "effort"),
         objectives=np.array([[0.8, 1.0], [0.85, 0.9]]),
         x=np.ones((2, 1)),

@@ -122,14 +122,14 @@ COMPONENTS = {
         "TwoLink.payload",
         "one number",
     ),
-    "reading": (
-        lambda: controllers.Backstepping(2.0, 20.0, reading="exact"),
-        "Backstepping.reading",
+    "variant": (
+        lambda: controllers.Backstepping(2.0, 20.0, variant="exact"),
+        "Backstepping.variant",
         "'printed', 'corrected'",
     ),
     "reading-array": (
-        lambda: controllers.Backstepping(2.0, 20.0, reading=np.asarray(["printed"])),
-        "reading",
+        lambda: controllers.Backstepping(2.0, 20.0, variant=np.asarray(["printed"])),
+        "variant",
         "hashable",
     ),
     "barrier-name": (
@@ -159,8 +159,8 @@ COMPONENTS = {
     "p-half": (lambda: barriers.Log(p=1.5), "Log.p", "whole"),
     "p-bool": (lambda: barriers.Log(p=True), "Log.p", "whole"),
     "observer-start": (
-        lambda: observers.Printed(kf=20.0, start="cold"),
-        "Printed.start",
+        lambda: observers.AsPublished(kf=20.0, start="cold"),
+        "AsPublished.start",
         "'matched'",
     ),
     "side-number": (lambda: bounds.Bounds(0.1, 0.9), "Bounds.lower", "Constant(value)"),
@@ -192,7 +192,7 @@ COMPONENTS = {
     ),
     "quintic": (lambda: references.Quintic(0.0, 1.0, duration=-2.0), "Quintic.duration", "> 0"),
     "preset-law": (lambda: ij.presets.zhang_yan_2024(law="tangent"), "law", "'integral', 'log'"),
-    "preset-reading": (lambda: ij.presets.zhang_yan_2024(reading=None), "reading", "'printed'"),
+    "preset-reading": (lambda: ij.presets.zhang_yan_2024(variant=None), "variant", "'printed'"),
     "dtype-int": (lambda: ij.astype(ij.presets.zhang_yan_2024(), "int32"), "dtype", "float32"),
     "dtype-word": (
         lambda: ij.astype(ij.presets.zhang_yan_2024(), "double-double"),
@@ -383,7 +383,7 @@ PATHS = {
     "unknown": ("controller.K3", "controller.K2"),
     "no-such-part": ("engine.power", "parameters(scenario)"),
     "a-part": ("controller", "path"),
-    "static": ("controller.reading", "path"),
+    "static": ("controller.variant", "path"),
     "beyond-the-end": ("plant.mass[2]", "plant.mass"),
     "before-the-start": ("plant.mass[-3]", "plant.mass"),
     "far-beyond": ("plant.mass[99999999999999999999]", "path"),
@@ -479,7 +479,7 @@ GOOD = {
     "sweep": lambda **x: ij.sweep(
         **({"scenario": WEAK, "grid": {"controller.K2": [10.0, 20.0]}, **SHORT} | x)
     ),
-    "ThisProcess": lambda **x: GOOD["monte_carlo"](executor=ij.studies.ThisProcess(**x)),
+    "LocalExecutor": lambda **x: GOOD["monte_carlo"](executor=ij.studies.LocalExecutor(**x)),
     "StoreOptions": lambda **x: GOOD["sweep"](store=ij.studies.StoreOptions("never.zarr", **x)),
     "sensitivity": lambda **x: ij.sensitivity(
         **({"scenario": WEAK, "perturbations": DRAWN, "points": 2, **SHORT} | x)
@@ -614,8 +614,8 @@ REFUSED = {
     "compare record_every": (NO_COUNTS, ["whole number"]),
     "certify method": (NO_WORDS, ["'rk4'"]),
     "monte_carlo backend": (NO_WORDS, ["'auto'", "'native'"]),
-    "ThisProcess chunk": (NO_COUNTS[1:], ["whole number"]),
-    "ThisProcess memory": ((None, "x", [], 0, -1, 5e-324, 1e300, 10**30, np.inf), ["bytes"]),
+    "LocalExecutor chunk": (NO_COUNTS[1:], ["whole number"]),
+    "LocalExecutor memory": ((None, "x", [], 0, -1, 5e-324, 1e300, 10**30, np.inf), ["bytes"]),
     "monte_carlo runs": (NO_COUNTS, ["whole number"]),
     "monte_carlo seed": (NO_SEEDS, ["whole number"]),
     "sweep backend": (NO_WORDS, ["'auto'"]),

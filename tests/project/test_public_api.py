@@ -67,8 +67,8 @@ PROMISED = [
         "Sensitivity",
         "Certificate",
         "Counterexample",
-        "Attack",
-        "Front",
+        "WorstCase",
+        "ParetoFront",
     ),
 ]
 

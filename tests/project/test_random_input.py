@@ -169,7 +169,7 @@ PATHLIKE = st.one_of(
                 "kf",
                 "phase",
                 "offset",
-                "reading",
+                "variant",
                 "barrier",
                 "__init__",
             ]
@@ -388,8 +388,8 @@ ENTRIES = {
         },
     ),
     "Design": (with_a_design, {"scenario": None, "kind": "random", "points": 4}),
-    "ThisProcess": (
-        lambda **options: ij.studies.ThisProcess(**options).checked(),
+    "LocalExecutor": (
+        lambda **options: ij.studies.LocalExecutor(**options).checked(),
         {"devices": None, "memory": 1e9, "chunk": 8},
     ),
     "StoreOptions": (
@@ -742,13 +742,13 @@ def depth_left(n: int) -> bool:
         (lambda s: ij.falsify(s, WAYS, starts=2**40, duration=0.01), ("GiB",)),
         (
             lambda s: ij.monte_carlo(
-                s, WAYS, runs=2, executor=ij.studies.ThisProcess(devices=[]), duration=0.01
+                s, WAYS, runs=2, executor=ij.studies.LocalExecutor(devices=[]), duration=0.01
             ),
             ("devices", "at least one"),
         ),
         (
             lambda s: ij.monte_carlo(
-                s, WAYS, runs=2, executor=ij.studies.ThisProcess(devices=["cpu"]), duration=0.01
+                s, WAYS, runs=2, executor=ij.studies.LocalExecutor(devices=["cpu"]), duration=0.01
             ),
             ("devices", "cpu"),
         ),
@@ -894,8 +894,8 @@ def results(paper, no_runs, monkeypatch):
     )
     vars(tuned)["nominal"] = (run, run)
     twos, (blocks, _) = np.ones((2, 2)), layout(paper, ["controller.K2"], 1e-3, "rk4")
-    front = ij.Front(("a", "b"), twos, twos, names, twos, twos[0], paper, blocks, twos, 1.0)
-    attack = ij.Attack(
+    front = ij.ParetoFront(("a", "b"), twos, twos, names, twos, twos[0], paper, blocks, twos, 1.0)
+    attack = ij.WorstCase(
         paper, {}, 0.1, 0.1, 0, np.ones((2, 2)), 4, {"duration": 0.01, "dt": 1e-3, "method": "rk4"}
     )
     compared = ij.Comparison({"log": run}, {}, {}, {}, {"log": "K2 = 20"})

@@ -33,7 +33,7 @@ def chain_loop(n, **parts):
         "bounds": ij.bounds.Bounds(
             ij.bounds.Constant(-0.4), ij.bounds.Sinusoid(1.0, 0.1, 2.0, np.arange(n))
         ),
-        "controller": ij.controllers.Backstepping(k1=2.0, K2=3.0, reading="corrected"),
+        "controller": ij.controllers.Backstepping(k1=2.0, K2=3.0, variant="corrected"),
         "observer": ij.observers.Momentum(kf=100.0),
         "initial": ij.Initial(q=0.3 * ones),
     }
@@ -42,7 +42,7 @@ def chain_loop(n, **parts):
 
 def paper_loop(law="integral"):
     """The paper's arm with K2 = 3 and kf = 100, without disturbance."""
-    scenario = ij.presets.zhang_yan_2024(law=law, reading="corrected")
+    scenario = ij.presets.zhang_yan_2024(law=law, variant="corrected")
     scenario = ij.with_parts(scenario, disturbance=ij.disturbances.Nothing())
     return ij.with_parameters(scenario, {"controller.K2": 3.0, "observer.kf": 100.0})
 
@@ -51,7 +51,7 @@ def general_loop(law):
     """The paper's loop with everything that the bound knows: another plant, friction, a disturbance
     that depends on the motion, and weights.
     """
-    scenario = ij.presets.zhang_yan_2024(law=law, reading="corrected")
+    scenario = ij.presets.zhang_yan_2024(law=law, variant="corrected")
     disturbance = ij.disturbances.Sum((scenario.disturbance, ij.disturbances.Friction(0.1, 0.05)))
     values = {"plant.payload": 0.1, "plant.centre": [0.18, 0.16], "controller.weight": [0.7, 1.2]}
     return ij.with_parameters(ij.with_parts(scenario, disturbance=disturbance), values)
@@ -184,7 +184,7 @@ def with_parts(**parts):
 
 ARM = paper_loop()
 REFUSED = {
-    "controller.reading": (lambda: ij.presets.zhang_yan_2024(), MASSES),
+    "controller.variant": (lambda: ij.presets.zhang_yan_2024(), MASSES),
     "controller": (with_parts(controller=ij.controllers.PDGravity(Kp=1.0, Kd=1.0)), MASSES),
     "with_parts(s, controller=s.controller.law)": (
         with_parts(controller=ij.controllers.Saturated(paper_loop().controller, limit=50.0)),
@@ -203,7 +203,7 @@ REFUSED = {
         lambda: ij.with_parts(
             ARM,
             controller=ij.controllers.Backstepping(
-                k1=2.0, K2=3.0, reading="corrected", barrier=ij.barriers.State()
+                k1=2.0, K2=3.0, variant="corrected", barrier=ij.barriers.StateBarrier()
             ),
         ),
         MASSES,

@@ -21,7 +21,7 @@ from iblf_jax.proofs.forms import enclosed
 from iblf_jax.proofs.search import search
 
 WEIGHT, LEVEL = 2e-3, 0.8
-Mapping, Quadratic = ij.barriers.Mapping, ij.barriers.Quadratic
+TransformedError, Quadratic = ij.barriers.TransformedError, ij.barriers.Quadratic
 
 
 @pytest.mark.slow
@@ -56,7 +56,7 @@ def narrow_between_samples():
             lower=ij.bounds.Constant([-0.7]), upper=ij.bounds.Sinusoid(offset=[0.45], **side)
         ),
         controller=ij.controllers.Backstepping(
-            k1=2.0, K2=3.0, reading="corrected", barrier=ij.barriers.Tan(guard=0.2)
+            k1=2.0, K2=3.0, variant="corrected", barrier=ij.barriers.Tan(guard=0.2)
         ),
     )
 
@@ -202,14 +202,14 @@ def test_a_mass_matrix_that_is_singular_inside_the_box_is_not_proved():
 def test_nothing_is_claimed_about_bounds_without_a_barrier():
     claimed = chain_problem(lever(), within(0.1, *LEVER)).assumptions
     assert not any("Nothing is claimed" in sentence for sentence in claimed)
-    mixed = pendulum_with_motor((Mapping(), Quadratic(), Quadratic()))
+    mixed = pendulum_with_motor((TransformedError(), Quadratic(), Quadratic()))
     assert any("the bounds of x_2, x_3" in x for x in chain_problem(mixed, {}).assumptions)
     free = dataclasses.replace(mixed, bounds=mixed.bounds[0])
     assert not any("Nothing" in x for x in chain_problem(free, {}).assumptions)
 
 
 @component
-class WithLength(ij.barriers.Mapping):
+class WithLength(ij.barriers.TransformedError):
     """A barrier whose V1 depends on a length of its own."""
 
     def value(self, tube, q):
@@ -217,12 +217,12 @@ class WithLength(ij.barriers.Mapping):
 
 
 @component
-class Renamed(ij.barriers.Mapping):
+class Renamed(ij.barriers.TransformedError):
     """A barrier that the package does not know."""
 
 
 def with_barrier(barrier):
-    law = ij.controllers.Backstepping(k1=2.0, K2=[3.0], reading="corrected", barrier=barrier)
+    law = ij.controllers.Backstepping(k1=2.0, K2=[3.0], variant="corrected", barrier=barrier)
     return pendulum(controller=law)
 
 
@@ -231,7 +231,9 @@ def test_barriers_of_users_are_without_a_length_and_their_claims_are_assumed():
         arm_problem(with_barrier(WithLength()), {})
     claims = "The claims of Renamed hold"
     assert any(claims in x for x in arm_problem(with_barrier(Renamed()), {}).assumptions)
-    assert any(claims in x for x in chain_problem(lever(Mapping(), Renamed()), {}).assumptions)
+    assert any(
+        claims in x for x in chain_problem(lever(TransformedError(), Renamed()), {}).assumptions
+    )
     assert not any("claims of" in x for x in arm_problem(pendulum(), {}).assumptions)
 
 

@@ -22,7 +22,11 @@ from iblf_jax.simulation import closed_loop, levels
 from iblf_jax.world.bounds import Bounds, Constant, Sinusoid
 from iblf_jax.world.references import Sinusoid as SinusoidalReference
 
-Mapping, Quadratic, Integral = barriers.Mapping, barriers.Quadratic, barriers.Integral
+TransformedError, Quadratic, Integral = (
+    barriers.TransformedError,
+    barriers.Quadratic,
+    barriers.Integral,
+)
 
 
 @component
@@ -52,7 +56,9 @@ class Lever:
 def lever(*law_barriers, kappa=(0.0, 40.0), **fields) -> ij.Scenario:
     """A lever whose position and velocity are bounded."""
     law = controllers.BarrierBackstepping(
-        k=(2.0, 8.0), barriers=law_barriers or (Mapping(), Mapping()), weights=(89.0, 10.0)
+        k=(2.0, 8.0),
+        barriers=law_barriers or (TransformedError(), TransformedError()),
+        weights=(89.0, 10.0),
     )
     scenario = ij.Scenario(
         plant=Lever(J=1.2, b=0.3, m=2.0),
@@ -123,7 +129,7 @@ def check_points(scenario, parameters, level, count=6):
 
 
 LEVERS = {
-    "Mapping, the second level observed": lever(),
+    "TransformedError, the second level observed": lever(),
     "both levels observed": lever(kappa=(5.0, 30.0)),
     "Integral, no observer, another model": lever(
         Integral(), Integral(), observer=observers.NoObserver(), model=Lever(J=1.0, b=0.2, m=1.9)
@@ -148,7 +154,7 @@ def test_rate_of_v_is_that_of_the_closed_loop(name):
     ids=["second level observed", "all levels observed", "no observer"],
 )
 def test_rate_of_v_of_order_3(fields):
-    check_points(pendulum((Mapping(),) * 3, **fields), within(0.05, *PENDULUM), 0.2)
+    check_points(pendulum((TransformedError(),) * 3, **fields), within(0.05, *PENDULUM), 0.2)
 
 
 def points_of(problem, x):
@@ -198,9 +204,11 @@ def test_bounds_are_above_the_points_of_their_boxes(name):
 
 
 @pytest.mark.release
-@pytest.mark.parametrize("upper", [Mapping(), Quadratic()], ids=["Mapping", "Quadratic"])
+@pytest.mark.parametrize(
+    "upper", [TransformedError(), Quadratic()], ids=["TransformedError", "Quadratic"]
+)
 def test_bounds_of_order_3(upper):
-    check_bounds(pendulum((Mapping(), upper, upper)), within(0.05, *PENDULUM), 0.5)
+    check_bounds(pendulum((TransformedError(), upper, upper)), within(0.05, *PENDULUM), 0.5)
 
 
 def proved(problem, weight, level, max_boxes):
@@ -233,7 +241,7 @@ def test_lever_with_too_uncertain_parameters_is_not_proved():
 
 @pytest.mark.release
 def test_pendulum_with_a_motor_is_proved():
-    scenario = pendulum((Mapping(), Quadratic(), Quadratic()))
+    scenario = pendulum((TransformedError(), Quadratic(), Quadratic()))
     problem = chain_problem(scenario, within(0.05, *PENDULUM))
     found, largest = proved(problem, PENDULUM_WEIGHT, 0.5, 500_000_000)
     assert found.proved

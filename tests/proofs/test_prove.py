@@ -30,7 +30,7 @@ def proof(K2=3.0, kf=100.0, percent=3.0, level=LEVEL, **options):
 
 def paper(**gains):
     scenario = ij.with_parts(
-        ij.presets.zhang_yan_2024(reading="corrected"), disturbance=ij.disturbances.Nothing()
+        ij.presets.zhang_yan_2024(variant="corrected"), disturbance=ij.disturbances.Nothing()
     )
     return ij.with_parameters(scenario, gains)
 

@@ -518,12 +518,12 @@ class OtherSum(ij.disturbances.Sum):
 @pytest.mark.parametrize(
     "parts",
     [
-        {"controller": OtherLaw(k1=2.0, K2=[3.0], reading="corrected")},
+        {"controller": OtherLaw(k1=2.0, K2=[3.0], variant="corrected")},
         {"observer": OtherObserver(kf=[100.0])},
         {"actuator": OtherActuator()},
         {
             "controller": ij.controllers.Backstepping(
-                k1=2.0, K2=[3.0], reading="corrected", decays=OtherDecay()
+                k1=2.0, K2=[3.0], variant="corrected", decays=OtherDecay()
             )
         },
     ],
@@ -542,7 +542,7 @@ def test_a_disturbance_that_inherits_from_a_periodic_one_has_no_period():
 
 
 @component
-class Altered(ij.barriers.Mapping):
+class Altered(ij.barriers.TransformedError):
     """A barrier whose methods are multiplied by functions of (tube, e1)."""
 
     of_value: Any = static(default=None)
@@ -612,7 +612,7 @@ BARRIERS = {
 
 
 def with_barrier(barrier):
-    law = ij.controllers.Backstepping(k1=2.0, K2=[3.0], reading="corrected", barrier=barrier)
+    law = ij.controllers.Backstepping(k1=2.0, K2=[3.0], variant="corrected", barrier=barrier)
     return pendulum(controller=law)
 
 
@@ -639,12 +639,12 @@ def digests_of(barrier, n):
 
 
 def test_the_barriers_of_the_package_satisfy_what_is_required_of_others():
-    for barrier in (ij.barriers.Integral(), ij.barriers.Log(), ij.barriers.Mapping()):
+    for barrier in (ij.barriers.Integral(), ij.barriers.Log(), ij.barriers.TransformedError()):
         digests_of(barrier, 2)
 
 
 @component
-class Shifted(ij.barriers.Mapping):
+class Shifted(ij.barriers.TransformedError):
     """A barrier on the error of another joint in one of its methods."""
 
     method: str = static(default="value")

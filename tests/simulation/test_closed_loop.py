@@ -13,7 +13,7 @@ import iblf_jax as ij
 TIMES = np.linspace(0.0, 1.2, 121)
 
 
-def random_loop(seed, law, reading) -> independent.Loop:
+def random_loop(seed, law, variant) -> independent.Loop:
     """A feasible closed loop, far from the paper's numbers."""
     rng = np.random.default_rng(seed)
     mass, length = rng.uniform([1.5, 0.8], [3.0, 1.6]), rng.uniform(0.3, 0.5, 2)
@@ -38,7 +38,7 @@ def random_loop(seed, law, reading) -> independent.Loop:
         K2=rng.uniform(5, 20, 2),
         kf=rng.uniform(5, 20, 2),
         p=None if law == "integral" else 1,
-        corrected=reading == "corrected",
+        corrected=variant == "corrected",
         reference=reference,
         lower=(reference[0] - rng.uniform(0.4, 0.6, 2), *wobble()),
         upper=(reference[0] + rng.uniform(0.4, 0.6, 2), *wobble()),
@@ -55,7 +55,7 @@ def random_loop(seed, law, reading) -> independent.Loop:
 
 def scenario_of(loop: independent.Loop) -> ij.Scenario:
     barrier = ij.barriers.Integral() if loop.p is None else ij.barriers.Log(p=loop.p)
-    observer = ij.observers.Momentum if loop.corrected else ij.observers.Printed
+    observer = ij.observers.Momentum if loop.corrected else ij.observers.AsPublished
     a, b = loop.force_a[1:], loop.force_b[1:]
     return ij.Scenario(
         plant=ij.robots.TwoLink(
@@ -71,7 +71,7 @@ def scenario_of(loop: independent.Loop) -> ij.Scenario:
             K2=loop.K2,
             o=loop.o,
             barrier=barrier,
-            reading="corrected" if loop.corrected else "printed",
+            variant="corrected" if loop.corrected else "printed",
         ),
         observer=observer(kf=loop.kf),
         initial=ij.Initial(q=loop.q0, dq=loop.dq0),
@@ -80,10 +80,10 @@ def scenario_of(loop: independent.Loop) -> ij.Scenario:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("law", ["integral", "log"])
-@pytest.mark.parametrize("reading", ["printed", "corrected"])
+@pytest.mark.parametrize("variant", ["printed", "corrected"])
 @pytest.mark.parametrize("seed", range(3))
-def test_other_numbers_against_scipy(seed, law, reading):
-    loop = random_loop(seed, law, reading)
+def test_other_numbers_against_scipy(seed, law, variant):
+    loop = random_loop(seed, law, variant)
     expected = loop.solve(TIMES, rtol=1e-9)
     run = ij.simulate(scenario_of(loop), **PAPER)
     assert run.ok

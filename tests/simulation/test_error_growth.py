@@ -21,7 +21,7 @@ from iblf_jax.simulation.scenario import canonical
 
 FINER = 16
 BASE = ij.with_parameters(
-    ij.presets.zhang_yan_2024(reading="corrected"), {"controller.K2": 4.0, "observer.kf": 4.0}
+    ij.presets.zhang_yan_2024(variant="corrected"), {"controller.K2": 4.0, "observer.kf": 4.0}
 )
 DIFFERENCE = ij.sensors.FilteredDifference(cutoff=192.57)
 MOTOR = ij.actuators.Motor(bandwidth=150.0)

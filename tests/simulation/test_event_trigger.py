@@ -20,7 +20,7 @@ from iblf_jax.simulation.metrics import Events
 from iblf_jax.simulation.scenario import canonical
 
 PERIOD = 4e-3
-PAPER = ij.with_parts(ij.presets.zhang_yan_2024(reading="corrected"), sampling=ij.Sampling(1e-3))
+PAPER = ij.with_parts(ij.presets.zhang_yan_2024(variant="corrected"), sampling=ij.Sampling(1e-3))
 TRIGGER = ij.EventTrigger(relative=0.1, absolute=[0.3, 0.1])
 TRIGGERED = ij.with_parts(PAPER, sampling=ij.Sampling(1e-3, trigger=TRIGGER))
 

@@ -142,7 +142,7 @@ def test_a_continuous_loop_by_output_feedback():
 @pytest.mark.slow
 def test_a_law_of_robots_without_a_velocity_sensor():
     """A StateObserver on a robot estimates q' and f from positions."""
-    paper = ij.presets.zhang_yan_2024(reading="corrected")
+    paper = ij.presets.zhang_yan_2024(variant="corrected")
     push = ij.disturbances.Step(size=[0.5, -0.3], time=0.0)
     sensor = Levels((Direct(), None))
     observer = ij.observers.StateObserver(bandwidth=300.0)

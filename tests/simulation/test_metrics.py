@@ -169,7 +169,7 @@ def test_access_by_name_and_by_attribute(short_run):
 # --- integrals are of second order -----------------------------------------------
 
 SLOW = ij.with_parameters(
-    ij.presets.zhang_yan_2024(reading="corrected"), {"controller.K2": 4.0, "observer.kf": 4.0}
+    ij.presets.zhang_yan_2024(variant="corrected"), {"controller.K2": 4.0, "observer.kf": 4.0}
 )
 STEP = ij.disturbances.Step(size=[8.0, 3.0], time=0.0631)
 LOOPS = {

@@ -51,7 +51,7 @@ def tanks(**parts: Any) -> ij.Scenario:
         "reference": ij.references.Sinusoid(offset=0.12, amplitude=0.02, frequency=0.02),
         "bounds": (TUBE, root),
         "controller": ij.controllers.BarrierBackstepping(
-            k=(0.03, 0.1), barriers=(ij.barriers.Mapping(),) * 2, weights=(1e4, 400.0)
+            k=(0.03, 0.1), barriers=(ij.barriers.TransformedError(),) * 2, weights=(1e4, 400.0)
         ),
         "initial": ij.Initial(x=[[0.125], [0.247]]),
     }

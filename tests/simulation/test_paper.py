@@ -9,12 +9,12 @@ from conftest import PAPER
 
 import iblf_jax as ij
 
-VARIANTS = [(law, reading) for law in ("integral", "log") for reading in ("printed", "corrected")]
-both = pytest.mark.parametrize(("law", "reading"), VARIANTS)
+VARIANTS = [(law, variant) for law in ("integral", "log") for variant in ("printed", "corrected")]
+both = pytest.mark.parametrize(("law", "variant"), VARIANTS)
 
 
-def reference_of(data, law, reading):
-    prefix = f"{'iblf' if law == 'integral' else 'log'}_{reading}."
+def reference_of(data, law, variant):
+    prefix = f"{'iblf' if law == 'integral' else 'log'}_{variant}."
     return {
         key.removeprefix(prefix): value for key, value in data.items() if key.startswith(prefix)
     }
@@ -25,10 +25,10 @@ def largest(a, b):
 
 
 @both
-def test_all_four_variants_at_one_millisecond(reference_data, law, reading):
+def test_all_four_variants_at_one_millisecond(reference_data, law, variant):
     run, ref = (
-        ij.simulate(ij.presets.zhang_yan_2024(law=law, reading=reading), **PAPER),
-        reference_of(reference_data, law, reading),
+        ij.simulate(ij.presets.zhang_yan_2024(law=law, variant=variant), **PAPER),
+        reference_of(reference_data, law, variant),
     )
     assert run.ok
     np.testing.assert_allclose(run.t, reference_data["t"], atol=1e-12)
@@ -45,10 +45,10 @@ def test_all_four_variants_at_one_millisecond(reference_data, law, reading):
 
 
 @both
-def test_torque_at_half_a_millisecond(reference_data, law, reading):
+def test_torque_at_half_a_millisecond(reference_data, law, variant):
     scenario, ref = (
-        ij.presets.zhang_yan_2024(law=law, reading=reading),
-        reference_of(reference_data, law, reading),
+        ij.presets.zhang_yan_2024(law=law, variant=variant),
+        reference_of(reference_data, law, variant),
     )
     run = ij.simulate(scenario, duration=20.0, dt=5e-4, record_every=20)
     assert largest(run.tau, ref["tau"]) <= 2e-5
@@ -57,12 +57,12 @@ def test_torque_at_half_a_millisecond(reference_data, law, reading):
 
 @pytest.mark.slow
 @both
-def test_float32(reference_data, law, reading):
-    scenario = ij.astype(ij.presets.zhang_yan_2024(law=law, reading=reading), "float32")
+def test_float32(reference_data, law, variant):
+    scenario = ij.astype(ij.presets.zhang_yan_2024(law=law, variant=variant), "float32")
     run = ij.simulate(scenario, **PAPER)
     assert run.q.dtype == np.float32
     assert run.ok
-    assert largest(run.q, reference_of(reference_data, law, reading)["q"]) <= 1e-4
+    assert largest(run.q, reference_of(reference_data, law, variant)["q"]) <= 1e-4
 
 
 def test_what_the_paper_shows(paper_run):

@@ -270,7 +270,7 @@ def test_moments_of_an_ornstein_uhlenbeck_process(study):
 
 
 def test_runs_do_not_depend_on_chunks_or_the_number_of_runs(study):
-    other = make_study(runs=300, executor=ij.studies.ThisProcess(chunk=256))
+    other = make_study(runs=300, executor=ij.studies.LocalExecutor(chunk=256))
     for name in ("end_q", "end_dq", "first_exit_time"):
         np.testing.assert_array_equal(other.metrics[name], study.metrics[name][:300])
     assert np.unique(study.metrics["end_q"]).size == len(study)

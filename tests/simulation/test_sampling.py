@@ -29,7 +29,7 @@ from iblf_jax.tuning.parameters import layout
 from iblf_jax.tuning.ranges import BY_COUNT, BY_PERIOD, TIMES, TOGETHER
 from iblf_jax.tuning.result import AtLimit
 
-PAPER = ij.presets.zhang_yan_2024(reading="corrected")
+PAPER = ij.presets.zhang_yan_2024(variant="corrected")
 SLOW = ij.with_parameters(PAPER, {"controller.K2": 4.0, "observer.kf": 4.0})
 """Slow enough for a filter and a drive in the loop."""
 MOTOR = ij.actuators.Motor(

@@ -8,10 +8,10 @@ import pytest
 
 import iblf_jax as ij
 
-PAPER = ij.presets.zhang_yan_2024(reading="corrected")
+PAPER = ij.presets.zhang_yan_2024(variant="corrected")
 ROBOT = PAPER.plant
 SHORT = {"duration": 0.4, "dt": 2e-4, "record_every": 20}
-Mapping = ij.barriers.Mapping
+TransformedError = ij.barriers.TransformedError
 
 
 def drive(inductance):
@@ -53,7 +53,7 @@ def orders(errors):
 @pytest.mark.slow
 def test_a_rigid_law_on_a_drive_tends_to_the_rigid_loop_for_a_small_inductance():
     """First order in L: the current lags by L/R."""
-    law = ij.controllers.Backstepping(k1=2.0, K2=5.0, o=0.1, reading="corrected")
+    law = ij.controllers.Backstepping(k1=2.0, K2=5.0, o=0.1, variant="corrected")
     observer = ij.observers.Momentum(kf=5.0)
     rigid = ij.simulate(ij.with_parts(PAPER, controller=law, observer=observer), **SHORT)
     errors = []
@@ -69,7 +69,7 @@ def test_a_rigid_law_on_a_drive_tends_to_the_rigid_loop_for_a_small_inductance()
 @pytest.mark.slow
 def test_a_rigid_law_on_stiff_joints_tends_to_the_robot_with_motors():
     """First order in 1/K, with the inertia of the motors in the model."""
-    law = ij.controllers.Backstepping(k1=2.0, K2=[4.0, 0.6], o=0.1, reading="corrected")
+    law = ij.controllers.Backstepping(k1=2.0, K2=[4.0, 0.6], o=0.1, variant="corrected")
     rigid = flexible(1.0).rigid()
     limit = ij.simulate(on(rigid, law, model=rigid), **SHORT)
     errors = []

@@ -68,7 +68,7 @@ def test_laws_by_name_take_the_gains_the_observer_and_the_limit_of_the_scenario(
         assert float(jnp.max(jnp.abs(run.tau) - law.limit)) <= 1e-12
         observer = type(run.scenario.observer).__name__
         assert observer == ("NoObserver" if name == "adaptive_rbf" else "Momentum")
-    assert comparison.rollouts["log"].scenario.controller.law.reading == "corrected"
+    assert comparison.rollouts["log"].scenario.controller.law.variant == "corrected"
     assert not comparison.equal_effort
     assert "effort" not in comparison.table
 
@@ -184,7 +184,7 @@ def test_laws_for_other_constraints_have_names_and_margins():
 
 
 def test_a_filter_by_name_is_around_the_unconstrained_law():
-    law = controllers.law_by_name("safety_filter", k1=3.0, reading="corrected")
+    law = controllers.law_by_name("safety_filter", k1=3.0, variant="corrected")
     assert isinstance(law.law.barrier, ij.barriers.Quadratic) and float(law.law.k1) == 3.0
     found = ij.compare(
         ij.with_parts(ij.presets.zhang_yan_2024(), controller=law),

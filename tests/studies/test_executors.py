@@ -176,10 +176,10 @@ def test_units_that_another_process_writes_are_skipped(table, tmp_path, monkeypa
         write(self, unit, data)
         seen.append(unit)
         if len(seen) == 1:
-            cases.table(store=path, executor=ij.studies.ThisProcess(chunk=1))
+            cases.table(store=path, executor=ij.studies.LocalExecutor(chunk=1))
 
     monkeypatch.setattr(store.Store, "write", write_all_at_first)
-    one_at_a_time = ij.studies.ThisProcess(chunk=1)
+    one_at_a_time = ij.studies.LocalExecutor(chunk=1)
     assert cases.table(store=options, executor=one_at_a_time).identical(table)
     assert len(seen) <= 12 + 2, "units that are written are not computed again"
 

@@ -46,7 +46,7 @@ def results(study):
 @pytest.mark.parametrize("chunk", [1, 256, 300, 10**6])
 def test_chunk_changes_nothing(study, chunk):
     assert cases.same(
-        results(study), results(cases.study(executor=ij.studies.ThisProcess(chunk=chunk)))
+        results(study), results(cases.study(executor=ij.studies.LocalExecutor(chunk=chunk)))
     )
 
 
@@ -73,7 +73,7 @@ def test_as_many_blocks_are_made_beside_each_other_as_are_in_flight(
 
     monkeypatch.setattr(blocks, "_execute", counted)
     again = cases.study(
-        runs=256 * (1 + sizes.MAX_IN_FLIGHT), executor=ij.studies.ThisProcess(chunk=chunk)
+        runs=256 * (1 + sizes.MAX_IN_FLIGHT), executor=ij.studies.LocalExecutor(chunk=chunk)
     )
     assert max(most) == together
     assert cases.same(results(study), {name: x[:600] for name, x in results(again).items()})
@@ -470,7 +470,7 @@ def test_bad_perturbations_are_refused(perturbation, message):
         ({"runs": 100, "sampler": "sobol"}, "128"),
         ({"runs": 10, "replicates": 2}, "replicates"),
         ({"backend": "fast"}, "backend"),
-        ({"executor": ij.studies.ThisProcess(chunk=0.5)}, "chunk"),
+        ({"executor": ij.studies.LocalExecutor(chunk=0.5)}, "chunk"),
         ({"duration": 0.0105}, "duration"),
     ],
 )

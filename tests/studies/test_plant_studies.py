@@ -61,7 +61,7 @@ def test_a_rigid_law_and_one_of_all_levels_at_equal_effort():
     preset = ij.presets.flexible_joint_two_link(stiffness=1000.0)
     damped = ij.with_parameters(preset, {f"{x}.motor_damping": 1.0 for x in ("plant", "model")})
     scenario = ij.with_parts(damped, observer=ij.observers.Momentum(kf=5.0))
-    rigid = ij.controllers.Backstepping(k1=2.0, K2=0.9, reading="corrected")
+    rigid = ij.controllers.Backstepping(k1=2.0, K2=0.9, variant="corrected")
     all_levels = ij.controllers.BarrierBackstepping(k=(2.0, 10.0, 30.0, 60.0))
     laws = {"rigid": rigid, "all levels": all_levels}
     found = ij.compare(scenario, laws, duration=1.0, dt=5e-4)

@@ -87,7 +87,7 @@ def test_points_are_the_studies_of_their_scenarios(table):
 
 @pytest.mark.parametrize("chunk", [1, 700])
 def test_chunk_changes_nothing(table, chunk):
-    assert cases.table(executor=ij.studies.ThisProcess(chunk=chunk)).identical(table)
+    assert cases.table(executor=ij.studies.LocalExecutor(chunk=chunk)).identical(table)
 
 
 @pytest.mark.slow
@@ -181,7 +181,7 @@ def test_another_scenario_law_or_backend_is_refused(finished):
         ij.sweep(heavier, cases.GRID, perturbations=ways, **options)
     with pytest.raises(ij.StoreError, match=r"structure.controller.*corrected"):
         ij.sweep(
-            ij.presets.zhang_yan_2024(reading="corrected"),
+            ij.presets.zhang_yan_2024(variant="corrected"),
             cases.GRID,
             perturbations=ways,
             **options,

@@ -590,13 +590,13 @@ class WeightedMapping:
     uses_o: ClassVar[bool] = False
 
     def value(self, tube, q):
-        return self.weight * ij.barriers.Mapping(guard=self.guard).value(tube, q)
+        return self.weight * ij.barriers.TransformedError(guard=self.guard).value(tube, q)
 
     def slope(self, tube, q):
-        return self.weight * ij.barriers.Mapping(guard=self.guard).slope(tube, q)
+        return self.weight * ij.barriers.TransformedError(guard=self.guard).slope(tube, q)
 
     def virtual_velocity(self, tube, q, k1, o):
-        return ij.barriers.Mapping(guard=self.guard).virtual_velocity(tube, q, k1, o)
+        return ij.barriers.TransformedError(guard=self.guard).virtual_velocity(tube, q, k1, o)
 
 
 @ij.component

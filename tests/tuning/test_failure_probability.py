@@ -118,7 +118,7 @@ def test_importance_sampling_and_monte_carlo_agree(scenario, rare):
 
 def test_the_same_bits_for_a_seed_whatever_the_chunks(scenario, rare):
     found, perturbations, _ = rare
-    chunks = ij.studies.ThisProcess(chunk=256)
+    chunks = ij.studies.LocalExecutor(chunk=256)
     again = ij.failure_probability(scenario, perturbations, runs=1000, executor=chunks, **RUN)
     assert again.estimate == found.estimate
     np.testing.assert_array_equal(again.failures.margins, found.failures.margins)

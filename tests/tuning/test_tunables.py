@@ -28,7 +28,7 @@ TOGETHER = [
 def lab():
     """The paper's arm with a loop as a robot has it, at rest beside its reference."""
     gains = {"controller.K2": [4.0, 3.0], "observer.kf": 4.0, "initial.q": [0.6, 0.7]}
-    paper = ij.with_parameters(ij.presets.zhang_yan_2024(reading="corrected"), gains)
+    paper = ij.with_parameters(ij.presets.zhang_yan_2024(variant="corrected"), gains)
     return canonical(
         ij.with_parts(
             paper,

@@ -14,7 +14,7 @@ import iblf_jax as ij
 from iblf_jax.files.tuning import load_tuning
 from iblf_jax.simulation.paths import get
 from iblf_jax.tuning import _pareto, evaluation
-from iblf_jax.tuning._pareto import Front, non_dominated
+from iblf_jax.tuning._pareto import ParetoFront, non_dominated
 from iblf_jax.tuning.problem import TuningProblem
 from iblf_jax.tuning.result import TuneResult
 
@@ -36,14 +36,14 @@ def paper():
 
 def test_an_attack_whose_loop_is_unstable_says_so_although_its_bounds_are_kept(paper):
     timing = {"duration": 0.01, "dt": 1e-3, "method": "rk4"}
-    attack = ij.Attack(paper, {}, 0.1, 0.1, 0, np.ones((2, 2)), 4, timing)
-    assert repr(attack).startswith("Attack(not falsified: smallest margin 0.1 rad")
+    attack = ij.WorstCase(paper, {}, 0.1, 0.1, 0, np.ones((2, 2)), 4, timing)
+    assert repr(attack).startswith("WorstCase(not falsified: smallest margin 0.1 rad")
     unstable = dataclasses.replace(attack, status=int(ij.Status.SAMPLING_TOO_SLOW))
     assert repr(unstable).startswith(
-        "Attack(bounds kept, but the sampled loop is unstable at this draw: smallest margin 0.1 rad"
+        "WorstCase(bounds kept, but the sampled loop is unstable at this draw: smallest margin 0.1"
     )
     flags = ij.Status.SAMPLING_TOO_SLOW | ij.Status.BOUND_VIOLATED
-    assert repr(dataclasses.replace(attack, status=int(flags))).startswith("Attack(FALSIFIED")
+    assert repr(dataclasses.replace(attack, status=int(flags))).startswith("WorstCase(FALSIFIED")
 
 
 @pytest.mark.slow
@@ -302,7 +302,7 @@ def test_ends_of_ranges_are_found_at_zero_and_where_there_is_none():
 )
 def test_a_front_over_decades_has_logarithmic_axes(b, scale):
     points = np.stack([np.linspace(0.5, 1.0, 3), b], axis=1)
-    front = Front(("a", "b"), points, points, (), points, points[0], None, (), points, 0.0)
+    front = ParetoFront(("a", "b"), points, points, (), points, points[0], None, (), points, 0.0)
     (axes,) = front.plot().axes
     assert (axes.get_xscale(), axes.get_yscale()) == ("linear", scale)
     low, high = axes.get_ylim()

@@ -276,7 +276,8 @@ def test_refused_with_a_remedy(what):
 def test_bounds_of_the_agents_velocities_are_kept():
     limits = ij.Bounds(lower=bounds.Constant(-1.5), upper=bounds.Constant(1.5))
     one = scenario(
-        bounds=(TUBE, limits), controller=law(barriers=(barriers.Mapping(), barriers.Mapping()))
+        bounds=(TUBE, limits),
+        controller=law(barriers=(barriers.TransformedError(), barriers.TransformedError())),
     )
     run = ij.simulate(one, duration=1.0, dt=1e-3, record_every=10)
     assert run.ok

@@ -228,7 +228,7 @@ def test_derivatives_by_inertial_parameters_are_finite_differences():
 
 def scenario_with(plant, **parts) -> ij.Scenario:
     return dataclasses.replace(
-        ij.presets.zhang_yan_2024(reading="corrected"),
+        ij.presets.zhang_yan_2024(variant="corrected"),
         plant=plant,
         model=two_link_in_space(),
         **parts,
@@ -288,7 +288,7 @@ SHORT_RUN = {"duration": 0.1, "dt": 1e-3}
 @pytest.mark.slow
 def test_runs_as_the_planar_robot_does():
     planar = dataclasses.replace(
-        ij.presets.zhang_yan_2024(reading="corrected"), plant=TWO_LINK, model=TWO_LINK
+        ij.presets.zhang_yan_2024(variant="corrected"), plant=TWO_LINK, model=TWO_LINK
     )
     run, other = (
         ij.simulate(scenario_with(two_link_in_space()), **SHORT_RUN),

@@ -206,8 +206,8 @@ def test_a_scenario_from_an_arm_alone():
     scenario = arms.arm_scenario(arm, reference)
     np.testing.assert_array_equal(scenario.bounds[0].upper.value, arm.upper)
     np.testing.assert_allclose(scenario.initial.q, reference.start)
-    with pytest.raises(ValueError, match="reading"):
-        arms.arm_scenario(arm, reference, reading="wrong")
+    with pytest.raises(ValueError, match="variant"):
+        arms.arm_scenario(arm, reference, variant="wrong")
 
 
 # -------------------------------------------------------------- joints of small inertia, sampled

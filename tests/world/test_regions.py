@@ -36,7 +36,7 @@ def stepping(law=None, goal=(0.3, 0.9), **parts):
         "initial": ij.Initial([1.0, 1.3]),
         "regions": (WALL, BALL, REACH),
     }
-    scenario = ij.presets.zhang_yan_2024(law="pd", reading="corrected")
+    scenario = ij.presets.zhang_yan_2024(law="pd", variant="corrected")
     return ij.with_parts(scenario, **(made | {"disturbance": ij.disturbances.Nothing()} | parts))
 
 

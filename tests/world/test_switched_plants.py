@@ -182,7 +182,7 @@ def test_every_run_of_a_study_has_a_path_of_its_own():
             dt=1e-2,
             metrics=(ij.metrics.Tracking(),),
             progress=False,
-            executor=ij.studies.ThisProcess(chunk=chunk),
+            executor=ij.studies.LocalExecutor(chunk=chunk),
         )
 
     every, some = make(600, None), make(300, 256)

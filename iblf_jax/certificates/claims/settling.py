@@ -8,7 +8,7 @@ joints,
 with g = T - sum c_i w_i |s_i|^2 of (S.3) for `BarrierBackstepping`; for `Backstepping` E = V2
 without the term of f_tilde, and
 
-    g = e2 . f_tilde (+ 1/2 e2^T M0' e2 in the printed reading)         `Backstepping`
+    g = e2 . f_tilde (+ 1/2 e2^T M0' e2 in the printed variant)         `Backstepping`
 
 The second step of `Backstepping` has V = W = 1/2 e2^T M0 e2 with w = 1 and
 e2^T K2 e2 + 2 g(t, W) W >= 2 (mu + g(t, W)) W, mu = lambda_min(M0^-1 K2).

@@ -71,7 +71,7 @@ from iblf_jax.certificates.terms import (
 from iblf_jax.control.controllers import Backstepping
 from iblf_jax.control.controllers._base import decay_of
 from iblf_jax.control.decays._base import energy_gain, gain_at
-from iblf_jax.control.observers import Momentum, Printed
+from iblf_jax.control.observers import AsPublished, Momentum
 from iblf_jax.core import programs
 from iblf_jax.core.status import Status
 from iblf_jax.simulation.scenario import Scenario
@@ -424,7 +424,7 @@ class Theorem(TwoCases, ShownClaim):
 
     def why_law_is_exact(self, summary: Summary) -> str:
         """Why the proof drops no term of the law; "" if it drops one."""
-        if summary.law.reading == "corrected":
+        if summary.law.variant == "corrected":
             return "the claim is exact: the law uses C0 alpha"
         return ""
 
@@ -614,9 +614,9 @@ def _dropped_terms(point: TorquePoint, terms: Terms) -> tuple[jax.Array, jax.Arr
     scenario, state, e2 = point.scenario, point.state, terms.e[1]
     dM0 = mass_matrix_rate(scenario.model, state.q, state.dq)
     by_law = by_observer = jnp.zeros_like(e2[0])
-    if isinstance(point.law, Backstepping) and point.law.reading == "printed":
+    if isinstance(point.law, Backstepping) and point.law.variant == "printed":
         by_law = 0.5 * (e2 @ (dM0 @ e2))
-    if isinstance(scenario.observer, Printed):
+    if isinstance(scenario.observer, AsPublished):
         by_observer = -terms.d_tilde @ (scenario.observer.kf * (dM0 @ state.dq))
     return by_law, by_observer
 

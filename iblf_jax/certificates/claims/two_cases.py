@@ -20,7 +20,7 @@ from iblf_jax.certificates.summary import Segment, Summary, weighted_lyapunov
 from iblf_jax.certificates.terms import adaptive_law, on_position
 from iblf_jax.control.actuators import Ideal
 from iblf_jax.control.controllers import Backstepping
-from iblf_jax.control.observers import Momentum, Printed
+from iblf_jax.control.observers import AsPublished, Momentum
 from iblf_jax.core import checks, programs
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.simulation.scenario import Scenario
@@ -221,7 +221,7 @@ def why_not_in_loop(scenario: Scenario) -> str:
     have.
     """
     observer, actuator = scenario.observer, scenario.actuator
-    if not isinstance(observer, Printed | Momentum):
+    if not isinstance(observer, AsPublished | Momentum):
         needs = "Theorem 2 needs the observer (3.11), printed or in momentum form"
         return f"{needs}; {type(observer).__name__} has no claim of this kind"
     if not isinstance(actuator, Ideal):

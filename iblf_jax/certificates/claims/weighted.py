@@ -85,7 +85,7 @@ class Weighted(TwoCases):
     def why_not(self, scenario: Scenario) -> str:
         """Why the claim with weights does not apply; "" if it does."""
         law = unwrapped(scenario.controller)
-        is_corrected = isinstance(law, Backstepping) and law.reading == "corrected"
+        is_corrected = isinstance(law, Backstepping) and law.variant == "corrected"
         has_momentum = isinstance(scenario.observer, Momentum)
         if not is_corrected or not has_momentum or why_no_theorem(scenario):
             return "the claim with weights is about the corrected law with a momentum observer"

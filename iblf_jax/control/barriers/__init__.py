@@ -11,21 +11,21 @@ from iblf_jax.control.barriers._base import guard_is_active as guard_is_active
 from iblf_jax.control.barriers._base import guarded_error as guarded_error
 from iblf_jax.control.barriers.integral import Integral as Integral
 from iblf_jax.control.barriers.log import Log as Log
-from iblf_jax.control.barriers.mapping import Mapping as Mapping
 from iblf_jax.control.barriers.prescribed_performance import (
     PrescribedPerformance as PrescribedPerformance,
 )
 from iblf_jax.control.barriers.quadratic import Quadratic as Quadratic
-from iblf_jax.control.barriers.state import State as State
+from iblf_jax.control.barriers.state_barrier import StateBarrier as StateBarrier
 from iblf_jax.control.barriers.tan import Tan as Tan
+from iblf_jax.control.barriers.transformed_error import TransformedError as TransformedError
 
 MEMBERS = {
     "integral": Integral,
     "log": Log,
     "tan": Tan,
-    "state": State,
+    "state": StateBarrier,
     "prescribed_performance": PrescribedPerformance,
-    "mapping": Mapping,
+    "mapping": TransformedError,
     "quadratic": Quadratic,
 }
 """Every barrier by the name that a scenario file gives it."""
@@ -36,11 +36,11 @@ __all__ = [
     "GuardedError",
     "Integral",
     "Log",
-    "Mapping",
     "PrescribedPerformance",
     "Quadratic",
-    "State",
+    "StateBarrier",
     "Tan",
+    "TransformedError",
     "guard_is_active",
     "guarded_error",
 ]

@@ -156,7 +156,7 @@ class TrackingLaw(Timed):
     """Weight of the barrier's V1, (n,); None for a law without one."""
     K2: Leaf = None
     """Gain of the velocity error, (n,); None for a law without one."""
-    reading: str = ""
+    variant: str = ""
     """Of a law of the paper, "printed" or "corrected"."""
     filter: Leaf = None
     """Time constants of filters in place of exact derivatives [s]; None without filters."""

@@ -26,7 +26,7 @@ to, so that lower <= theta_hat <= upper and the rate is continuous.  It does not
 lower + band <= theta <= upper - band.
 
 **Which laws.**  In the robot's equation M e2' is what the torque changes, so that the inertia need
-not be inverted: `Backstepping` in the corrected reading adapts all parameters in which M, C and G
+not be inverted: `Backstepping` in the corrected variant adapts all parameters in which M, C and G
 are linear.  `BarrierBackstepping` inverts the gain G_r.  It adapts parameters of the last level,
 f_r, on plants of any order, and refuses those of G_r and of the levels below, whose estimates the
 virtual controls would have to differentiate.
@@ -90,7 +90,7 @@ class AdaptiveParameters(Wrapping):
     In units, theta stands for that of the parameter, and N m rad for that of V.
 
     Args:
-      law: the law whose model adapts: `Backstepping` with reading="corrected", or
+      law: the law whose model adapts: `Backstepping` with variant="corrected", or
         `BarrierBackstepping` without filters.
       parameters: paths of p numbers of the model, without "model.": ("mass[0]", "payload").
       Gamma: rate of adaptation of each parameter, () or (p,) [theta^2/(N m rad)], > 0.
@@ -160,11 +160,11 @@ class AdaptiveParameters(Wrapping):
         stated = ((law.energy, base.energy), (law.energy_decay, base.energy_decay))
         if any(is_default(own, default) for own, default in stated):
             raise checks.fail(field, type(law).__name__, "a law with an `energy`", LAWS)
-        if law.reading == "printed":
-            remedy = "With C0 q' the term 1/2 e2^T M0' e2 remains. Take reading=\"corrected\"."
-            raise checks.fail(f"{field}.reading", "printed", "corrected", remedy)
+        if law.variant == "printed":
+            remedy = "With C0 q' the term 1/2 e2^T M0' e2 remains. Take variant=\"corrected\"."
+            raise checks.fail(f"{field}.variant", "printed", "corrected", remedy)
         second = decay_of(law, 1)
-        if law.reading and not second.constant:
+        if law.variant and not second.constant:
             remedy = "The energy of the second step contains the parameters, so that the torque is"
             remedy += " not affine in them."
             name = type(second).__name__
@@ -224,7 +224,7 @@ class AdaptiveParameters(Wrapping):
                 expected = "a parameter of the last level that its gain does not contain"
                 remedy = (
                     "Virtual controls and V contain this one. For a robot take Backstepping with"
-                    ' reading="corrected".'
+                    ' variant="corrected".'
                 )
                 raise checks.fail(field, path, expected, remedy)
             if np.nanmax(np.abs(rows - rows[0])) > scale * largest:
@@ -420,7 +420,7 @@ class AdaptiveParameters(Wrapping):
 
 
 LAWS = (
-    'Such as iblf_jax.controllers.Backstepping(k1=..., K2=..., reading="corrected"). Limits of the'
+    'Such as iblf_jax.controllers.Backstepping(k1=..., K2=..., variant="corrected"). Limits of the'
     " torque go around: Saturated(AdaptiveParameters(...))."
 )
 

@@ -11,7 +11,7 @@ function of its joint, V1 = sum_i w_i V1_i, and leaves its decay rate as it is. 
 barrier acts on a joint as a spring of 2 w/k^2 at e1 = 0, whatever K2 and kf are: on a joint of
 small inertia a sampled loop needs a small weight.
 
-That is the law as `printed`.  Its proof drops 1/2 e2^T M0' e2; the `corrected` reading has C0 alpha
+That is the law as `printed`.  Its proof drops 1/2 e2^T M0' e2; the `corrected` variant has C0 alpha
 in place of C0 q', which cancels that term by skew symmetry, and then the claim of Theorem 2 is
 exact.
 
@@ -21,7 +21,7 @@ W = 1/2 e2^T M0 e2 with a gain g(t, W) that all joints share:
 
     tau = ... - g(t, W) M0 e2,   W' = -2 g(t, W) W - e2^T K2 e2 + e2 . f_tilde - w s . e2     (D.1)
 
-in the corrected reading, because e2^T (g M0 e2) = 2 g W.  V = sum w V1 + W then obeys
+in the corrected variant, because e2^T (g M0 e2) = 2 g W.  V = sum w V1 + W then obeys
 
     V' <= -sum w rate(k1(t, V1)) V1 - 2 (mu + g(t, W)) W + e2 . f_tilde,  mu = lambda_min(M0^-1 K2)
 
@@ -50,7 +50,7 @@ from iblf_jax.core.pytree import Leaf, component, leaf, static
 from iblf_jax.world.bounds import Tube
 from iblf_jax.world.robots import inverse_dynamics, momentum
 
-READINGS = ("printed", "corrected")
+VARIANTS = ("printed", "corrected")
 
 
 def weight_units(law: Any) -> dict[str, str]:
@@ -83,7 +83,7 @@ class Backstepping(RobotLaw):
       o: margin under the root of kappa (3.7), () or (n,) [1/s^2], > 0, for barriers that compensate
         a moving bound by kappa and for no others; 0.1, the paper's, for these, if not given.
       barrier: any `Barrier`; `Integral()` if not given.
-      reading: "printed" or "corrected"; "printed" if not given.
+      variant: "printed" or "corrected"; "printed" if not given.
       weight: w of the barrier's V1, () or (n,) [N m rad] ([N m/rad] for a barrier whose V1 is in
         rad^2), > 0; 1, the paper's, if not given.
       decays: a `Decay` of V1 and one of the energy 1/2 e2^T M0 e2; one alone is that of both;
@@ -96,7 +96,7 @@ class Backstepping(RobotLaw):
     K2: Leaf = leaf("N m s/rad", sign="positive")
     o: Leaf = leaf("1/s^2", sign="positive", default=None)
     barrier: Barrier = Integral()
-    reading: str = static(default="printed")
+    variant: str = static(default="printed")
     weight: Leaf = leaf("N m rad", sign="positive", default=None)
     decays: tuple[Decay, ...] = ()
     factors: ClassVar[tuple[str, ...]] = ("weight",)
@@ -106,10 +106,10 @@ class Backstepping(RobotLaw):
     init = no_state
 
     def check(self) -> None:
-        """Raises ValueError for an unknown reading; completes `o` (0.1, the paper's, if the barrier
+        """Raises ValueError for an unknown variant; completes `o` (0.1, the paper's, if the barrier
         needs one) and `weight`.
         """
-        checks.one_of("Backstepping.reading", self.reading, READINGS)
+        checks.one_of("Backstepping.variant", self.variant, VARIANTS)
         check_barrier(self, "barrier", self.barrier)
         fit_o(self, self.barrier)
         fit_weight(self)
@@ -120,7 +120,7 @@ class Backstepping(RobotLaw):
         its conditions.  For the corrected law the claim with weights, which holds for every K2 > 0,
         takes its place.
         """
-        if self.reading == "corrected" or not checks.is_concrete((self.K2, self.weight)):
+        if self.variant == "corrected" or not checks.is_concrete((self.K2, self.weight)):
             return []
         is_papers = np.asarray(self.weight) == 1.0
         if not np.any(is_papers & (np.asarray(self.K2) <= 0.5)):
@@ -128,7 +128,7 @@ class Backstepping(RobotLaw):
         need = "Theorem 2 needs K2 > 1/2 on every joint, condition (3.17) of the paper"
         lost = "Below it the paper's bound on V2 is not proven"
         rest = (
-            'with reading="corrected" and observers.Momentum, ij.certify computes another bound,'
+            'with variant="corrected" and observers.Momentum, ij.certify computes another bound,'
             ' its claim "weighted", which holds for every K2 > 0'
         )
         return [f"controller.K2 = {self.K2}: {need}. {lost}; {rest}."]
@@ -145,7 +145,7 @@ class Backstepping(RobotLaw):
         """The torque (3.14) and what belongs to it."""
         alpha, dalpha = alpha_and_rate(self, t, q, dq, context)
         tube = context.tube(t)
-        v = alpha if self.reading == "corrected" else dq
+        v = alpha if self.variant == "corrected" else dq
         feedforward = inverse_dynamics(context.model, q, dq, v, dalpha)
         tau = feedforward - f_hat - self.K2 * (dq - alpha)
         tau = tau - self.weight * self.barrier.slope(tube, q)
@@ -163,7 +163,7 @@ class Backstepping(RobotLaw):
         self, t: jax.Array, q: jax.Array, dq: jax.Array, context: LawContext
     ) -> jax.Array:
         """The decay of V1, which is 0 for a barrier that states none, + e2^T K2 e2, ()
-        [N m rad/s], of the corrected reading.
+        [N m rad/s], of the corrected variant.
         """
         e2 = dq - virtual_velocity(self, t, q, context)
         V1 = self.weight * self.barrier.value(context.tube(t), q)

@@ -33,8 +33,8 @@ the derivatives of k_i(t, V_i).
 `Log(p=1)` have a kink of the slope at e_i = 0 in an asymmetric tube, and on levels above the first
 their e_i/s_i jumps there.  Such a barrier is refused below the last level.  On the last level u
 jumps at e_r = 0 (`switching`), as the exact cancellation requires: for a robot with bounds on
-positions and velocities the torque jumps by M0 s_1 (K_u^2 - K_l^2)/2.  `Tan`, `State`, `Mapping`
-and `PrescribedPerformance` have no jump.
+positions and velocities the torque jumps by M0 s_1 (K_u^2 - K_l^2)/2.  `Tan`, `StateBarrier`,
+`TransformedError` and `PrescribedPerformance` have no jump.
 
 **Derivatives across the jump.**  In a continuous loop the derivative of a step that reaches e_r,i =
 0 is that of the hybrid flow, with the jump of a perturbation at the crossing (`engine.switching`,
@@ -71,7 +71,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.control.barriers import Barrier, Mapping, Quadratic
+from iblf_jax.control.barriers import Barrier, Quadratic, TransformedError
 from iblf_jax.control.barriers._base import (
     guard_is_active,
     has_ratio,
@@ -112,7 +112,8 @@ class BarrierBackstepping(Law):
     Args:
       k: gain of each level, r numbers or (r, n) [1/s], > 0.
       barriers: a `Barrier` for each level, `Quadratic()` where a level has no bounds.  A single
-        barrier is that of the first level, with `Quadratic()` above; `(Mapping(),)` if not given.
+        barrier is that of the first level, with `Quadratic()` above;
+        `(TransformedError(),)` if not given.
       c: gain of each level's slope s_i, which limits the effect of estimation errors, one number, r
         numbers or (r, n) [1], >= 0; 0 if not given.  On a robot with a momentum observer the claim
         (F.3) of case 2 asks for c_2 > w_2/(4 (kf - 1/2) lambda_min(M0)^2).
@@ -120,9 +121,9 @@ class BarrierBackstepping(Law):
         not given, with which w_i V_i is about half the scale of the level times e_i^2 near e_i = 0;
         1 for a model that states none.  The unit 1 of c and of the weights is that of a plant
         without units; `iblf_jax.parameters` shows the others, in which all w_i V_i have one unit.
-        They depend on the barrier: in a tube of half-width k, w/k^2 with `Mapping` equals w with
-        `PrescribedPerformance` and `Log` near e_i = 0, so that a weight of 1 of these is large in
-        a narrow tube.
+        They depend on the barrier: in a tube of half-width k, w/k^2 with `TransformedError`
+        equals w with `PrescribedPerformance` and `Log` near e_i = 0, so that a weight of 1 of these
+        is large in a narrow tube.
       o: margin under the root of kappa, one number, r numbers or (r, n) [1/s^2], > 0, for barriers
         that have it and for no others; 0.1 for these, if not given.
       filter: mu_i of the filters of a dynamic surface, r - 1 numbers or (r - 1, n) [s], > 0; exact
@@ -137,7 +138,7 @@ class BarrierBackstepping(Law):
     """
 
     k: Leaf = leaf("1/s", sign="positive", shape="level")
-    barriers: tuple[Barrier, ...] = (Mapping(),)
+    barriers: tuple[Barrier, ...] = (TransformedError(),)
     c: Leaf = leaf("1", sign="nonnegative", shape="level", default=0.0)
     weights: Leaf = leaf("1", sign="positive", shape="level", default=None)
     o: Leaf = leaf("1/s^2", sign="positive", shape="level", default=None)
@@ -166,7 +167,7 @@ class BarrierBackstepping(Law):
             got = f"{len(self.barriers)} barriers"
             raise checks.fail("BarrierBackstepping.barriers", got, expected, remedy)
         for i, barrier in enumerate(self.barriers):
-            check_barrier(self, f"barriers[{i}]", barrier, "Mapping")
+            check_barrier(self, f"barriers[{i}]", barrier, "TransformedError")
         fit_o(self, *self.barriers, like=jnp.zeros(order, self.k.dtype))
         for name, rows in (("c", order), ("weights", order), ("o", order), ("filter", order - 1)):
             self._fit_rows(name, rows)
@@ -310,7 +311,7 @@ class BarrierBackstepping(Law):
         last = i == self.order - 1
         if i > 0 and not has_ratio(barrier):
             expected = "a barrier with `error_over_slope` above the first level"
-            raise checks.fail(name, kind, expected, "Such as Mapping().")
+            raise checks.fail(name, kind, expected, "Such as TransformedError().")
         if last or self.filter is not None or _is_symmetric(context, i, bounds):
             return
         # Row i is level i + 1, whose slope u contains with r - (i + 1) - 1 derivatives.
@@ -505,6 +506,6 @@ def _centre_in_words(i: int) -> str:
 def _smooth_alternatives(i: int, order: int) -> str:
     """The barriers that are smooth enough on a level, in words."""
     if i > 0:
-        return "Mapping() and PrescribedPerformance() are smooth."
+        return "TransformedError() and PrescribedPerformance() are smooth."
     p = math.ceil(order / 2)
-    return f"Mapping(), PrescribedPerformance() and Log(p={p}) are smooth enough."
+    return f"TransformedError(), PrescribedPerformance() and Log(p={p}) are smooth enough."

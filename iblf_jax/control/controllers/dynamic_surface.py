@@ -8,7 +8,7 @@ A filter of the first order smooths alpha, and the law follows the output beta o
 so that alpha' is never formed: neither the reference's acceleration nor the rates of the bounds'
 rates are needed.  The price is the filter's lag, beta - alpha = -mu beta', which drives e1 as an
 error of the velocity would: about mu |alpha'|/k1 is left of it.  For mu -> 0 it is the backstepping
-law in its corrected reading.  The literature claims ultimate boundedness; Theorem 2 does not apply.
+law in its corrected variant.  The literature claims ultimate boundedness; Theorem 2 does not apply.
 """
 
 from __future__ import annotations

@@ -26,9 +26,9 @@ BARRIERS: dict[str, Callable[..., barriers.Barrier]] = {
     "integral": barriers.Integral,
     "log": barriers.Log,
     "tan": barriers.Tan,
-    "state": barriers.State,
+    "state": barriers.StateBarrier,
     "prescribed_performance": barriers.PrescribedPerformance,
-    "mapping": barriers.Mapping,
+    "mapping": barriers.TransformedError,
     "backstepping": barriers.Quadratic,
 }
 """System -> barrier of the backstepping law."""
@@ -68,7 +68,7 @@ def law_by_name(
     k1: Any = 2.0,
     K2: Any = 20.0,
     o: Any = 0.1,
-    reading: str = "printed",
+    variant: str = "printed",
     p: int = 1,
     weight: Any = 1.0,
 ) -> TrackingLaw:
@@ -79,13 +79,13 @@ def law_by_name(
       k1: gain of the virtual velocity, () or (n,) [1/s].
       K2: gain of the velocity error, () or (n,) [N m s/rad].
       o: margin under the root of kappa (3.7), () or (n,) [1/s^2], for the barriers that use it.
-      reading: "printed" or "corrected", for the backstepping laws.
+      variant: "printed" or "corrected", for the backstepping laws.
       p: exponent of the logarithmic barrier.
       weight: of the barrier, () or (n,), of the laws that have one; in the unit that the law
         states.
 
     Raises:
-      ValueError: an unknown name or reading.
+      ValueError: an unknown name or variant.
     """
     checks.one_of("law", name, (*LAWS, *KEEPERS))
     if name in BASELINES:
@@ -101,11 +101,11 @@ def law_by_name(
     if name == "reference_governor":
         return ReferenceGovernor(law=BASELINES["pd"](), eta=SPEED)
     if name == "safety_filter":
-        law = law_by_name("backstepping", k1=k1, K2=K2, reading=reading, weight=weight)
+        law = law_by_name("backstepping", k1=k1, K2=K2, variant=variant, weight=weight)
         return SafetyFilter(law=law, nearest="acceleration")
     barrier = barriers.Log(p=p) if name == "log" else BARRIERS[name]()
     o = o if barrier.uses_o else None
-    return Backstepping(k1=k1, K2=K2, o=o, barrier=barrier, reading=reading, weight=weight)
+    return Backstepping(k1=k1, K2=K2, o=o, barrier=barrier, variant=variant, weight=weight)
 
 
 def observer_of(name: str, usual: DisturbanceObserver) -> DisturbanceObserver:

@@ -6,8 +6,9 @@ gives
 
     V' <= -rate(k(t, V)) V,
 
-with equality for `Mapping`, `PrescribedPerformance`, `Quadratic` (rate 2k) and `Tan` (rate k).  In
-z = sqrt(2V), which is the size of the mapped error for the first three, this is z' = -k(t, V) z.
+with equality for `TransformedError`, `PrescribedPerformance`, `Quadratic` (rate 2k) and `Tan` (rate
+k).  In z = sqrt(2V), which is the size of the mapped error for the first three, this is
+z' = -k(t, V) z.
 For `Integral` (rate 2k) and `Log` (rate 2pk) it is an inequality: z decays at least as fast.
 
 **Contract.**  k(t, V) >= k.  All claims that a law and a certificate state for the constant gain

@@ -6,16 +6,16 @@ from iblf_jax.control.observers._base import DisturbanceObserver as DisturbanceO
 from iblf_jax.control.observers._base import Observer as Observer
 from iblf_jax.control.observers._base import RobotObserver as RobotObserver
 from iblf_jax.control.observers._base import State as State
+from iblf_jax.control.observers.as_published import AsPublished as AsPublished
 from iblf_jax.control.observers.extended_state import ExtendedState as ExtendedState
 from iblf_jax.control.observers.level import LevelObserver as LevelObserver
 from iblf_jax.control.observers.momentum import Momentum as Momentum
 from iblf_jax.control.observers.none import NoObserver as NoObserver
-from iblf_jax.control.observers.printed import Printed as Printed
 from iblf_jax.control.observers.state_observer import StateObserver as StateObserver
 
 MEMBERS = {
     "none": NoObserver,
-    "printed": Printed,
+    "printed": AsPublished,
     "momentum": Momentum,
     "extended_state": ExtendedState,
     "level": LevelObserver,
@@ -25,13 +25,13 @@ MEMBERS = {
 
 __all__ = [
     "MEMBERS",
+    "AsPublished",
     "DisturbanceObserver",
     "ExtendedState",
     "LevelObserver",
     "Momentum",
     "NoObserver",
     "Observer",
-    "Printed",
     "RobotObserver",
     "State",
     "StateObserver",

@@ -1,6 +1,6 @@
 """What the observers f_hat = eta + kf M0 q' share: all but the rate of eta.
 
-Each function is a member of `Printed` and of `Momentum`; the first argument is the observer.
+Each function is a member of `AsPublished` and of `Momentum`; the first argument is the observer.
 """
 
 from __future__ import annotations

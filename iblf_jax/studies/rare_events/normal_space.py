@@ -31,7 +31,7 @@ from iblf_jax.studies.blocks import BlockResults
 from iblf_jax.studies.distributions import Distribution, Perturbation, is_interval
 from iblf_jax.studies.draws import draw, draw_shapes
 from iblf_jax.studies.execution import run_all_cases
-from iblf_jax.studies.options import ThisProcess
+from iblf_jax.studies.options import LocalExecutor
 from iblf_jax.studies.perturbation_cube import Cube
 from iblf_jax.studies.study_setup import PreparedStudy
 from iblf_jax.studies.time_step import warn_of_step
@@ -106,7 +106,7 @@ class NormalSpace:
         prepared: PreparedStudy,
         metric: str,
         limit: float,
-        executor: ThisProcess | Executor,
+        executor: LocalExecutor | Executor,
         advance: Callable[[int], None],
     ):
         self.prepared = in_normal_coordinates(prepared)

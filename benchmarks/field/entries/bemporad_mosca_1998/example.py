@@ -62,7 +62,7 @@ def task(k, barrier):
 
 
 gains = np.array([0.6, 1.0, 5.0, 20.0])
-scenario = task(gains, ij.barriers.Mapping())
+scenario = task(gains, ij.barriers.TransformedError())
 unbounded = task(gains * [2.0, 2.0, 1.0, 1.0], ij.barriers.Quadratic())
 cases = {"barrier on the torque": scenario, "faster, without a barrier": unbounded}
 runs = {name: ij.simulate(case, duration=8.0, dt=1e-3) for name, case in cases.items()}

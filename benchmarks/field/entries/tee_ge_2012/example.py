@@ -1,7 +1,7 @@
 """Bounds on the full state (Tee and Ge 2012): the integral barrier on the state, on both levels of
 a plant of order 2, with exact derivatives and with a filter. The published law is that of the
-package with `barriers.State` on both levels and weights of 1: its term of coupling is the exchange
-of (S.2), and V' = -sum k_i kc_i^2 z_i^2/(kc_i^2 - x_i^2).
+package with `barriers.StateBarrier` on both levels and weights of 1: its term of coupling is the
+exchange of (S.2), and V' = -sum k_i kc_i^2 z_i^2/(kc_i^2 - x_i^2).
 """
 
 import jax
@@ -37,7 +37,7 @@ def within(size):
 
 def law(**fields):
     """The law of both levels."""
-    states = (ij.barriers.State(), ij.barriers.State())
+    states = (ij.barriers.StateBarrier(), ij.barriers.StateBarrier())
     return ij.controllers.BarrierBackstepping(k=(5.0, 5.0), barriers=states, weights=1.0, **fields)
 
 
@@ -73,7 +73,7 @@ class ModelFilter:
 
     def command(self, t, x, d_hat, context, state):
         """The input, and beta'."""
-        barrier, k = ij.barriers.State(), jnp.full_like(x[0], 5.0)
+        barrier, k = ij.barriers.StateBarrier(), jnp.full_like(x[0], 5.0)
         f, G = context.model.drift(t, x), context.model.gain(t, x)
         first = context.tube(t)
         alpha = barrier.virtual_velocity(first, x[0], k, None) - f[0]

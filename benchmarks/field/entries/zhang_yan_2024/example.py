@@ -41,12 +41,12 @@ gap = ij.presets.printed_gap()
 print(f"gains: K2 = {gap.controller.K2}, kf = {gap.observer.kf}")
 print(f"start: q = {gap.initial.q}, q' = {gap.initial.dq}, eta = {gap.observer.eta0}")
 gaps = {
-    reading: ij.simulate(ij.presets.printed_gap(reading=reading), duration=0.1, dt=1e-5)
-    for reading in ("printed", "corrected")
+    variant: ij.simulate(ij.presets.printed_gap(variant=variant), duration=0.1, dt=1e-5)
+    for variant in ("printed", "corrected")
 }
-V2 = {reading: np.asarray(run.V) for reading, run in gaps.items()}
-for reading, values in V2.items():
-    print(f"{reading}: V2 starts at {values[0]:.4f}, largest {values.max():.4f}")
+V2 = {variant: np.asarray(run.V) for variant, run in gaps.items()}
+for variant, values in V2.items():
+    print(f"{variant}: V2 starts at {values[0]:.4f}, largest {values.max():.4f}")
 
 # %% The estimate of a disturbance of zero, on a faster motion.
 motion = {
@@ -56,7 +56,7 @@ motion = {
 }
 late, estimates = integral.t >= 10.0, {}
 for name, observer in {
-    "printed": ij.observers.Printed(kf=20.0),
+    "printed": ij.observers.AsPublished(kf=20.0),
     "with M0' q'": ij.observers.Momentum(kf=20.0),
 }.items():
     faster = ij.with_parameters(ij.with_parts(scenario, observer=observer), motion)

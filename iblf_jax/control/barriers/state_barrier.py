@@ -59,7 +59,7 @@ def _parts(e: jax.Array, k_l: jax.Array, k_u: jax.Array) -> _Parts:
 
 
 @component
-class State(Barrier):
+class StateBarrier(Barrier):
     """V1 = int_0^e1 s kc^2 / (kc^2 - (s + y)^2) ds,   y = q_d - c,   bounds c(t) -+ kc(t).
 
         s = kc^2 e1 / (kc^2 - x^2),   x = q - c
@@ -83,7 +83,7 @@ class State(Barrier):
 
     def check(self) -> None:
         """Raises ValueError for a guard outside (0, 1)."""
-        check_guard("State", self.guard)
+        check_guard("StateBarrier", self.guard)
 
     def value(self, tube: Tube, q: jax.Array) -> jax.Array:
         """V1, (n,) [rad^2]."""

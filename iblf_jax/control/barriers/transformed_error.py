@@ -21,7 +21,7 @@ from iblf_jax.world.bounds import Tube
 
 
 @component
-class Mapping(Barrier):
+class TransformedError(Barrier):
     """V1 = 1/2 z^2,   z = e1 k_l k_u / ((k_l + e1)(k_u - e1)).
 
         s = z z_e,   alpha = q_d' - (k1 z + z_t) / z_e
@@ -46,7 +46,7 @@ class Mapping(Barrier):
 
     def check(self) -> None:
         """Raises ValueError for a guard outside (0, 1)."""
-        check_guard("Mapping", self.guard)
+        check_guard("TransformedError", self.guard)
 
     def value(self, tube: Tube, q: jax.Array) -> jax.Array:
         """V1, (n,) [rad^2]."""

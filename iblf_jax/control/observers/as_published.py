@@ -19,7 +19,7 @@ from iblf_jax.world.robots import Robot
 
 
 @component
-class Printed(RobotObserver):
+class AsPublished(RobotObserver):
     """f_hat = eta + kf M0 q',   eta' = -kf eta - kf (tau - C0 q' - G0 + kf M0 q').    (3.11)
 
     Its error obeys f_tilde' = f' - kf f_tilde - kf M0' q': the last term is what `Momentum`
@@ -46,7 +46,7 @@ class Printed(RobotObserver):
 
     def check(self) -> None:
         """Raises ValueError for an unknown `start`."""
-        checks.one_of("Printed.start", self.start, STARTS)
+        checks.one_of("AsPublished.start", self.start, STARTS)
 
     def derivative(
         self,
