@@ -289,7 +289,7 @@ def servo_candidates(quick: bool) -> dict:
         def final(v):
             outcome = run_batch(scenario, v, folds, dt, request)
             signals, *_ = outcome.records
-            return signals["q"][:, -1], outcome.metrics
+            return signals["x"][:, -1, 0], outcome.metrics
 
         call = jax.jit(final).lower(values).compile()
         return lambda: call(values)[0]

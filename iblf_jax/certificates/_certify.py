@@ -15,13 +15,13 @@ import jax
 import numpy as np
 
 from iblf_jax.certificates import lines
-from iblf_jax.certificates.claims import claims_of, shown_claim
-from iblf_jax.certificates.claims.own import OWN, is_about_torque
-from iblf_jax.certificates.lines import FAILS, NOT_APPLICABLE, Line, Statement, not_applicable
+from iblf_jax.certificates.claims import claims_of, main_claim
+from iblf_jax.certificates.claims.own import OWN
+from iblf_jax.certificates.lines import FAILS, NOT_APPLICABLE, Line, Statement, measured
 from iblf_jax.certificates.reconstruction import is_valid, time_grid
 from iblf_jax.certificates.result import Certificate
-from iblf_jax.certificates.summary import Summary, summarise
-from iblf_jax.certificates.terms import adaptive_law
+from iblf_jax.certificates.summary import summarise
+from iblf_jax.certificates.terms import adaptive_law, receives_q_dq
 from iblf_jax.control import actuators, sensors
 from iblf_jax.control.controllers import EventCompensated
 from iblf_jax.control.controllers.event_compensated import excess
@@ -236,33 +236,36 @@ def _checked_claims(run: Rollout) -> Certificate:
         return _certificate_by_comparison(run, "sampled", SAMPLED)
     if run.scenario.actuator.input_delay is not None:
         return _certificate_by_comparison(run, "delayed", DELAYED)
-    scenario, shown = run.scenario, shown_claim(run.scenario)
+    scenario, main = run.scenario, main_claim(run.scenario)
     summary, segments = summarise(run, claims_of(scenario))
     assumptions: list[Line] = []
     at_steps: dict[str, list[Line]] = {claim.key: [] for claim in summary.claims}
-    gathered: dict[str, list[Any]] = {claim.key: [] for claim in summary.claims}
+    data: dict[str, list[Any]] = {claim.key: [] for claim in summary.claims}
     traces = []
     for segment in segments:
         for claim in summary.claims:
             assumptions += claim.assumptions(segment)
             at_steps[claim.key] += claim.lines(segment)
-            gathered[claim.key].append(claim.gathered(segment))
-        traces.append(shown.traces(segment))
+            data[claim.key].append(claim.segment_data(segment))
+        traces.append(main.traces(segment))
     by_name = lines.merged(assumptions)
     for claim in summary.claims:
-        by_name |= {line.name: line for line in claim.gains(summary)}
+        by_name |= {line.name: line for line in claim.gain_lines(summary)}
     by_name |= lines.merged([line for claim in summary.claims for line in at_steps[claim.key]])
     for claim in summary.claims:
-        concluded = list(claim.conclusions(summary, gathered[claim.key], by_name))
-        by_name |= {line.name: line for line in concluded}
+        # A list first: the lines of a claim do not read one another.
+        last = list(claim.run_lines(summary, data[claim.key], by_name))
+        by_name |= {line.name: line for line in last}
+    numbers = {name: x for claim in summary.claims for name, x in claim.numbers(summary).items()}
+    curves = (np.concatenate(parts) for parts in zip(*traces, strict=True))
     return Certificate(
         _heading_of(scenario),
         tuple(by_name.values()),
-        _numbers(summary),
-        type(traces[0])(*map(np.concatenate, zip(*traces, strict=True))),
+        numbers | {"samples": summary.samples, "samples_left_out": summary.excluded},
+        type(traces[0])(*curves),
         joints=plants.component_names(scenario.plant),
-        claim=shown.in_words,
-        levels=shown.labels(scenario),
+        claim=main.in_words,
+        levels=main.labels(scenario),
     )
 
 
@@ -282,20 +285,12 @@ def _heading_of(scenario: Scenario) -> str:
     return ", ".join([*parts, f"observer {type(scenario.observer).__name__}"])
 
 
-def _numbers(summary: Summary) -> dict[str, Any]:
-    """The constants of the claims."""
-    found: dict[str, Any] = {}
-    for claim in summary.claims:
-        found |= claim.numbers(summary)
-    return found | {"samples": summary.samples, "samples_left_out": summary.excluded}
-
-
-# --- one run of a sampled or delayed loop --------------------------------------------------------
+# --- one run of a sampled, delayed or noisy loop -------------------------------------------------
 
 
 def _certificate_by_comparison(run: Rollout, kind: str, reason: str) -> Certificate:
-    """The certificate of a run whose law is sampled or whose input has a delay: nothing is claimed
-    about it, and it is compared with the continuous run instead.
+    """The certificate of a run whose law is sampled, whose input has a delay or whose plant has
+    noise: nothing is claimed about it, and it is compared with the run without these instead.
 
     Args:
       run: the run.
@@ -331,15 +326,15 @@ def _certificate_by_comparison(run: Rollout, kind: str, reason: str) -> Certific
     return dataclasses.replace(
         certificate,
         lines=(*unclaimed, *_compared(run, continuous, kind), *_trigger_lines(run)),
-        traces=shown_claim(scenario).unclaimed_traces(run),
+        traces=main_claim(scenario).unclaimed_traces(run),
     )
 
 
 def _compared(run: Rollout, continuous: Rollout, kind: str) -> tuple[Line, Line]:
-    """The differences of V2 and of the margin between a sampled or delayed run and its continuous
+    """The differences of V2 and of the margin between a run without claims and the continuous
     one.
     """
-    measured = f"how far the {kind} run is from the continuous one; no claim of the theorem"
+    about = f"how far the {kind} run is from the continuous one; no claim of the theorem"
     V_excess = run.V - continuous.V
     at = int(np.argmax(V_excess))
     margin_excess = _margins(run) - _margins(continuous)
@@ -355,12 +350,10 @@ def _compared(run: Rollout, continuous: Rollout, kind: str) -> tuple[Line, Line]
         "smallest distance to a bound, less that of the continuous run",
         "rad",
     )
-    scale = f"{measured}; the largest V2 of the continuous run is {np.max(continuous.V):.4g}"
-    V_line = not_applicable(by_V, scale, counts=False)
-    margin_line = not_applicable(by_margin, measured, counts=False)
+    scale = f"{about}; the largest V2 of the continuous run is {np.max(continuous.V):.4g}"
     return (
-        dataclasses.replace(V_line, value=float(V_excess[at]), time=float(run.t[at])),
-        dataclasses.replace(margin_line, value=float(margin_excess[joint]), joint=joint),
+        measured(by_V, scale, value=float(V_excess[at]), time=float(run.t[at])),
+        measured(by_margin, about, value=float(margin_excess[joint]), joint=joint),
     )
 
 
@@ -374,18 +367,16 @@ def _trigger_lines(run: Rollout) -> tuple[Line, ...]:
         return ()
     trigger: Any = sampling.trigger
     if isinstance(law, EventCompensated):
-        line = not_applicable(COMPENSATED, AT_CHECKS, counts=False)
-        return (dataclasses.replace(line, value=float(excess(law))),)
+        return (measured(COMPENSATED, AT_CHECKS, value=float(excess(law))),)
     inner = unwrapped(law)
-    if not is_about_torque(scenario) or law is not inner or inner.includes_e2:
+    if not receives_q_dq(scenario) or law is not inner or inner.includes_e2:
         return ()
     if not isinstance(scenario.actuator, actuators.Ideal) or sampling.queue > 0:
         return ()  # the torque of the run is not the command that the trigger holds
     threshold = np.asarray(trigger.relative) * np.abs(run.tau) + np.asarray(trigger.absolute)
     added = np.sum(np.abs(run.e2) * threshold, axis=1)
     at = int(np.argmax(added))
-    line = not_applicable(TRIGGERED, AT_CHECKS, counts=False)
-    return (dataclasses.replace(line, value=float(added[at]), time=float(run.t[at])),)
+    return (measured(TRIGGERED, AT_CHECKS, value=float(added[at]), time=float(run.t[at])),)
 
 
 def _margins(run: Rollout) -> np.ndarray:
@@ -413,9 +404,9 @@ def _over_runs(runs: Iterable[tuple[int, Rollout]]) -> Certificate:
             invalid.append(index)
         for line in certificate.lines:
             by_name.setdefault(line.name, []).append(dataclasses.replace(line, run=index))
-        severity = _severity(certificate)
-        if worst is None or severity < worst[0]:
-            worst = (severity, index, certificate)
+        rank = _rank(certificate)
+        if worst is None or rank < worst[0]:
+            worst = (rank, index, certificate)
     if worst is None:
         raise checks.fail("run", "no runs", "at least one run")
     _, worst_index, certificate = worst
@@ -428,11 +419,11 @@ def _over_runs(runs: Iterable[tuple[int, Rollout]]) -> Certificate:
     )
 
 
-def _severity(certificate: Certificate) -> tuple[float, float]:
+def _rank(certificate: Certificate) -> tuple[float, float]:
     """Sort key of certificates, the worst first: one that fails, then by the margin of the
     inequality.
     """
-    inequalities = [line for line in certificate.lines if "inequality" in line.name]
-    worst = min(lines.severity(line, lines.OVER_RUNS) for line in inequalities)
+    inequalities = (line for line in certificate.lines if line.is_inequality)
+    worst = min(lines.rank(line, lines.OVER_RUNS) for line in inequalities)
     verdict = 0.0 if certificate.verdict == FAILS else 1.0
     return min(worst, (verdict, worst[1]))

@@ -33,11 +33,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.certificates.claims.levels import LEVELS
-from iblf_jax.certificates.claims.own import is_about_torque
 from iblf_jax.certificates.claims.theorem import LOWEST_K2, LOWEST_KF, THEOREM
 from iblf_jax.certificates.claims.two_cases import gains_of
 from iblf_jax.certificates.eigenvalues import maximise
-from iblf_jax.certificates.terms import terms_and_sample
+from iblf_jax.certificates.terms import TORQUE, receives_q_dq, terms_and_sample
 from iblf_jax.core import checks
 from iblf_jax.core.presentation import Result
 from iblf_jax.simulation.closed_loop import initial_state
@@ -67,18 +66,18 @@ def _growth(scenario: Scenario) -> tuple[jax.Array, jax.Array]:
     (3.24), (S.3)
     """
     t, state = jnp.zeros((), scenario.initial.q.dtype), initial_state(scenario)
-    if not is_about_torque(scenario):
+    if not receives_q_dq(scenario):
         terms, _ = terms_and_sample(scenario, t, state, (LEVELS,))
         claim = terms.claims[LEVELS.key]
         growth = terms.dV - claim.disturbance_terms - claim.lag
-        return growth / (claim.decay + claim.by_slopes), terms.excluded
+        return growth / (claim.dissipation + claim.by_slopes), terms.excluded
     terms, _ = terms_and_sample(scenario, t, state, (THEOREM,))
     gains, e2, f_tilde = gains_of(scenario), terms.e[1], terms.d_tilde
-    M0 = terms.claims["torque"].M0
+    M0 = terms.claims[TORQUE].M0
     V1 = terms.V - 0.5 * (e2 @ (M0 @ e2) + f_tilde @ f_tilde)
     by_e2 = e2 @ ((gains.K2 - LOWEST_K2) * e2)
     by_f = f_tilde @ ((gains.kf - LOWEST_KF[2]) * f_tilde)
-    Q = jnp.min(gains.decay) * V1 + by_e2 + by_f
+    Q = jnp.min(gains.decay_rate) * V1 + by_e2 + by_f
     return (terms.dV - 0.5 * terms.dd @ terms.dd) / Q, terms.excluded
 
 
@@ -123,7 +122,7 @@ def counterexample(
 
 def _check_claimed(scenario: Scenario) -> None:
     """Raises ValueError for a scenario about which neither Theorem 2 nor (S.3) makes a claim."""
-    claim = THEOREM if is_about_torque(scenario) else LEVELS
+    claim = THEOREM if receives_q_dq(scenario) else LEVELS
     reason = claim.why_not(scenario)
     if reason:
         got = type(scenario.controller).__name__

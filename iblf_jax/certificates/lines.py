@@ -54,6 +54,16 @@ class Line:
     """The first instant at which the inequality is broken [s]; None if there is none."""
 
     @property
+    def has_weights(self) -> bool:
+        """Whether it belongs to the claim with weights."""
+        return self.name.startswith("weighted")
+
+    @property
+    def is_inequality(self) -> bool:
+        """Whether it is the differential inequality of a claim, from which the rest follows."""
+        return "inequality" in self.name
+
+    @property
     def applies(self) -> bool:
         """Whether the line is informative about this run: it has a verdict, or a measured number
         beside the claims.
@@ -96,9 +106,14 @@ def verdict_of(holds: bool) -> str:
     return HOLDS if holds else FAILS
 
 
-def not_applicable(statement: Statement, reason: str, *, counts: bool = True) -> Line:
-    """The line of a statement that is not claimed about this run."""
-    return statement.line(NOT_APPLICABLE, note=reason, counts=counts)
+def not_applicable(statement: Statement, reason: str, **fields: Any) -> Line:
+    """The line of a statement that is not claimed about this run, with further fields."""
+    return statement.line(NOT_APPLICABLE, note=reason, **fields)
+
+
+def measured(statement: Statement, note: str, **fields: Any) -> Line:
+    """The line of a number that is measured beside the claims."""
+    return not_applicable(statement, note, counts=False, **fields)
 
 
 def check_positive(statement: Statement, margin: float, **fields: Any) -> Line:
@@ -182,7 +197,7 @@ def join_notes(*notes: str) -> str:
 # --- one line from several of the same name ------------------------------------------------------
 
 
-def severity(line: Line, ranks: dict[str, float]) -> tuple[float, float]:
+def rank(line: Line, ranks: dict[str, float]) -> tuple[float, float]:
     """Sort key of lines, the worst first: the rank of the verdict, then the margin; where there is
     no margin, the largest value.
     """
@@ -201,7 +216,7 @@ def over_segments(same: list[Line]) -> Line:
     """One line from those of the segments of a run: the worst, with the largest value and the first
     instant at which one is broken.
     """
-    worst = min(same, key=lambda line: severity(line, WITHIN_RUN))
+    worst = min(same, key=lambda line: rank(line, WITHIN_RUN))
     values = [line.value for line in same if line.value is not None]
     broken = [line.first for line in same if line.first is not None]
     worst = dataclasses.replace(worst, first=min(broken, default=None))
@@ -224,7 +239,7 @@ def over_runs(same: list[Line], invalid_runs: list[int]) -> Line:
 
     A line that was not checked in an invalid run does not hold in all runs.
     """
-    worst = min(same, key=lambda line: severity(line, OVER_RUNS))
+    worst = min(same, key=lambda line: rank(line, OVER_RUNS))
     if worst.verdict == HOLDS:
         unchecked = [
             line for line in same if line.run in invalid_runs and line.verdict == NOT_APPLICABLE

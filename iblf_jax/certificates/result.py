@@ -21,8 +21,6 @@ from iblf_jax.certificates.lines import (
 from iblf_jax.core import checks, tables
 from iblf_jax.core.presentation import Result, present
 
-WEIGHTED_LINES = "weighted"
-"""Beginning of the names of the lines of the claim with weights."""
 MAX_LISTED = 3
 """Lines that do not apply are listed by name up to this number."""
 
@@ -120,7 +118,7 @@ class Certificate(Result):
         counted = [line for line in self.lines if line.counts]
         if any(line.verdict == FAILS for line in counted):
             return FAILS
-        checked = any(line.verdict == HOLDS and "inequality" in line.name for line in counted)
+        checked = any(line.verdict == HOLDS and line.is_inequality for line in counted)
         return HOLDS if checked else NOT_APPLICABLE
 
     @property
@@ -131,8 +129,7 @@ class Certificate(Result):
         if self.verdict != FAILS:
             return self.verdict
         failing = [f'"{x.name}"' for x in self.lines if x.counts and x.verdict == FAILS]
-        weighted = [x for x in self.lines if x.name.startswith(WEIGHTED_LINES) and x.counts]
-        verdicts = {x.verdict for x in weighted}
+        verdicts = {x.verdict for x in self.lines if x.has_weights and x.counts}
         if HOLDS in verdicts and FAILS not in verdicts:
             return f"{self.claim} fails in {_listed(failing)}; the claim with weights holds"
         return f"fails in {_listed(failing)}"
@@ -147,7 +144,7 @@ class Certificate(Result):
         """Whether the checked inequality is one that the law states about itself, and not that of
         the paper's theorem.
         """
-        inequalities = [line.name for line in self.applicable if line.name.startswith("inequality")]
+        inequalities = [x.name for x in self.applicable if x.is_inequality and not x.has_weights]
         return inequalities == [OWN_INEQUALITY]
 
     def __getitem__(self, name: str) -> Line:

@@ -20,8 +20,10 @@ reconstructed again, so that memory stays bounded.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Iterator, Sequence
+import operator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cached_property
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -36,7 +38,7 @@ from iblf_jax.certificates.reconstruction import (
     time_grid,
 )
 from iblf_jax.certificates.terms import rounding
-from iblf_jax.control.controllers import AdaptiveParameters, Backstepping, Saturated
+from iblf_jax.control.controllers import AdaptiveParameters, Saturated
 from iblf_jax.core.pytree import layers, unwrapped
 from iblf_jax.core.status import UNTRUSTED, describe
 from iblf_jax.simulation.scenario import Scenario
@@ -51,7 +53,7 @@ ENERGY_ROUNDING = 32.0
 """Rounding error of sqrt(2 V) in units of the last place, relative to the sizes of its terms."""
 
 
-class Decay(NamedTuple):
+class DecayBound(NamedTuple):
     """The constants of a claimed decay, V_w' <= -rho V_w + gain |f'|^2; V_w is V for w_f = 1."""
 
     rho: float
@@ -71,8 +73,8 @@ class Summary:
     run: Any
     """The Rollout, its arrays on the host."""
     claims: tuple[Claim, ...]
-    extrema: Extrema
-    """Over all steps."""
+    extrema: Any
+    """`Extrema` over all steps."""
     duration: float
     """[s]."""
 
@@ -115,6 +117,11 @@ class Summary:
         """What excludes samples from the claims, in words."""
         return why_excluded(self.run.scenario)
 
+    @property
+    def why_never(self) -> str:
+        """Why the claims exclude every sample; "" if they do not."""
+        return f"{self.why_excluded} all the time" if self.excluded == self.samples else ""
+
     def exclusion_note(self, of_alpha: str = "{}") -> str:
         """Which samples the claims exclude, in words, with what a virtual control adds to the
         reason {}; "" if none is.
@@ -144,6 +151,10 @@ class Summary:
         """1 if f' = 0, else 2."""
         return 1 if self.extrema.steady else 2
 
+    def counts(self, case: int) -> bool:
+        """Whether a case enters the verdict: where f' = 0, case 1 decides."""
+        return case == 1 or self.case == 2
+
     @property
     def F_d(self) -> float:
         """Largest |f'| [N m/s]; 0 in case 1."""
@@ -155,12 +166,12 @@ class Summary:
         return {claim.key: claim.constants(self) for claim in self.claims}
 
     @cached_property
-    def decays(self) -> dict[tuple[str, int], Decay]:
+    def decay_bounds(self) -> dict[tuple[str, int], DecayBound]:
         """The constants of every claimed decay, by key of the claim and case."""
         return {
             (claim.key, case): decay
             for claim in self.claims
-            for case, decay in claim.decays(self).items()
+            for case, decay in claim.decay_bounds(self).items()
         }
 
 
@@ -214,96 +225,59 @@ def summarise(run: Any, claims: Sequence[Claim]) -> tuple[Summary, Iterator[Segm
 # --- first pass: extremes over all steps ---------------------------------------------------------
 
 
-class Extrema:
-    """Running extrema over the steps of a run.  NaN propagates.
+class Extremum(NamedTuple):
+    """A quantity at some steps, and how it is combined with that of the steps before."""
 
-    Args:
-      root: sqrt(K2), (n,), of the law of Theorem 2; None for others.
+    combined: Callable[[Any, Any], Any]
+    value: Any
+
+
+class Extrema(SimpleNamespace):
+    """Running extrema over the steps of a run, by name, those of its claims (`Claim.extrema`)
+    included.  NaN propagates.
+
+    low, high        bounds on positions over the run, (n,) [rad]
+    bound_distance   smallest distance to a bound, () [rad]
+    d, d_tilde       sup of the norms: of a torque, (), or of each level, (r,)
+    V_start, V_end   V at the first and at the last step
     """
 
-    def __init__(self, root: np.ndarray | None) -> None:
-        self.root = root
-        self.low: Any = np.inf
-        self.high: Any = -np.inf
-        self.bound_distance: Any = np.inf
-        self.d: Any = 0.0
-        """sup |d|: of a torque, or of each level, (r,)."""
-        self.dd: Any = 0.0
-        self.d_tilde: Any = 0.0
-        self.growth = 0.0
-        """sup max(g, 0) of (S.4)."""
-        self.lambda_min = np.inf
-        """Smallest eigenvalue of M0 along the run [kg m^2]."""
-        self.lambda_max = -np.inf
-        self.mu = np.inf
-        """Smallest eigenvalue of M0^-1 K2 along the run [1/s]."""
-        self.steady = True
-        """Whether f' = 0 at every step."""
-        self.samples = 0
-        self.excluded = 0
-        self.V_start = np.nan
-        self.V_end = np.nan
-        self.half_square_start = np.nan
-        """1/2 |f_tilde(0)|^2."""
+    samples: int = 0
+    excluded: int = 0
 
-    def add(self, steps: Steps) -> None:
+    def add(self, steps: Steps, scenario: Scenario, claims: Sequence[Claim]) -> None:
         """Updates the extrema with some steps."""
         sample, terms = steps.sample, steps.terms
-        if self.samples == 0:
-            self.V_start = terms.V[0]
-            self.half_square_start = 0.5 * np.sum(terms.d_tilde[0] ** 2)
-        self.V_end = terms.V[-1]
-        self.low = np.minimum(self.low, sample.lower.min(axis=0))
-        self.high = np.maximum(self.high, sample.upper.max(axis=0))
-        self.bound_distance = np.minimum(self.bound_distance, terms.distance[:, 0].min())
-        self.d = np.maximum(self.d, _largest(terms.d))
-        self.d_tilde = np.maximum(self.d_tilde, _largest(terms.d_tilde))
-        self.samples += steps.t.size
-        self.excluded += int(terms.excluded.sum())
-        if "torque" in terms.claims:
-            self._add_torque(terms, terms.claims["torque"])
-        if "levels" in terms.claims:
-            growth = np.where(terms.excluded, 0.0, terms.claims["levels"].growth)
-            self.growth = np.maximum(self.growth, growth.max())
-
-    def _add_torque(self, terms: Any, torque: Any) -> None:
-        """Updates the extrema of claims about a torque."""
-        self.dd = np.maximum(self.dd, _largest(terms.dd))
-        self.steady = self.steady and bool(torque.steady.all())
-        M0 = np.asarray(torque.M0)
-        eigenvalues = _eigenvalues(M0)
-        self.lambda_min = np.minimum(self.lambda_min, eigenvalues[:, 0].min())
-        self.lambda_max = np.maximum(self.lambda_max, eigenvalues[:, -1].max())
-        if self.root is None:
-            self.mu = np.nan
-            return
-        scaled = M0 / (self.root[:, None] * self.root[None, :])
-        self.mu = np.minimum(self.mu, (1.0 / _eigenvalues(scaled)[:, -1]).min())
+        found = {
+            "low": Extremum(np.minimum, sample.lower.min(axis=0)),
+            "high": Extremum(np.maximum, sample.upper.max(axis=0)),
+            "bound_distance": Extremum(np.minimum, terms.distance[:, 0].min()),
+            "d": Extremum(np.maximum, largest_norm(terms.d)),
+            "d_tilde": Extremum(np.maximum, largest_norm(terms.d_tilde)),
+            "samples": Extremum(operator.add, steps.t.size),
+            "excluded": Extremum(operator.add, int(terms.excluded.sum())),
+            "V_start": Extremum(lambda first, _: first, terms.V[0]),
+            "V_end": Extremum(lambda _, last: last, terms.V[-1]),
+        }
+        for claim in claims:
+            found |= claim.extrema(scenario, terms)
+        kept = vars(self)
+        for name, (combined, value) in found.items():
+            kept[name] = combined(kept[name], value) if name in kept else value
 
 
-def _largest(values: np.ndarray) -> np.ndarray:
+def largest_norm(values: np.ndarray) -> np.ndarray:
     """Largest norm over time: of a torque, (), or of each level, (r,)."""
     return np.linalg.norm(values, axis=-1).max(axis=0)  # type: ignore[no-any-return]
-
-
-def _eigenvalues(matrices: np.ndarray) -> np.ndarray:
-    """Eigenvalues of symmetric matrices, ascending, (T, n); NaN where a matrix is not finite, for
-    which NumPy would raise.
-    """
-    finite = np.all(np.isfinite(matrices), axis=(1, 2), keepdims=True)
-    unit = np.eye(matrices.shape[-1])
-    return np.where(finite[..., 0], np.linalg.eigvalsh(np.where(finite, matrices, unit)), np.nan)
 
 
 def _summary(
     run: Any, grid: TimeGrid, claims: tuple[Claim, ...], all_steps: Iterable[Steps]
 ) -> Summary:
     """Extremes over all steps, and the constants that follow from them."""
-    law = unwrapped(run.scenario.controller)
-    root = np.asarray(law.K2**0.5) if isinstance(law, Backstepping) else None
-    extrema = Extrema(root)
+    extrema = Extrema()
     for steps in all_steps:
-        extrema.add(steps)
+        extrema.add(steps, run.scenario, claims)
     if is_valid(run):
         check_status(run, float(extrema.bound_distance))
     return Summary(run, claims, extrema, grid.duration)
@@ -325,7 +299,6 @@ class _Anchor(NamedTuple):
 
 def _segments(summary: Summary, all_steps: Iterable[Steps]) -> Iterator[Segment]:
     """The segments, with the envelopes that run through them."""
-    decays = summary.decays
     anchors: dict[tuple[str, int], _Anchor] = {}
     # The last step of the segment before decides whether an envelope starts again.
     last_t, last_excluded = np.zeros(0), np.zeros(0, bool)
@@ -335,9 +308,9 @@ def _segments(summary: Summary, all_steps: Iterable[Steps]) -> Iterator[Segment]
         starts = starts[last_t.size :]
         last_t, last_excluded = t[-1:], excluded[-1:]
         envelopes = {}
-        for key, decay in decays.items():
+        for key, bound in summary.decay_bounds.items():
             envelopes[key], anchors[key] = _envelope(
-                float(summary.run.dt), decay, steps, starts, anchors.get(key)
+                float(summary.run.dt), bound, steps, starts, anchors.get(key)
             )
         yield Segment(summary, t, steps.sample, steps.terms, steps.recorded, envelopes)
 
@@ -359,7 +332,7 @@ def weighted_lyapunov(terms: Any, w_f: float) -> np.ndarray:
 
 
 def _envelope(
-    dt: float, claimed: Decay, steps: Steps, starts: np.ndarray, anchor: _Anchor | None
+    dt: float, claimed: DecayBound, steps: Steps, starts: np.ndarray, anchor: _Anchor | None
 ) -> tuple[Envelope, _Anchor]:
     """The envelope along some steps and its tolerance; NaN at excluded steps, and everywhere if the
     rate is not positive.
@@ -378,11 +351,11 @@ def _envelope(
     start_V = np.append(anchor.V, V)[start]
     start_noise = np.append(anchor.noise, noise)[start]
     # The integrator's errors accumulate and decay at the claimed rate.
-    decay = np.exp(-max(rho, 0.0) * dt)
+    shrinking = np.exp(-max(rho, 0.0) * dt)
     errors, carried = [], anchor.carried
     for restart, defect in zip(starts.tolist(), defects.tolist(), strict=True):
         errors.append(0.0 if restart else carried)
-        carried = decay * errors[-1] + defect
+        carried = shrinking * errors[-1] + defect
     after = _Anchor(start_t[-1], start_V[-1], start_noise[-1], carried)
     if not rho > 0:
         unclaimed = np.full(t.size, np.nan)

@@ -11,7 +11,8 @@ by forward-mode differentiation of `closed_loop.evaluate`.  No differences along
 When plant and model differ, d contains x' and the input, and its rate is still exact.
 
 There is one record of terms, `Terms`.  A `Point` makes those that belong to every claim, and each
-claim adds its own (`Claim.added`).  Two kinds of points differ in how they get derivatives:
+claim adds its own (`Claim.with_terms_of_claim`).  Two kinds of points differ in how they get
+derivatives:
 
     TorquePoint   for claims about a robot and the torque f: the signals of the loop and their rates
     LevelPoint    for claims about levels: the arguments (t, x, d_hat, state of the law) of V and
@@ -37,6 +38,7 @@ from iblf_jax.control.controllers import (
     Backstepping,
     BarrierBackstepping,
     LawContext,
+    RobotLaw,
     Saturated,
 )
 from iblf_jax.control.controllers._base import law_of_x, layers_with_states
@@ -52,6 +54,9 @@ from iblf_jax.world.robots import friction_torque
 if TYPE_CHECKING:
     from iblf_jax.certificates.claims._base import Claim
 
+TORQUE, ESTIMATED = "torque", "estimate"
+"""Names of entries of `Terms.claims` that several claims read: of a robot, and of the estimate of
+levels."""
 DECAY_ROUNDING = 2.0
 """Error of V2' in units of the last place, relative to the sizes of its terms; the largest that
 tests found is 0.1."""
@@ -66,32 +71,32 @@ class Terms(NamedTuple):
 
     V: Any
     """The Lyapunov function, (): V2 of (3.12), or sum w_i V_i of (S.3)."""
-    dV: Any
-    """V', exact, () [unit of V a second]."""
     d: jax.Array
-    """The uncertain term: f, (n,) [N m], for claims about a torque, else what x' differs from the
-    flow of the model, (r, n), in units of the levels a second."""
-    dd: Any
-    """d', exact."""
+    """The uncertain term: f, (n,) [N m], for claims about a torque, else x' minus the flow of the
+    model, (r, n), in units of the levels a second."""
     d_tilde: jax.Array
     """d - d_hat, or f_tilde = f - f_hat."""
-    dd_tilde: Any
-    """Its rate, exact."""
-    e: Any
-    """Errors x_i - alpha_{i-1}, (r, n), in the units of the levels."""
-    xi: Any
-    """Errors relative to their bounds, (r, n); 0 in levels without bounds."""
     distance: jax.Array
     """Distances of x_i to the bounds of level i, (r, n); infinite without bounds."""
-    size: Any
-    """Sum of the absolute values of the terms of V', (): rounding is relative to it."""
-    sqrt_V_size: Any
-    """Error of sqrt(2 V) for a relative error of 1, ()."""
     excluded: jax.Array
     """Whether the claims exclude this instant, () bool: the guard at a bound or a limit of the
     input is active, or a virtual control is outside the bounds of its level."""
-    claims: dict[str, Any]
-    """Key of a claim -> its own terms."""
+    dV: Any = ()
+    """V', exact, () [unit of V a second]."""
+    dd: Any = ()
+    """d', exact."""
+    dd_tilde: Any = ()
+    """Rate of d_tilde, exact."""
+    e: Any = ()
+    """Errors x_i - alpha_{i-1}, (r, n), in the units of the levels."""
+    xi: Any = ()
+    """Errors relative to their bounds, (r, n); 0 in levels without bounds."""
+    size: Any = ()
+    """Sum of the absolute values of the terms of V', (): rounding is relative to it."""
+    sqrt_V_size: Any = ()
+    """Error of sqrt(2 V) for a relative error of 1, ()."""
+    claims: Any = ()
+    """Terms that claims add, a dict: by the key of the claim, TORQUE or ESTIMATED."""
 
 
 def rounding(dtype: Any) -> float:
@@ -109,13 +114,13 @@ def terms_and_sample(
       scenario: canonical.
       t: time, () [s].
       state: state of the loop at t.
-      claims: about the scenario, the one that decides on the kind of the point first or later.
+      claims: claims about the scenario, in any order.
     """
     kind = TorquePoint if any(claim.about_torque for claim in claims) else LevelPoint
     point = kind(scenario, t, state)
     terms = point.terms()
     for claim in claims:
-        terms = claim.added(point, terms)
+        terms = claim.with_terms_of_claim(point, terms)
     return terms, point.sample
 
 
@@ -129,7 +134,7 @@ class Uncertain(NamedTuple):
 
 
 class Point(metaclass=abc.ABCMeta):
-    """One state of a closed loop and the rate of everything there; computed where it is first used.
+    """One state of a closed loop and the rate of everything there.
 
     Args:
       scenario: canonical.
@@ -137,6 +142,8 @@ class Point(metaclass=abc.ABCMeta):
       state: state of the loop at t.
     """
 
+    rate: LoopState
+    """The rate of the state."""
     sample: Sample
     """What a run records at this state."""
     uncertain: Uncertain
@@ -153,7 +160,7 @@ class Point(metaclass=abc.ABCMeta):
         """The terms that do not belong to a claim."""
 
     @abc.abstractmethod
-    def effect(self, slope: jax.Array, d_tilde: jax.Array) -> jax.Array:
+    def disturbance_power(self, slope: jax.Array, d_tilde: jax.Array) -> jax.Array:
         """dV/dx . d_tilde, () for the slopes dV/dx, (r, n)."""
 
     @abc.abstractmethod
@@ -167,11 +174,6 @@ class Point(metaclass=abc.ABCMeta):
             inner_state(self.scenario, each)
             for each in (self.state.controller, self.rate.controller)
         )
-
-    @property
-    @abc.abstractmethod
-    def rate(self) -> LoopState:
-        """The rate of the state."""
 
     @cached_property
     def distance(self) -> jax.Array:
@@ -188,37 +190,20 @@ class Point(metaclass=abc.ABCMeta):
 class TorquePoint(Point):
     """A state of the loop of a robot, whose uncertain term is the torque f."""
 
-    @cached_property
-    def rate(self) -> LoopState:  # type: ignore[override]
-        """The rate of the state."""
-        return rate(self.scenario, self.t, self.state)
+    now: dict[str, jax.Array]
+    """The signals that are differentiated."""
+    rates: dict[str, jax.Array]
+    """Their rates along the vector field of the loop."""
+    M0: jax.Array
+    """The mass matrix of the model, (n, n) [kg m^2]."""
 
-    @cached_property
-    def M0(self) -> jax.Array:
-        """The mass matrix of the model, (n, n) [kg m^2]."""
-        return self.scenario.model.mass_matrix(self.x[0])
-
-    @cached_property
-    def _along(self) -> tuple[dict[str, jax.Array], dict[str, jax.Array], Sample]:
-        """The signals, their rates and the sample."""
-        directions = (jnp.ones_like(self.t), self.rate)
-        signals = partial(_signals, self.scenario)
-        return jax.jvp(signals, (self.t, self.state), directions, has_aux=True)  # type: ignore[no-any-return]
-
-    @property
-    def now(self) -> dict[str, jax.Array]:
-        """The signals that are differentiated."""
-        return self._along[0]
-
-    @property
-    def rates(self) -> dict[str, jax.Array]:
-        """Their rates along the vector field of the loop."""
-        return self._along[1]
-
-    @property
-    def sample(self) -> Sample:  # type: ignore[override]
-        """What a run records at this state."""
-        return self._along[2]
+    def __init__(self, scenario: Scenario, t: jax.Array, state: LoopState) -> None:
+        super().__init__(scenario, t, state)
+        self.rate = rate(scenario, t, state)
+        self.M0 = scenario.model.mass_matrix(self.x[0])
+        along = (jnp.ones_like(t), self.rate)
+        signals = partial(_signals, scenario)
+        self.now, self.rates, self.sample = jax.jvp(signals, (t, state), along, has_aux=True)
 
     @cached_property
     def uncertain(self) -> Uncertain:  # type: ignore[override]
@@ -229,26 +214,24 @@ class TorquePoint(Point):
 
     def terms(self) -> Terms:
         """The terms that do not belong to a claim."""
-        now, rates, sample = self._along
+        now, rates, sample = self.now, self.rates, self.sample
         f, f_tilde, df, df_tilde = self.uncertain
-        xi, e = now["xi"], jnp.stack([sample.e1, now["e2"]])
+        xi = now["xi"]
         return Terms(
             V=now["V"],
-            dV=rates["V"],
             d=f,
-            dd=df,
             d_tilde=f_tilde,
-            dd_tilde=df_tilde,
-            e=e,
-            xi=jnp.stack([xi, jnp.zeros_like(xi)]),
             distance=self.distance,
-            size=(),
-            sqrt_V_size=(),
             excluded=jnp.any(sample.guard_active | sample.saturated),
+            dV=rates["V"],
+            dd=df,
+            dd_tilde=df_tilde,
+            e=jnp.stack([sample.e1, now["e2"]]),
+            xi=jnp.stack([xi, jnp.zeros_like(xi)]),
             claims={},
         )
 
-    def effect(self, slope: jax.Array, d_tilde: jax.Array) -> jax.Array:
+    def disturbance_power(self, slope: jax.Array, d_tilde: jax.Array) -> jax.Array:
         """dV/dq' . M0^-1 f_tilde."""
         return slope[1] @ solve_spd(self.M0, d_tilde)
 
@@ -314,7 +297,7 @@ def on_position(law: Any) -> tuple[Barrier, Any]:
     return law.barrier, law.weight
 
 
-def gap(xi: jax.Array, guard: float) -> jax.Array:
+def relative_gap(xi: jax.Array, guard: float) -> jax.Array:
     """Distance to the bound relative to the width of the tube, in [guard, 1]; 1 for a barrier
     without a guard.  Relative errors grow by 1/gap near the bound.
     """
@@ -336,21 +319,13 @@ class Arguments(NamedTuple):
 
 
 class LevelPoint(Point):
-    """A state of the loop of a plant in strict-feedback form."""
+    """A state of a loop whose law receives levels: of a plant in strict-feedback form, or of a
+    robot as one of order 2.
+    """
 
-    @cached_property
-    def _evaluated(self) -> tuple[LoopState, Sample]:
-        return evaluate(self.scenario, self.t, self.state)  # type: ignore[no-any-return]
-
-    @property
-    def rate(self) -> LoopState:
-        """The rate of the state."""
-        return self._evaluated[0]
-
-    @property
-    def sample(self) -> Sample:  # type: ignore[override]
-        """What a run records at this state."""
-        return self._evaluated[1]
+    def __init__(self, scenario: Scenario, t: jax.Array, state: LoopState) -> None:
+        super().__init__(scenario, t, state)
+        self.rate, self.sample = evaluate(scenario, t, state)
 
     @cached_property
     def arguments(self) -> tuple[Arguments, Arguments]:
@@ -359,8 +334,8 @@ class LevelPoint(Point):
 
     @cached_property
     def d(self) -> jax.Array:
-        """What x' differs from the flow of the model, (r, n)."""
-        return _disturbance(self.scenario, self.state, *self._evaluated)
+        """Rate x' minus the flow of the model, (r, n)."""
+        return _disturbance(self.scenario, self.state, self.rate, self.sample)
 
     @cached_property
     def d_tilde(self) -> jax.Array:
@@ -388,23 +363,9 @@ class LevelPoint(Point):
         excluded = jnp.any(sample.guard_active)
         if not covers_limit(self.scenario):
             excluded |= jnp.any(sample.saturated) | self._input_was_limited()
-        return Terms(
-            V=sample.V,
-            dV=(),
-            d=self.d,
-            dd=(),
-            d_tilde=self.d_tilde,
-            dd_tilde=(),
-            e=(),
-            xi=(),
-            distance=self.distance,
-            size=(),
-            sqrt_V_size=(),
-            excluded=excluded,
-            claims={},
-        )
+        return Terms(sample.V, self.d, self.d_tilde, self.distance, excluded, claims={})
 
-    def effect(self, slope: jax.Array, d_tilde: jax.Array) -> jax.Array:
+    def disturbance_power(self, slope: jax.Array, d_tilde: jax.Array) -> jax.Array:
         """dV/dx . d_tilde."""
         return jnp.sum(slope * d_tilde)
 
@@ -465,7 +426,7 @@ def _as_rates(scenario: Scenario, x: jax.Array, estimate: jax.Array) -> jax.Arra
 def _disturbance(
     scenario: Scenario, state: LoopState, state_rate: LoopState, sample: Sample
 ) -> jax.Array:
-    """What x' differs from the flow of the model, (r, n)."""
+    """Rate x' minus the flow of the model, (r, n)."""
     if plants.is_chain(scenario.model):
         return sample.disturbance
     # The sample of a robot has a torque.
@@ -498,6 +459,11 @@ def inner_context(scenario: Scenario, state: Any) -> LawContext:
     if not covers_limit(scenario):
         return scenario.context
     return scenario.context._replace(shift=outer.shift(state))
+
+
+def receives_q_dq(scenario: Scenario) -> bool:
+    """Whether the law of a scenario receives q and q', and not all levels."""
+    return isinstance(unwrapped(scenario.controller), RobotLaw)
 
 
 def adaptive_law(scenario: Scenario) -> AdaptiveParameters | None:

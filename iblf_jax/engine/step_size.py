@@ -309,7 +309,9 @@ def _find_part(
         dt = jnp.asarray(period / parts, scenario.initial.q.dtype)
         fitted = with_history(scenario, period / parts)
         found = run_one(fitted, (), dt, RunRequest(periods * parts, method, parts), noise)
-        q, width = found.records[0]["q"], found.records[0]["upper"] - found.records[0]["lower"]
+        signals = found.records[0]
+        q = signals["x"][:, 0]
+        width = signals["level_upper"][:, 0] - signals["level_lower"][:, 0]
         poor = has_flag(int(found.status), Status.STEP_TOO_LARGE)
         # A step of any size leaves the error that a different code makes.
         if float(error_growth.errors_by_step(found.metrics)) != 0.0:

@@ -51,6 +51,16 @@ def with_bounds_of_levels(data: Mapping[str, Any]) -> dict[str, Any]:
     return {**data, "bounds": [data["bounds"], *levels]}
 
 
+def has_other_leaves(tables: Mapping[str, Any]) -> bool:
+    """Whether a scenario with these tables had other leaves when it was stored: its law was a
+    FullState, which is a BarrierBackstepping now.
+    """
+    law = tables.get("controller", {})
+    while law.get("kind") != "full_state" and isinstance(law.get("law"), Mapping):
+        law = law["law"]
+    return law.get("kind") == "full_state"
+
+
 def order_of_leaves(tables: Mapping[str, Any], scenario: Scenario) -> list[int]:
     """The numbers of a scenario's leaves in the order in which a file with these tables has them.
 

@@ -517,6 +517,11 @@ class _Reader:
             self.value(x, f"{key}.leaves[{i}]")
             for i, x in enumerate(_listed(node.get("leaves"), key))
         ]
+        if earlier.has_other_leaves(tables):
+            if np.ndim(stored[0]) == np.ndim(expected[0]):
+                return first  # its tables have the same numbers
+            remedy = "save_rollouts of the version that wrote it makes a file that is read."
+            raise checks.fail(key, Words("many scenarios of a FullState"), "one scenario", remedy)
         if len(stored) != len(expected):
             raise checks.fail(f"{key}.leaves", len(stored), f"{len(expected)} arrays")
         numbers = earlier.order_of_leaves(tables, first)

@@ -335,6 +335,8 @@ def pareto(front: ParetoFront) -> Figure:
 
     Source: design of this package.
     """
+    from iblf_jax.tuning import ParetoFront  # a result exists only where its package is loaded
+
     check_class("front", front, ParetoFront, "ij.pareto returns one.")
     figure = _style.new_figure(0.7 * _style.WIDTH, 3.6)
     axes = figure.subplots()

@@ -293,9 +293,13 @@ def _verdicts(axes: Axes, shown: Certificate) -> None:
     names = ["K2", "kf", "own", "inequality", "envelope", "xi", "e2", "f_tilde", "joints"]
     if shown.levels:
         names = ["own", "inequality", "equality", "estimate", "alpha", "envelope", "xi", "e,"]
-    if not any(line.name.startswith("inequality") for line in applicable):
-        names.append("weighted")  # The claim of the paper does not apply.
-    lines = [line for line in applicable if line.name.startswith(tuple(names)) and line.counts]
+    only_weighted = not any(x.is_inequality and not x.has_weights for x in applicable)
+    lines = [
+        line
+        for line in applicable
+        if line.counts
+        and (line.name.startswith(tuple(names)) or (only_weighted and line.has_weights))
+    ]
     growth = axes.get_figure().get_figwidth() / WIDTH  # type: ignore[union-attr]
     style: dict[str, Any] = {"transform": axes.transAxes, "va": "center"}
     if not lines:

@@ -115,7 +115,7 @@ def _quantity(findings: Findings, quantity: Any, duration: float, n: int) -> Non
     fold = Quantities((quantity,))
 
     def outputs(fold, numbers):
-        run = Sample(**numbers, **in_dtype(flags, numbers["q"].dtype))
+        run = Sample(**numbers, **in_dtype(flags, numbers["x"].dtype))
         return {"the smooth value": folded((fold,), run)["tuning_smooth"]}
 
     exact = jax.jit(folded)((fold,), some)["tuning_exact"]

@@ -142,7 +142,7 @@ CASES: dict[str, Callable[[], Any]] = {
     "barrier Log": lambda: paper(law="log", variant="corrected"),
     "barrier Log, p = 2": lambda: paper(law="log", variant="corrected", p=2),
     "barrier Tan": lambda: paper(law="tan", variant="corrected"),
-    "barrier State": lambda: paper(law="state", variant="corrected"),
+    "barrier StateBarrier": lambda: paper(law="state", variant="corrected"),
     "barrier TransformedError": lambda: paper(law="mapping", variant="corrected"),
     "funnel": ij.presets.zhang_yan_2024_funnel,
     "with a weight": lambda: under(backstepping(weight=0.3)),

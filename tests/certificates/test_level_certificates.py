@@ -120,7 +120,7 @@ def test_both_sides_of_the_claim_are_equal(design):
     assert np.all(np.abs(left - right) <= 1e-13 * terms.size)
     tolerance = LEVEL_ROUNDING * rounding("float64") * terms.size
     assert np.median(tolerance / np.abs(left)) < 1e-10
-    certified = claim.disturbance_terms - claim.decay - claim.by_slopes
+    certified = claim.disturbance_terms - claim.dissipation - claim.by_slopes
     assert np.all(np.abs(right - certified) <= 1e-13 * terms.size)
     assert np.all(np.abs(left - terms.dV) <= 1e-13 * terms.size)
     assert np.all(np.abs(terms.dV - certified) <= 0.2 * tolerance)

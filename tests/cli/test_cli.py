@@ -150,7 +150,7 @@ def test_claims_can_fail(paper, short_run):
     assert not confirmed["The integral form overshoots more in e2 at the start."]
     assert not confirmed["The error signals tend to a very small neighbourhood of zero."]
     outside = jax.tree.map(lambda x: x, short_run)
-    object.__setattr__(outside, "q", short_run.q + 10.0)
+    object.__setattr__(outside, "x", short_run.x.at[:, 0].add(10.0))
     assert not _claims.theorem_1({"a": outside}).confirmed
     object.__setattr__(outside, "status", short_run.status | int(ij.Status.BOUND_VIOLATED))
     assert not _claims.bounds_kept({"a": outside}).confirmed

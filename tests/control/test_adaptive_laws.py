@@ -221,7 +221,7 @@ def test_the_rate_of_the_lyapunov_function_is_what_is_claimed(scenario, paths, r
         return terms_at(ij.with_parameters(scenario, values), t, state).claims["own"]
 
     found = terms_of(values, t, states)
-    excess = found.dV + found.decay - found.disturbance_terms
+    excess = found.dV + found.dissipation - found.disturbance_terms
     assert np.all(excess <= 1e-12 * found.size)
     assert np.all(found.V > 0)
     # The projection makes it an inequality where it acts.

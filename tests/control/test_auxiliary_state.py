@@ -147,7 +147,7 @@ def test_the_rate_of_V2_of_an_arm(rng):
         expected = -decay - z @ (law.K2 * z) + z @ f_tilde + f_tilde @ proof.dd_tilde
         expected += slope @ aux
         np.testing.assert_allclose(proof.dV, expected, rtol=1e-9, atol=1e-12 * proof.size)
-        np.testing.assert_allclose(proof.claims["torque"].auxiliary.growth, slope @ aux, rtol=1e-12)
+        np.testing.assert_allclose(proof.claims["torque"].auxiliary.power, slope @ aux, rtol=1e-12)
 
 
 @pytest.mark.slow
@@ -158,7 +158,7 @@ def test_the_rate_of_V_of_a_chain_with_bounds_of_every_level(coupled, rng):
         state = LoopState(np.asarray(x), AuxiliaryState((), aux), ())
         proof = terms(coupled, jnp.asarray(t), jax.tree.map(jnp.asarray, state))
         claim = proof.claims["levels"]
-        left = proof.dV + claim.decay - claim.growth
+        left = proof.dV + claim.dissipation - claim.growth
         assert not proof.excluded
         np.testing.assert_allclose(left, 0.0, atol=1e-12 * proof.size)
 

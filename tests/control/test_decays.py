@@ -206,7 +206,7 @@ def test_settling_time_of_an_arm_and_the_case_in_which_it_is_broken():
         samples=1001,
         why_invalid="",
     )
-    (broken,) = settling.SETTLING.conclusions(summary, [slow], {})
+    (broken,) = settling.SETTLING.run_lines(summary, [slow], {})
     assert broken.verdict == "fails"
 
 

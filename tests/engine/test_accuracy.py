@@ -69,8 +69,8 @@ def positions(scenario, varied, dt, steps, method):
     found = run({path: jnp.asarray(x) for path, x in varied.items()}, jnp.asarray(dt))
     arrays = found.records[0]
     return (
-        np.asarray(arrays["q"]),
-        np.asarray(arrays["upper"] - arrays["lower"]),
+        np.asarray(arrays["x"][..., 0, :]),
+        np.asarray((arrays["level_upper"] - arrays["level_lower"])[..., 0, :]),
         np.asarray(found.metrics[RELATIVE]),
         np.asarray(found.status),
     )

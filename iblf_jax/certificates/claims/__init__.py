@@ -15,21 +15,21 @@ from __future__ import annotations
 import jax
 
 from iblf_jax.certificates.claims._base import Claim as Claim
-from iblf_jax.certificates.claims._base import ShownClaim
+from iblf_jax.certificates.claims._base import MainClaim
 from iblf_jax.certificates.claims.levels import LEVELS
 from iblf_jax.certificates.claims.matched import MATCHED
-from iblf_jax.certificates.claims.own import OWN, is_about_torque
+from iblf_jax.certificates.claims.own import OWN
 from iblf_jax.certificates.claims.settling import SETTLING
 from iblf_jax.certificates.claims.theorem import THEOREM
 from iblf_jax.certificates.claims.weighted import WEIGHTED
-from iblf_jax.certificates.terms import Terms, terms_and_sample
+from iblf_jax.certificates.terms import Terms, receives_q_dq, terms_and_sample
 from iblf_jax.simulation.closed_loop import LoopState
 from iblf_jax.simulation.scenario import Scenario
 
 
-def shown_claim(scenario: Scenario) -> ShownClaim:
+def main_claim(scenario: Scenario) -> MainClaim:
     """The claim that a certificate of a scenario is about, whether or not it applies."""
-    if is_about_torque(scenario):
+    if receives_q_dq(scenario):
         return THEOREM
     return LEVELS if MATCHED.why_not(scenario) else MATCHED
 
@@ -40,11 +40,11 @@ def claims_of(scenario: Scenario) -> tuple[Claim, ...]:
     Raises:
       ValueError: a law that states half of a claim about itself.
     """
-    shown = shown_claim(scenario)
-    candidates: tuple[Claim, ...] = (OWN, shown, SETTLING, WEIGHTED)
-    if shown is LEVELS:
-        candidates = (shown, SETTLING, OWN)
-    return tuple(x for x in candidates if x is shown or not x.why_not(scenario))
+    main = main_claim(scenario)
+    candidates: tuple[Claim, ...] = (OWN, main, SETTLING, WEIGHTED)
+    if main is LEVELS:
+        candidates = (main, SETTLING, OWN)
+    return tuple(x for x in candidates if x is main or not x.why_not(scenario))
 
 
 def terms_at(scenario: Scenario, t: jax.Array, state: LoopState) -> Terms:

@@ -7,11 +7,11 @@ estimate d_hat, through the errors and through the virtual controls.  With d_til
 
 for any observer, because the law replaces x' by the flow of the model with the estimate and holds
 the estimate.  dV/dx contains w_i s_i in level i, and dV_i/dalpha_{i-1} times the derivatives of
-alpha_{i-1} in the levels below it; dV_i/dalpha_{i-1} is taken at fixed x_i and t, so that it moves
-the error and the tube.  An observer with d_tilde' = d' - kappa d_tilde has d_hat' = kappa d_tilde
-(`Observer.error_gain`), which is checked by itself.  Without an observer d_hat = 0 and
-d_tilde = d.  A torque observer of the robot inside the plant gives f_hat, which is held, while
-d_hat = M0^-1 f_hat in the second level is not: T has dV/df_hat . f_hat' then, and
+alpha_{i-1} in the levels below it.  When alpha_{i-1} varies at fixed x_i and t, both the error and
+the tube of level i change; the derivative includes both.  An observer with
+d_tilde' = d' - kappa d_tilde has d_hat' = kappa d_tilde (`Observer.error_gain`), which is checked
+by itself.  Without an observer d_hat = 0 and d_tilde = d.  A torque observer gives f_hat, and the
+law holds f_hat constant, not d_hat = M0^-1 f_hat.  T then contains dV/df_hat . f_hat', with
 f_hat' = kf f_tilde.
 
 For barriers that decay exactly (`Barrier.exact_decay`), (S.3) is an equality.
@@ -44,9 +44,19 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from iblf_jax.certificates.claims._base import ShownClaim, check_steps, with_status
+from iblf_jax.certificates.claims._base import (
+    MainClaim,
+    at_recorded,
+    centre_distance,
+    check_steps,
+    level_dissipation,
+    other_actuator,
+    reference_inside,
+    stays_inside,
+    unclaimed,
+    xi_bound,
+)
 from iblf_jax.certificates.claims.own import OWN
-from iblf_jax.certificates.claims.theorem import REFERENCE_INSIDE
 from iblf_jax.certificates.lines import (
     Line,
     Statement,
@@ -54,24 +64,24 @@ from iblf_jax.certificates.lines import (
     check_smallest,
     finite,
     join_notes,
+    measured,
     not_applicable,
-    observed_only,
     verdict_of,
 )
 from iblf_jax.certificates.result import LevelLabel, LevelTraces
-from iblf_jax.certificates.summary import Decay, Segment, Summary
+from iblf_jax.certificates.summary import DecayBound, Extremum, Segment, Summary
 from iblf_jax.certificates.terms import (
+    ESTIMATED,
     Arguments,
     LevelPoint,
     Point,
     Terms,
     adaptive_law,
     covers_limit,
-    gap,
     inner_context,
     inner_state,
+    relative_gap,
 )
-from iblf_jax.control.actuators import Ideal
 from iblf_jax.control.barriers import Barrier
 from iblf_jax.control.controllers import BarrierBackstepping
 from iblf_jax.control.controllers._base import decay_of
@@ -127,7 +137,7 @@ NO_ESTIMATE = "the observer states no kappa; T uses the rate of its estimate alo
 class LevelTerms(NamedTuple):
     """The terms of (S.3) besides those of `Terms`, () each unless noted."""
 
-    decay: jax.Array
+    dissipation: jax.Array
     """sum w_i decay_i, where decay_i is at least the barrier's stated rate times V_i, for the gain
     k_i(t, V_i) of the instant."""
     by_slopes: jax.Array
@@ -159,11 +169,10 @@ class EstimateTerms(NamedTuple):
     """Sum of the absolute values of its terms."""
 
 
-class Levels(ShownClaim):
+class Levels(MainClaim):
     """(S.3) and the bounds that follow from it."""
 
     key: ClassVar[str] = "levels"
-    equation: ClassVar[str] = "(S.3)"
     in_words: ClassVar[str] = "the claim (S.3)"
 
     def why_not(self, scenario: Scenario) -> str:
@@ -182,8 +191,8 @@ class Levels(ShownClaim):
             kind = type(scenario.observer).__name__
             about = "(S.3) is about a measured state, and the law receives levels that"
             return f"{about} {kind} estimates"
-        if not isinstance(scenario.actuator, Ideal):
-            actuator = checks.with_article(type(scenario.actuator).__name__)
+        actuator = other_actuator(scenario)
+        if actuator:
             about = "(S.3) is about an input that acts as it is commanded"
             return f"{about}; {actuator} has no claim of this kind"
         return ""
@@ -191,8 +200,8 @@ class Levels(ShownClaim):
     def why_not_in_run(self, summary: Summary) -> str:
         """Why (S.3) does not apply to a run; "" if it does."""
         reason = super().why_not_in_run(summary)
-        if not reason and summary.excluded == summary.samples:
-            return f"{summary.why_excluded} all the time, or alpha was outside the bounds"
+        if not reason and summary.why_never:
+            return f"{summary.why_never}, or alpha was outside the bounds"
         return reason
 
     def exclusion_note(self, summary: Summary) -> str:
@@ -202,10 +211,10 @@ class Levels(ShownClaim):
 
     # --- the terms --------------------------------------------------------------------------------
 
-    def added(self, point: Point, terms: Terms) -> Terms:
+    def with_terms_of_claim(self, point: Point, terms: Terms) -> Terms:
         """The terms at a state with those of this claim, and with those of the estimate."""
         assert isinstance(point, LevelPoint)
-        entries = terms.claims | {"estimate": _estimate_terms(point)}
+        entries = terms.claims | {ESTIMATED: _estimate_terms(point)}
         terms = terms._replace(claims=entries)
         if not isinstance(point.law, BarrierBackstepping):
             return terms
@@ -215,6 +224,13 @@ class Levels(ShownClaim):
         return terms._replace(excluded=terms.excluded | jnp.any(distance <= NARROWEST))
 
     # --- the constants ----------------------------------------------------------------------------
+
+    def extrema(self, scenario: Scenario, terms: Terms) -> dict[str, Extremum]:
+        """The largest g of (S.3), at least 0."""
+        growth = np.zeros(1)
+        if self.key in terms.claims:
+            growth = np.where(terms.excluded, 0.0, terms.claims[self.key].growth)
+        return {"growth": Extremum(np.maximum, np.maximum(0.0, growth.max()))}
 
     def constants(self, summary: Summary) -> np.ndarray:
         """Decay rate of V_i of each level and component, (r, n) [1/s]; empty where (S.3) does not
@@ -226,16 +242,16 @@ class Levels(ShownClaim):
         rows = zip(law.barriers, law.k, strict=True)
         return np.stack([np.broadcast_to(barrier.decay_rate(k), scenario.n) for barrier, k in rows])
 
-    def decays(self, summary: Summary) -> dict[int, Decay]:
+    def decay_bounds(self, summary: Summary) -> dict[int, DecayBound]:
         """The constants of (S.4), as case 2; none where (S.3) does not apply."""
         rates = summary.constants[self.key]
         if not rates.size:
             return {}
-        return {2: Decay(float(np.min(rates)), float(summary.extrema.growth))}
+        return {2: DecayBound(float(np.min(rates)), float(summary.extrema.growth))}
 
     def rho(self, summary: Summary) -> float:
         """The rate of (S.4) [1/s]; NaN where (S.3) does not apply."""
-        decay = summary.decays.get((self.key, 2))
+        decay = summary.decay_bounds.get((self.key, 2))
         return np.nan if decay is None else decay.rho
 
     def numbers(self, summary: Summary) -> dict[str, Any]:
@@ -253,7 +269,7 @@ class Levels(ShownClaim):
 
     # --- the whole run ----------------------------------------------------------------------------
 
-    def gains(self, summary: Summary) -> list[Line]:
+    def gain_lines(self, summary: Summary) -> list[Line]:
         """The lines about constants of a run: smoothness, and the rate."""
         return [self._smoothness(summary), self._rate(summary)]
 
@@ -299,17 +315,14 @@ class Levels(ShownClaim):
         """Bounded d_i, the reference and the start inside the bounds, and alpha_{i-1} inside those
         of level i.
         """
-        summary, terms, sample = segment.summary, segment.terms, segment.sample
+        summary, terms = segment.summary, segment.terms
         units = level_units(summary)
         lines = []
         for i, unit in enumerate(units):
             statement = Statement(f"d_{i + 1} bounded", "(S.1)", f"|d_{i + 1}| is finite")
             line = finite(statement, segment.t, np.linalg.norm(terms.d[:, i], axis=1))
             lines.append(_with_unit(line, per_second(unit)))
-        distance = np.minimum(sample.q_d - sample.lower, sample.upper - sample.q_d)
-        reference = check_smallest(REFERENCE_INSIDE, segment.t, distance)
-        reference = with_status(summary, reference, Status.INFEASIBLE_REFERENCE)
-        lines.append(_with_unit(reference, units[0]))
+        lines.append(_with_unit(reference_inside(segment), units[0]))
         for i, unit in enumerate(units):
             if not is_bounded(summary, i):
                 continue
@@ -330,7 +343,7 @@ class Levels(ShownClaim):
     def left_side(self, segment: Segment) -> np.ndarray:
         """The left less the right side of (S.3), which must not be positive, (T,)."""
         claim = segment.terms.claims[self.key]
-        return segment.terms.dV + claim.decay - claim.growth  # type: ignore[no-any-return]
+        return segment.terms.dV + claim.dissipation - claim.growth  # type: ignore[no-any-return]
 
     def _inequalities(self, segment: Segment) -> list[Line]:
         """(S.3) at every step, and its equality for barriers that decay exactly."""
@@ -371,7 +384,7 @@ class Levels(ShownClaim):
         if reason:
             return not_applicable(ENVELOPE, reason)
         bound, tolerance = segment.envelopes[self.key, 2]
-        decay = summary.decays[self.key, 2]
+        decay = summary.decay_bounds[self.key, 2]
         note = f"rho2/rho = {decay.rho2 / decay.rho:.4g}"
         if summary.law.filter is not None:
             note = join_notes(note, ULTIMATE)
@@ -421,41 +434,32 @@ class Levels(ShownClaim):
         zero = np.zeros_like(claim.k_l[:, 0])
         rows = []
         for i, barrier in enumerate(law.barriers):
-            level = V[:, None] / np.asarray(law.weights[i])
             if not is_bounded(summary, i):
-                rows.append(np.sqrt(2.0 * level) + zero)
+                rows.append(np.sqrt(2.0 * (V[:, None] / np.asarray(law.weights[i]))) + zero)
                 continue
             k_l, k_u = claim.k_l[:, i], claim.k_u[:, i]
             tube = Tube(zero, zero, -k_l, k_u, zero, zero)
-            stated = barrier.xi_bound(level, tube)
-            if stated is None:
-                stated = np.full_like(zero, np.nan)
-            rows.append(np.asarray(stated))
+            rows.append(xi_bound(barrier, law.weights[i], V, tube))
         return np.stack(rows, axis=1)
 
     def _levels_inside(self, segment: Segment) -> list[Line]:
         """Every level inside its bounds, at every step."""
         summary = segment.summary
         flags = {0: Status.BOUND_VIOLATED, 1: Status.VELOCITY_VIOLATED}
-        lines = []
-        last = len(level_units(summary)) - 1
-        for i, unit in enumerate(level_units(summary)):
+        lines, units = [], level_units(summary)
+        for i, unit in enumerate(units):
             if not is_bounded(summary, i):
                 continue
             text = f"lower < x_{i + 1} < upper"
             statement = Statement(f"level {i + 1} inside", "(S.4)", text)
-            line = check_smallest(statement, segment.t, segment.terms.distance[:, i])
-            line = _with_unit(line, unit)
-            if i in flags:
-                line = with_status(summary, line, flags[i])
             reason = self.why_not_in_run(summary)
             if not reason and self._states_no_bound(segment, i):
                 reason = _no_bound(summary, i)
-            if not reason and i == last and covers_limit(summary.run.scenario):
+            if not reason and i == len(units) - 1 and covers_limit(summary.run.scenario):
                 reason = "the claim is about x_r - lambda"
-            if reason:
-                line = observed_only(line, reason)
-            lines.append(line)
+            distance, flag = segment.terms.distance[:, i], flags.get(i)
+            line = stays_inside(segment, statement, distance, flag, reason)
+            lines.append(_with_unit(line, unit))
         return lines
 
     def _states_no_bound(self, segment: Segment, i: int) -> bool:
@@ -469,51 +473,40 @@ class Levels(ShownClaim):
         side are those of that claim.
         """
         summary, terms = segment.summary, segment.terms
-        nan = np.full(segment.t.shape, np.nan)
-        traces = LevelTraces(
-            t=segment.t,
+        unknown = np.full(terms.d.shape, np.nan)
+        traces = unclaimed(
+            LevelTraces,
+            segment.t,
             V=terms.V,
-            envelope=nan,
-            left=nan,
-            disturbance_terms=nan,
-            error=np.full(terms.d.shape, np.nan),
-            error_bound=np.full(terms.d.shape, np.nan),
+            error=errors(segment) if self.key in terms.claims else unknown,
+            error_bound=unknown,
             d_tilde=np.linalg.norm(terms.d_tilde, axis=2),
             excluded=terms.excluded,
         )
-        if self.key in terms.claims:
-            traces = traces._replace(error=errors(segment))
         if not self.why_not_in_run(summary):
-            envelope = segment.envelopes[self.key, 2].bound
-            claim = terms.claims[self.key]
+            envelope, claim = segment.envelopes[self.key, 2].bound, terms.claims[self.key]
             traces = traces._replace(
                 envelope=envelope,
-                left=np.where(terms.excluded, np.nan, self.left_side(segment)),
+                left=self.left_side(segment),
                 disturbance_terms=claim.disturbance_terms + claim.lag,
                 error_bound=self.error_bounds(segment, envelope),
             )
         elif OWN.applies(summary):
-            own = terms.claims[OWN.key]
-            left = np.where(terms.excluded, np.nan, own.left_side)
-            traces = traces._replace(V=own.V, left=left)
-        return LevelTraces(*(x[segment.recorded] for x in traces))
+            traces = OWN.on_traces(segment, traces)
+        return at_recorded(segment, traces)  # type: ignore[no-any-return]
 
     def unclaimed_traces(self, run: Any) -> LevelTraces:
         """The curves of a run of which nothing is claimed."""
-        nan = np.full(run.t.shape, np.nan)
-        order = plants.order_of(run.scenario.model)
-        error = np.full((*run.t.shape, order, run.n), np.nan)
+        unknown = np.full((*run.t.shape, plants.order_of(run.scenario.model), run.n), np.nan)
+        error = unknown.copy()
         error[:, 0] = run.xi
-        return LevelTraces(
-            t=run.t,
+        return unclaimed(  # type: ignore[no-any-return]
+            LevelTraces,
+            run.t,
             V=run.V,
-            envelope=nan,
-            left=nan,
-            disturbance_terms=nan,
             error=error,
-            error_bound=np.full_like(error, np.nan),
-            d_tilde=np.full((*run.t.shape, order), np.nan),
-            excluded=np.ones(run.t.shape, bool),
+            error_bound=unknown,
+            d_tilde=unknown[:, :, 0],
         )
 
     def labels(self, scenario: Scenario) -> tuple[LevelLabel, ...]:
@@ -562,8 +555,8 @@ def _largest(segment: Segment, statement: Statement, values: np.ndarray) -> Line
     """A measured term with its largest value."""
     included = np.where(segment.terms.excluded, -np.inf, values)
     at = int(np.argmax(included))
-    line = not_applicable(statement, "measured; a part of the right side of (S.3)", counts=False)
-    return dataclasses.replace(line, value=float(included[at]), time=float(segment.t[at]))
+    note = "measured; a part of the right side of (S.3)"
+    return measured(statement, note, value=float(included[at]), time=float(segment.t[at]))
 
 
 def _no_bound(summary: Summary, i: int) -> str:
@@ -574,7 +567,7 @@ def _no_bound(summary: Summary, i: int) -> str:
 
 def _estimate(segment: Segment) -> Line:
     """The rate of the estimate that the observer claims."""
-    summary, terms = segment.summary, segment.terms.claims["estimate"]
+    summary, terms = segment.summary, segment.terms.claims[ESTIMATED]
     observer = summary.run.scenario.observer
     if isinstance(observer, NoObserver):
         return not_applicable(ESTIMATE, "there is no observer: d_hat = 0 and d_tilde = d")
@@ -631,48 +624,39 @@ def _with_claim_terms(point: LevelPoint, terms: Terms) -> Terms:
     products = jax.tree.map(lambda slope, rate: jnp.sum(slope * rate), slopes, tangent)
     disturbance_terms = jnp.sum(slopes.x * d_tilde)
     disturbance_terms += jnp.sum(slopes.estimate * tangent.estimate)
-    decay, by_slopes, size, square = (jnp.zeros_like(at.t) for _ in range(4))
-    rows: dict[str, list[jax.Array]] = {"xi": [], "e": [], "distance": [], "k_l": [], "k_u": []}
-    gaps = []
+    dissipation, by_slopes, size, square = (jnp.zeros_like(at.t) for _ in range(4))
+    rows = []
     for i, (level, tube, barrier) in enumerate(zip(levels, tubes, law.barriers, strict=True)):
         w, x = law.weights[i], at.x[i]
-        # The claim holds for the gain of the instant, which a decay makes a function of t and V_i.
+        of_level, by_slope = level_dissipation(law, i, at.t, tube, x, level.slope)
+        dissipation, by_slopes = dissipation + of_level, by_slopes + by_slope
+        xi, distance = jnp.zeros_like(x), jnp.full_like(x, jnp.inf)
+        if scenario.context.bounds[i] is not None:
+            xi, distance = tube.xi(x), centre_distance(tube)
+        gap = relative_gap(xi, barrier.guard)
         gain = gain_at(decay_of(law, i), at.t, law.k[i], barrier, tube, x)
-        stated = barrier.decay_rate(gain)
-        if stated is not None:
-            decay += jnp.sum(w * stated * barrier.value(tube, x))
-        by_slopes += jnp.sum(law.c[i] * level.slope**2 / w)
-        xi = _relative_error(scenario, i, tube, x)
-        near_bound = gap(xi, barrier.guard)
-        gaps.append(near_bound)
-        size += jnp.sum(
-            jnp.abs(level.slope) / near_bound * (jnp.abs(tube.dq_d) + gain * jnp.abs(x))
-        )
-        near = jnp.abs(x) + jnp.abs(tube.q_d)
-        square += jnp.sum(w * (near / near_bound) ** 2 / _ratio_at_centre(barrier, tube))
-        rows["xi"].append(xi)
-        rows["e"].append(x - tube.q_d)
-        rows["distance"].append(_centre_distance(scenario, i, tube))
-        rows["k_l"].append(tube.k_l)
-        rows["k_u"].append(tube.k_u)
-    size += jnp.sum(jnp.abs(slopes.x) / jnp.stack(gaps) * sizes)
+        size += jnp.sum(jnp.abs(level.slope) / gap * (jnp.abs(tube.dq_d) + gain * jnp.abs(x)))
+        error_size = jnp.abs(x) + jnp.abs(tube.q_d)
+        square += jnp.sum(w * (error_size / gap) ** 2 / _ratio_at_centre(barrier, tube))
+        rows.append((x - tube.q_d, xi, gap, distance, tube.k_l, tube.k_u))
+    e, xi, gap, distance, k_l, k_u = map(jnp.stack, zip(*rows, strict=True))
+    size += jnp.sum(jnp.abs(slopes.x) / gap * sizes)
     size += sum(jnp.abs(product) for product in jax.tree.leaves(products))
-    size += decay + by_slopes
-    stacked = {name: jnp.stack(row) for name, row in rows.items()}
+    size += dissipation + by_slopes
     entry = LevelTerms(
-        decay=decay,
+        dissipation=dissipation,
         by_slopes=by_slopes,
         disturbance_terms=disturbance_terms,
         lag=_lag(scenario, at, levels, tubes),
-        alpha_distance=stacked["distance"],
-        k_l=stacked["k_l"],
-        k_u=stacked["k_u"],
+        alpha_distance=distance,
+        k_l=k_l,
+        k_u=k_u,
     )
     return terms._replace(
         V=V,
         dV=jnp.sum(jnp.stack(jax.tree.leaves(products))),
-        e=stacked["e"],
-        xi=stacked["xi"],
+        e=e,
+        xi=xi,
         size=size,
         sqrt_V_size=jnp.sqrt(square),
         claims=terms.claims | {LEVELS.key: entry},
@@ -694,22 +678,6 @@ def _lag(
         effect = plants.transposed_gain(plant, i + 1, at.t, at.x, level.slope)
         total += jnp.sum(effect * (above.q_d - level.alpha))
     return total
-
-
-def _relative_error(scenario: Scenario, i: int, tube: Tube, x: jax.Array) -> jax.Array:
-    """The relative error of level i + 1, (n,); 0 without bounds."""
-    if scenario.context.bounds[i] is None:
-        return jnp.zeros_like(x)
-    return tube.xi(x)
-
-
-def _centre_distance(scenario: Scenario, i: int, tube: Tube) -> jax.Array:
-    """Distance of the centre of the tube of level i + 1 to its bounds, (n,); infinite without
-    bounds.
-    """
-    if scenario.context.bounds[i] is None:
-        return jnp.full_like(tube.q_d, jnp.inf)
-    return jnp.minimum(tube.q_d - tube.lower, tube.upper - tube.q_d)
 
 
 def _ratio_at_centre(barrier: Barrier, tube: Tube) -> jax.Array:

@@ -24,16 +24,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.certificates.claims._base import check_steps, with_status
+from iblf_jax.certificates.claims._base import (
+    centre_distance,
+    check_steps,
+    level_dissipation,
+    stays_inside,
+    with_status,
+    xi_bound,
+)
 from iblf_jax.certificates.claims.own import own_claim
 from iblf_jax.certificates.claims.theorem import (
     CASE_1_COUNTS,
+    SignalSizes,
     Theorem,
     eigenvalues_in,
-    torque_size,
-    torque_sizes,
 )
-from iblf_jax.certificates.claims.two_cases import CASES, along, why_no_decay, why_not_in_loop
+from iblf_jax.certificates.claims.two_cases import CASES, why_no_decay, why_not_in_loop
 from iblf_jax.certificates.lines import (
     Line,
     Statement,
@@ -41,7 +47,6 @@ from iblf_jax.certificates.lines import (
     check_smallest,
     join_notes,
     not_applicable,
-    observed_only,
 )
 from iblf_jax.certificates.summary import Segment, Summary
 from iblf_jax.certificates.terms import (
@@ -49,14 +54,12 @@ from iblf_jax.certificates.terms import (
     Terms,
     TorquePoint,
     adaptive_law,
-    gap,
     inner_context,
+    relative_gap,
 )
 from iblf_jax.control.controllers import BarrierBackstepping
-from iblf_jax.control.controllers._base import decay_of
 from iblf_jax.control.controllers._levels import Level
-from iblf_jax.control.decays._base import gain_at
-from iblf_jax.core import checks, programs
+from iblf_jax.core import checks
 from iblf_jax.core.linalg import solve_spd
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.status import Status
@@ -77,7 +80,9 @@ class MatchedTerms(NamedTuple):
 
     left: jax.Array
     """(V1 + phi)' + decay rates times V1 and phi - s2 . M0^-1 f_tilde + c |s2|^2, () [1/s]."""
-    bound: jax.Array
+    tube: Tube
+    """Of the velocities."""
+    side: jax.Array
     """K of each joint's side, (n,) [rad/s]."""
     alpha_distance: jax.Array
     """Distance of alpha to the velocity bounds, (n,) [rad/s]."""
@@ -89,7 +94,6 @@ class Matched(Theorem):
     """(F.3): the estimation error acts where the law has the gain c."""
 
     key: ClassVar[str] = "matched"
-    equation: ClassVar[str] = "(F.3)"
     conditions: ClassVar[Mapping[int, str]] = {1: "(F.3)", 2: "(F.3)"}
     least: ClassVar[tuple[str, ...]] = (
         "the decay rate of V1",
@@ -125,26 +129,24 @@ class Matched(Theorem):
         """Whether it is about a law of this class."""
         return isinstance(law, BarrierBackstepping)
 
-    def added(self, point: Point, terms: Terms) -> Terms:
+    def with_terms_of_claim(self, point: Point, terms: Terms) -> Terms:
         """The terms at a state with those of this claim."""
-        terms = super().added(point, terms)
+        terms = super().with_terms_of_claim(point, terms)
         assert isinstance(point, TorquePoint)
         law, x, t = point.law, point.x, point.t
         levels, tubes = _levels(point)
         barriers_rate = terms.dV - terms.d_tilde @ terms.dd_tilde
-        decays = by_slopes = jnp.zeros_like(t)
-        for i, (barrier, tube, level) in enumerate(zip(law.barriers, tubes, levels, strict=True)):
-            gain = gain_at(decay_of(law, i), t, law.k[i], barrier, tube, x[i])
-            stated = barrier.decay_rate(gain)
-            if stated is not None:
-                decays += jnp.sum(stated * (law.weights[i] * barrier.value(tube, x[i])))
-            by_slopes += jnp.sum(law.c[i] / law.weights[i] * level.slope**2)
+        dissipation = by_slopes = jnp.zeros_like(t)
+        for i, (level, tube) in enumerate(zip(levels, tubes, strict=True)):
+            of_level, by_slope = level_dissipation(law, i, t, tube, x[i], level.slope)
+            dissipation, by_slopes = dissipation + of_level, by_slopes + by_slope
         growth = levels[1].slope @ solve_spd(point.M0, terms.d_tilde) - by_slopes
         inner = tubes[1]
-        distance = jnp.minimum(inner.q_d - inner.lower, inner.upper - inner.q_d)
+        distance = centre_distance(inner)
         entry = MatchedTerms(
-            left=barriers_rate + decays - growth,
-            bound=jnp.where(x[1] > inner.q_d, inner.k_u, inner.k_l),
+            left=barriers_rate + dissipation - growth,
+            tube=inner,
+            side=jnp.where(x[1] > inner.q_d, inner.k_u, inner.k_l),
             alpha_distance=distance,
             growth=growth,
         )
@@ -158,18 +160,15 @@ class Matched(Theorem):
     def term_sizes(self, point: TorquePoint, terms: Terms) -> tuple[jax.Array, jax.Array]:
         """`Terms.size` and `Terms.sqrt_V_size`, with the terms of phi'."""
         law, dq = point.law, point.x[1]
-        guard = law.barriers[0].guard
-        size, sqrt_V_size = torque_sizes(point, terms, law.k[1], law.weights[0], guard)
+        sizes = SignalSizes(point, law.k[1], law.barriers[0].guard)
+        size, sqrt_V_size = sizes.of_V2(terms, law.weights[0])
         levels, (_, inner) = _levels(point)
-        near = gap(inner.xi(dq), law.barriers[1].guard)
-        torque = torque_size(point, law.k[1], gap(point.now["xi"], guard))
-        unit = jnp.eye(torque.size, dtype=torque.dtype)
+        unit = jnp.eye(dq.size, dtype=dq.dtype)
         inverse = jnp.stack([solve_spd(point.M0, row) for row in unit])
-        accelerations = jnp.abs(point.now["ddq"]) + jnp.abs(point.rates["alpha"])
-        accelerations = accelerations + jnp.sum(jnp.abs(inverse) * torque, axis=1)
-        s2 = jnp.abs(levels[1].slope)
+        acceleration = sizes.acceleration + jnp.sum(jnp.abs(inverse) * sizes.torque, axis=1)
+        s2, gap = jnp.abs(levels[1].slope), relative_gap(inner.xi(dq), law.barriers[1].guard)
         by_slope = jnp.sum(law.c[1] / law.weights[1] * s2**2)
-        return size + ((s2 / near) @ accelerations + by_slope), sqrt_V_size
+        return size + ((s2 / gap) @ acceleration + by_slope), sqrt_V_size
 
     # --- gains and rates --------------------------------------------------------------------------
 
@@ -180,9 +179,10 @@ class Matched(Theorem):
         law: Any = summary.law
         lambda_min = eigenvalues_in(summary, domain).lambda_min
         pairs = zip(law.barriers, law.k, strict=True)
-        decay, decay_phi = (barrier.decay_rate(k) for barrier, k in pairs)
-        c, kf = law.c[1] / law.weights[1], summary.run.scenario.observer.kf
-        return np.asarray(rho_terms(decay, decay_phi, c, kf, lambda_min, case))
+        by_barriers = [np.min(barrier.decay_rate(k)) for barrier, k in pairs]
+        coupling = 0.25 / (np.min(law.c[1] / law.weights[1]) * lambda_min**2)
+        kf = np.min(summary.run.scenario.observer.kf)
+        return np.array([*by_barriers, 2.0 * (kf - LOWEST[case] - coupling)])
 
     def gain_conditions(self, summary: Summary) -> list[Line]:
         """The condition of (F.3) on kf and c, in both cases."""
@@ -200,10 +200,10 @@ class Matched(Theorem):
             note = f"lambda_min(M0) = {lambda_min:.4g} kg m^2 along the run"
             if margin <= 0 < needed:
                 note += f": c > {0.25 / (needed * lambda_min**2):.4g} would do"
-            counts = not (case == 2 and summary.case == 1)
-            if not counts:
+            if not summary.counts(case):
                 note = CASE_1_COUNTS
-            lines.append(check_positive(statement, margin, counts=counts, note=note))
+            line = check_positive(statement, margin, counts=summary.counts(case), note=note)
+            lines.append(line)
         return lines
 
     def rate_statement(self, name: str, case: int) -> Statement:
@@ -267,8 +267,9 @@ class Matched(Theorem):
         self, segment: Segment, V: np.ndarray, w_f: float = 1.0
     ) -> dict[str, np.ndarray]:
         """The bounds by name, with those on xi2 and e2 from phi."""
-        xi2 = along(segment, _xi2_bound, V, segment.sample.q, segment.sample.dq)
-        e2 = np.linalg.norm(xi2 * segment.terms.claims[self.key].bound, axis=1)
+        law, entry = segment.summary.law, segment.terms.claims[self.key]
+        xi2 = xi_bound(law.barriers[1], law.weights[1], V, entry.tube)
+        e2 = np.linalg.norm(xi2 * entry.side, axis=1)
         return super().bounds_along(segment, V, w_f) | {"e2": e2, "xi2, by phi": xi2}
 
     def why_no_bound(self, segment: Segment, name: str, bounds: dict[str, np.ndarray]) -> str:
@@ -282,56 +283,14 @@ class Matched(Theorem):
         """Every velocity inside its bounds, at every step."""
         summary = segment.summary
         statement = Statement("velocities inside", "(F.3)", "v_l < q' < v_u", "rad/s")
-        line = check_smallest(statement, segment.t, segment.terms.distance[:, 1])
-        line = with_status(summary, line, Status.VELOCITY_VIOLATED)
+        why_unclaimed = ""
         if self.case_of(summary) is None:
-            return observed_only(line, self.why_not_in_case(summary, summary.case))
-        return line
+            why_unclaimed = self.why_not_in_case(summary, summary.case)
+        distance, flag = segment.terms.distance[:, 1], Status.VELOCITY_VIOLATED
+        return stays_inside(segment, statement, distance, flag, why_unclaimed)
 
 
 MATCHED = Matched()
-
-
-@programs.jit(static_argnames="case")
-def rho_terms(
-    decay: jax.Array,
-    decay_phi: jax.Array,
-    c: jax.Array,
-    kf: jax.Array,
-    lambda_min: jax.typing.ArrayLike,
-    case: int,
-) -> jax.Array:
-    """The three terms of which rho is the least, (3,) [1/s].
-    (F.3)
-
-    Args:
-      decay, decay_phi: decay rates of V1 and of phi, (n,) each [1/s].
-      c: gain of the slope s2, (n,).
-      kf: gain of the observer, (n,) [1/s].
-      lambda_min: smallest eigenvalue of M0, () [kg m^2].
-      case: 1 for f' = 0, 2 for bounded f'.
-    """
-    coupling = 0.25 / (jnp.min(c) * lambda_min**2)  # type: ignore[operator]
-    by_kf = 2.0 * (jnp.min(kf) - LOWEST[case] - coupling)
-    return jnp.stack([jnp.min(decay), jnp.min(decay_phi), by_kf])
-
-
-@programs.jit
-def _xi2_bound(
-    scenario: Scenario, t: jax.Array, q: jax.Array, dq: jax.Array, V: jax.Array
-) -> jax.Array | None:
-    """The velocity barrier's own bound on |xi2| where phi <= V, (T, n), or None if it states
-    none.
-    """
-    law: Any = unwrapped(scenario.controller)
-    barrier, weight = law.barriers[1], law.weights[1]
-
-    def at(t: jax.Array, q: jax.Array, dq: jax.Array, V: jax.Array) -> jax.Array | None:
-        x = jnp.stack([q, dq])
-        _, (_, inner) = law.levels(t, x, jnp.zeros_like(q), scenario.context, ())
-        return barrier.xi_bound(V / weight, inner)  # type: ignore[no-any-return]
-
-    return jax.vmap(at)(t, q, dq, V)
 
 
 def _levels(point: TorquePoint) -> tuple[list[Level], list[Tube]]:

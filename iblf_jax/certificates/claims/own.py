@@ -23,18 +23,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.certificates.claims._base import Claim, check_steps
+from iblf_jax.certificates.claims._base import Claim, check_steps, other_actuator
 from iblf_jax.certificates.lines import OWN_INEQUALITY, Line, Statement, not_applicable
 from iblf_jax.certificates.summary import Segment, Summary
-from iblf_jax.certificates.terms import Point, Terms, TorquePoint
-from iblf_jax.control.actuators import Ideal
+from iblf_jax.certificates.terms import Point, Terms, TorquePoint, receives_q_dq
 from iblf_jax.control.controllers import Law, LyapunovLaw, RobotLaw, Saturated, TrackingLaw
 from iblf_jax.control.controllers._base import contract_of, law_of_x
 from iblf_jax.core import checks
 from iblf_jax.core.attributes import attributes
 from iblf_jax.core.families import is_default
 from iblf_jax.core.linalg import solve_spd
-from iblf_jax.core.pytree import unwrapped
 from iblf_jax.simulation.scenario import Scenario
 
 METHODS = ("lyapunov", "decay")
@@ -46,7 +44,7 @@ TORQUE_TERMS = "dV/dq' . M0^-1 f_tilde + dV/df_tilde . f'"
 TORQUE_OF_ESTIMATES = " + dV/dq' . M0^-1 (tau(x_hat) - tau(x))"
 """What the error of estimated levels adds to T."""
 ROUNDING = 8.0
-"""Relative errors of the derivatives of a law's own V, in those of their terms."""
+"""Rounding error of V' of a law's own V, in units of that of its terms."""
 
 
 class OwnTerms(NamedTuple):
@@ -55,7 +53,7 @@ class OwnTerms(NamedTuple):
     V: jax.Array
     dV: jax.Array
     """V', exact, in the unit of V a second."""
-    decay: jax.Array
+    dissipation: jax.Array
     """W."""
     disturbance_terms: jax.Array
     """T."""
@@ -65,14 +63,13 @@ class OwnTerms(NamedTuple):
     @property
     def left_side(self) -> Any:
         """V' + W - T, which must not be positive."""
-        return self.dV + self.decay - self.disturbance_terms
+        return self.dV + self.dissipation - self.disturbance_terms
 
 
 class OwnClaim(Claim):
     """What a law states about itself."""
 
     key: ClassVar[str] = "own"
-    equation: ClassVar[str] = "own"
 
     def why_not(self, scenario: Scenario) -> str:
         """Why a law states nothing about itself; "" if it does.
@@ -87,22 +84,17 @@ class OwnClaim(Claim):
     def why_not_in_run(self, summary: Summary) -> str:
         """Why it does not apply to a run; "" if it does."""
         scenario = summary.run.scenario
-        if not isinstance(scenario.actuator, Ideal):
-            kind = checks.with_article(type(scenario.actuator).__name__)
+        actuator = other_actuator(scenario)
+        if actuator:
             about = "the law's own claim is about a torque that acts as it is commanded"
-            return f"{about}, not about {kind}"
-        reason = _why_not_with_estimates(scenario)
-        if reason:
-            return reason
-        if summary.excluded == summary.samples:
-            return f"{summary.why_excluded} all the time"
-        return summary.why_invalid
+            return f"{about}, not about {actuator}"
+        return _why_not_with_estimates(scenario) or summary.why_never or summary.why_invalid
 
     def applies(self, summary: Summary) -> bool:
         """Whether the claim is made about a run."""
         return self in summary.claims and not self.why_not_in_run(summary)
 
-    def added(self, point: Point, terms: Terms) -> Terms:
+    def with_terms_of_claim(self, point: Point, terms: Terms) -> Terms:
         """The terms at a state with those of this claim."""
         scenario, t = point.scenario, point.t
         law: Any = own_claim(scenario)
@@ -120,41 +112,47 @@ class OwnClaim(Claim):
         dx = point.rate.x[: len(point.x)]
         direction = (jnp.ones_like(t), dx, dd_tilde, own_rate)
         V, dV = jax.jvp(lyapunov, at, direction)
-        decay = jnp.sum(of_x.decay(t, point.x, d_tilde, context, own_state))
+        W = jnp.sum(of_x.decay(t, point.x, d_tilde, context, own_state))
         slopes = jax.grad(lyapunov, argnums=(0, 1, 2, 3))(*at)
         if states_disturbance_terms(law):
             T = jnp.sum(of_x.disturbance_terms(t, point.x, d_tilde, dd, context, own_state))
         else:
-            T = point.effect(slopes[1], d_tilde) + jnp.sum(slopes[2] * dd)
+            T = point.disturbance_power(slopes[1], d_tilde) + jnp.sum(slopes[2] * dd)
             if isinstance(point, TorquePoint) and scenario.loop.observer.completes:
                 # The law received estimates: what that changes of the torque acts like f_tilde.
                 f_hat = point.now["disturbance_estimate"]
-                command, _ = of_x.command(t, point.x, f_hat, context, point.state.controller)
+                command, _ = of_x.command(t, point.x, f_hat, context, own_state)
                 T += slopes[1][1] @ solve_spd(point.M0, point.now["tau"] - command.tau)
         products = jax.tree.map(lambda a, b: jnp.sum(jnp.abs(a * b)), slopes, direction)
         size = sum(jax.tree.leaves(products)) + point.rate_size(slopes[1])
-        entry = OwnTerms(V, dV, decay, T, size + jnp.abs(decay) + jnp.abs(T))
+        entry = OwnTerms(V, dV, W, T, size + jnp.abs(W) + jnp.abs(T))
         terms = terms._replace(claims=terms.claims | {self.key: entry})
         if not isinstance(point, TorquePoint) or law is scenario.controller:
             return terms
         limited = point.differs_from_command(law, own_state)
         return terms._replace(excluded=terms.excluded | limited)
 
+    def on_traces(self, segment: Segment, traces: Any) -> Any:
+        """Curves with V and the left side of this claim."""
+        own = segment.terms.claims[self.key]
+        return traces._replace(V=own.V, left=own.left_side)
+
     def lines(self, segment: Segment) -> list[Line]:
         """The lines of the law's claim about itself for one segment."""
         summary, own = segment.summary, segment.terms.claims[self.key]
         scenario = summary.run.scenario
         law: Any = own_claim(scenario)
-        general = TORQUE_TERMS if is_about_torque(scenario) else LEVEL_TERMS
+        general = TORQUE_TERMS if receives_q_dq(scenario) else LEVEL_TERMS
         right_side = "what the law states" if states_disturbance_terms(law) else general
         if scenario.loop.observer.completes:
             right_side += TORQUE_OF_ESTIMATES
         decay = "W >= 0: the decay that the law states"
         inequality = f"V' <= -W + T,  T: {right_side}"
+        W = own.dissipation
         # Near 0, V and W are differences of numbers as large as their largest values.
         checked = (
             (Statement("own V", "own", "V >= 0", "1"), own.V, np.max(np.abs(own.V))),
-            (Statement("own decay", "own", decay, "1/s"), own.decay, np.max(np.abs(own.decay))),
+            (Statement("own decay", "own", decay, "1/s"), W, np.max(np.abs(W))),
             (Statement(OWN_INEQUALITY, "own", inequality, "1/s"), -own.left_side, own.size),
         )
         reason = self.why_not_in_run(summary)
@@ -170,11 +168,6 @@ class OwnClaim(Claim):
 OWN = OwnClaim()
 
 
-def is_about_torque(scenario: Scenario) -> bool:
-    """Whether the law of a scenario receives q and q', so that its claims are about a torque."""
-    return isinstance(unwrapped(scenario.controller), RobotLaw)
-
-
 def _why_not_with_estimates(scenario: Scenario) -> str:
     """Why the law's claim does not apply to estimated levels; "" if it does.
 
@@ -186,7 +179,7 @@ def _why_not_with_estimates(scenario: Scenario) -> str:
     law: Any = own_claim(scenario)
     kind = type(scenario.observer).__name__
     about = f"the law's own claim is about a measured state, and {kind} estimates levels"
-    if not is_about_torque(scenario):
+    if not receives_q_dq(scenario):
         return about
     if states_disturbance_terms(law):
         return f"{about}; the T that the law states does not contain their error"

@@ -32,16 +32,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.certificates.claims._base import Claim, check_steps
+from iblf_jax.certificates.claims._base import Claim, check_steps, other_actuator
 from iblf_jax.certificates.claims.levels import LEVELS
 from iblf_jax.certificates.claims.matched import MATCHED
 from iblf_jax.certificates.lines import Line, Statement, join_notes, not_applicable
 from iblf_jax.certificates.summary import ENERGY_ROUNDING, Segment, Summary
-from iblf_jax.control.actuators import Ideal
+from iblf_jax.certificates.terms import TORQUE
 from iblf_jax.control.controllers import Backstepping, BarrierBackstepping
 from iblf_jax.control.controllers._base import decay_of
 from iblf_jax.control.decays._base import energy_gain
-from iblf_jax.core import checks, programs
+from iblf_jax.core import programs
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.simulation.scenario import Scenario
 
@@ -119,7 +119,8 @@ def least_decay(law: Any, mu: jax.Array, t: jax.Array, E: jax.Array) -> jax.Arra
     if isinstance(law, Backstepping):
         decay = decay_of(law, 1)
         rows.append(jax.vmap(lambda W: 2.0 * (mu + energy_gain(decay, t, W, law.k1)) * W)(values))
-    # Row m of the table has the indices m - i, where i is the share of the parts before.
+    # Min-plus convolution: row m of the table has the indices m - i, where i is the share of the
+    # parts before.
     rest = np.arange(SHARES + 1)[:, None] - np.arange(SHARES + 1)[None, :]
     total = rows[0]
     for row in rows[1:]:
@@ -199,7 +200,6 @@ class Settling(Claim):
     """The settling time that decays of a law predict."""
 
     key: ClassVar[str] = "settling"
-    equation: ClassVar[str] = "(D.2)"
 
     def why_not(self, scenario: Scenario) -> str:
         """Why a law predicts no settling time; "" if it has a decay that is not exponential."""
@@ -218,15 +218,12 @@ class Settling(Claim):
         """Why (D.2) does not apply to a run; "" if it does."""
         if LEVELS in summary.claims:
             return LEVELS.why_not_in_run(summary)
-        actuator = summary.run.scenario.actuator
-        if not isinstance(actuator, Ideal):
-            name = checks.with_article(type(actuator).__name__)
-            return f"(D.2) is about a torque that acts as it is commanded, not about {name}"
-        if summary.excluded == summary.samples:
-            return f"{summary.why_excluded} all the time"
-        return summary.why_invalid
+        actuator = other_actuator(summary.run.scenario)
+        if actuator:
+            return f"(D.2) is about a torque that acts as it is commanded, not about {actuator}"
+        return summary.why_never or summary.why_invalid
 
-    def gathered(self, segment: Segment) -> Course:
+    def segment_data(self, segment: Segment) -> Course:
         """The course of E along a segment."""
         terms = segment.terms
         eps = float(np.finfo(terms.V.dtype).eps)
@@ -246,19 +243,19 @@ class Settling(Claim):
         why_not = self.why_not_in_run(summary)
         if why_not:
             return [not_applicable(INEQUALITY, why_not)]
-        decay = terms.claims["torque"].decay
+        dissipation = terms.claims[TORQUE].dissipation
         rate = terms.dV - np.sum(terms.d_tilde * terms.dd_tilde, axis=1)
-        tolerance = summary.eps * (terms.size + np.abs(decay))
+        tolerance = summary.eps * (terms.size + np.abs(dissipation))
         note = join_notes(summary.exclusion_note(), summary.restart_note("f"))
-        margins = _growth(segment) - rate - decay
+        margins = _growth(segment) - rate - dissipation
         return [check_steps(segment, INEQUALITY, margins, tolerance, note=note)]
 
-    def conclusions(
-        self, summary: Summary, gathered: list[Any], lines: Mapping[str, Line]
+    def run_lines(
+        self, summary: Summary, data: list[Any], lines: Mapping[str, Line]
     ) -> Iterable[Line]:
         """The lines about the settling time of a run."""
         law: Any = summary.law
-        course = Course(*map(np.concatenate, zip(*gathered, strict=True)))
+        course = Course(*map(np.concatenate, zip(*data, strict=True)))
         why_not = self.why_not_in_run(summary) or _why_not_from_the_start(summary, course)
         band, deadline = _band(law), _deadline(law)
         statements = []
@@ -269,8 +266,8 @@ class Settling(Claim):
         if why_not:
             return [not_applicable(statement, why_not) for statement in statements]
         rho2 = max(float(np.max(course.growth)), 0.0)
-        mu, start, end = float(summary.extrema.mu), float(course.total[0]), float(course.t[-1])
-        times, v = predicted(law, mu, start, rho2, end)
+        mu = float(getattr(summary.extrema, "mu", np.inf))  # levels have no K2
+        times, v = predicted(law, mu, float(course.total[0]), rho2, float(course.t[-1]))
         found = []
         if np.isfinite(band):
             found.append(_time_line(course, times, v, band, rho2))
@@ -288,7 +285,7 @@ def _growth(segment: Segment) -> np.ndarray:
     for claim in (LEVELS, MATCHED):
         if claim.key in terms.claims:
             return terms.claims[claim.key].growth  # type: ignore[no-any-return]
-    dropped = terms.claims["torque"].dropped_e2
+    dropped = terms.claims[TORQUE].dropped_e2
     return np.sum(terms.e[:, 1] * terms.d_tilde, axis=1) + dropped  # type: ignore[no-any-return]
 
 

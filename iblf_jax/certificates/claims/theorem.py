@@ -27,6 +27,7 @@ w s . lambda on the right side (A.3).
 from __future__ import annotations
 
 import dataclasses
+import operator
 from collections.abc import Iterable, Mapping
 from typing import Any, ClassVar, NamedTuple
 
@@ -34,7 +35,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.certificates.claims._base import ShownClaim, check_steps, with_status
+from iblf_jax.certificates.claims._base import (
+    MainClaim,
+    at_recorded,
+    check_steps,
+    reference_inside,
+    stays_inside,
+    unclaimed,
+)
 from iblf_jax.certificates.claims.own import OWN
 from iblf_jax.certificates.claims.two_cases import (
     CASES,
@@ -43,7 +51,7 @@ from iblf_jax.certificates.claims.two_cases import (
     TwoCases,
     gains_of,
     why_no_theorem,
-    xi_bound,
+    xi_bound_along,
 )
 from iblf_jax.certificates.claims.weighted import WEIGHTED
 from iblf_jax.certificates.lines import (
@@ -56,23 +64,24 @@ from iblf_jax.certificates.lines import (
     finite,
     join_notes,
     not_applicable,
-    observed_only,
 )
 from iblf_jax.certificates.result import Traces
-from iblf_jax.certificates.summary import Decay, Segment, Summary
+from iblf_jax.certificates.summary import DecayBound, Extremum, Segment, Summary, largest_norm
 from iblf_jax.certificates.terms import (
+    TORQUE,
     Point,
     Terms,
     TorquePoint,
     adaptive_law,
     covers_limit,
-    gap,
+    relative_gap,
 )
 from iblf_jax.control.controllers import Backstepping
 from iblf_jax.control.controllers._base import decay_of
 from iblf_jax.control.decays._base import energy_gain, gain_at
 from iblf_jax.control.observers import AsPublished, Momentum
 from iblf_jax.core import programs
+from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.status import Status
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import has, margin_of
@@ -96,7 +105,6 @@ NOT_NEEDED = (
 CASE_1_COUNTS = "f' = 0 on this run, so case 1 decides"
 BOUNDED = Statement("f bounded", "Assumption 1", "|f| <= F_m", "N m")
 RATE_BOUNDED = Statement("f' bounded", "Assumption 1", "|f'| <= F_d between jumps", "N m/s")
-REFERENCE_INSIDE = Statement("reference inside", "Assumption 2", "k_lc < x_d < k_uc", "rad")
 START_INSIDE = Statement("start inside", "Theorem 2", "k_lc(0) < q(0) < k_uc(0)", "rad")
 LIMITED = Statement(
     "inequality, limited torque",
@@ -132,7 +140,7 @@ class TorqueTerms(NamedTuple):
     torque in f is constant."""
     auxiliary: Any = ()
     """`AuxiliaryTerms` of a law that takes the shift of the limit around it."""
-    decay: Any = ()
+    dissipation: Any = ()
     """sum w V1 rate(k1(t, V1)) + e2^T K2 e2 + 2 g(t, W) W of a `Backstepping` law with decays, ()
     [1/s]."""
 
@@ -140,17 +148,16 @@ class TorqueTerms(NamedTuple):
 class AuxiliaryTerms(NamedTuple):
     """The terms of (A.3) at one instant."""
 
-    growth: jax.Array
+    power: jax.Array
     """w s . lambda, ()."""
     excluded: jax.Array
     """Whether the guard at the bound is active, or alpha outside its bounds, () bool."""
 
 
-class Theorem(TwoCases, ShownClaim):
+class Theorem(TwoCases, MainClaim):
     """Theorem 2."""
 
     key: ClassVar[str] = "theorem"
-    equation: ClassVar[str] = "(3.16)"
     in_words: ClassVar[str] = "the paper's theorem"
     inequalities: ClassVar[Mapping[int, Statement]] = {
         1: Statement("inequality, case 1", "(3.18)", "V2' + rho V2 <= 0", "1/s"),
@@ -171,22 +178,15 @@ class Theorem(TwoCases, ShownClaim):
         """Why Theorem 2 claims nothing about a scenario, in words; "" if it does."""
         return why_no_theorem(scenario)
 
-    def why_not_in_case(self, summary: Summary, case: int) -> str:
-        """Why a case does not apply to a run; "" if it does."""
-        reason = self.why_not_in_run(summary)
-        if reason:
-            return reason
-        if case == 1 and summary.case == 2:
-            return f"case 1 is for f' = 0; here |f'| reaches {summary.F_d:.4g} N m/s, see case 2"
-        if not summary.decays[self.key, case].rho > 0:
+    def why_no_rate(self, summary: Summary, case: int) -> str:
+        """Why a case has no positive rate; "" if it has one."""
+        if not summary.decay_bounds[self.key, case].rho > 0:
             return f"the gain conditions {self.conditions[case]} are not met"
-        if summary.excluded == summary.samples:
-            return f"{summary.why_excluded} all the time"
         return ""
 
     # --- the terms --------------------------------------------------------------------------------
 
-    def added(self, point: Point, terms: Terms) -> Terms:
+    def with_terms_of_claim(self, point: Point, terms: Terms) -> Terms:
         """The terms at a state with those of this claim."""
         assert isinstance(point, TorquePoint)
         scenario = point.scenario
@@ -206,14 +206,14 @@ class Theorem(TwoCases, ShownClaim):
                 # A wrapper around the law changed its torque.
                 excluded |= point.differs_from_command(law, ())
             if isinstance(law, Backstepping):
-                entry = entry._replace(decay=_decay_of_backstepping(point, terms.e[1]))
+                entry = entry._replace(dissipation=_dissipation_of_backstepping(point, terms.e[1]))
         if covers_limit(scenario):
             entry = entry._replace(auxiliary=_auxiliary_terms(point))
         return terms._replace(
             size=size,
             sqrt_V_size=sqrt_V_size,
             excluded=excluded,
-            claims=terms.claims | {"torque": entry},
+            claims=terms.claims | {TORQUE: entry},
         )
 
     def has_law(self, law: Any) -> bool:
@@ -224,7 +224,7 @@ class Theorem(TwoCases, ShownClaim):
         """`Terms.size` and `Terms.sqrt_V_size`."""
         law = point.law
         guard = -1.0 if law.barrier is None else law.barrier.guard
-        return torque_sizes(point, terms, law.K2, law.weight, guard)
+        return SignalSizes(point, law.K2, guard).of_V2(terms, law.weight)
 
     # --- the constants ----------------------------------------------------------------------------
 
@@ -236,6 +236,26 @@ class Theorem(TwoCases, ShownClaim):
         gains = gains_of(summary.run.scenario)
         return np.asarray(rho_terms(gains, source.lambda_max, case))
 
+    def extrema(self, scenario: Scenario, terms: Terms) -> dict[str, Extremum]:
+        """Extreme eigenvalues of M0 [kg m^2] and of M0^-1 K2 [1/s], sup |f'| and whether f' = 0 at
+        every step.
+        """
+        torque, law = terms.claims[TORQUE], unwrapped(scenario.controller)
+        M0 = np.asarray(torque.M0)
+        eigenvalues, mu = _eigenvalues(M0), np.nan
+        if isinstance(law, Backstepping):
+            root = np.asarray(law.K2**0.5)
+            mu = (1.0 / _eigenvalues(M0 / (root[:, None] * root[None, :]))[:, -1]).min()
+        half_square = 0.5 * np.sum(terms.d_tilde[0] ** 2)
+        return {
+            "dd": Extremum(np.maximum, largest_norm(terms.dd)),
+            "steady": Extremum(operator.and_, bool(torque.steady.all())),
+            "lambda_min": Extremum(np.minimum, eigenvalues[:, 0].min()),
+            "lambda_max": Extremum(np.maximum, eigenvalues[:, -1].max()),
+            "mu": Extremum(np.minimum, mu),
+            "half_square_start": Extremum(lambda first, _: first, half_square),
+        }
+
     def constants(self, summary: Summary) -> dict[tuple[int, str], np.ndarray]:
         """The terms of rho by case and domain; none where the claim does not apply."""
         if self.why_not(summary.run.scenario):
@@ -246,11 +266,11 @@ class Theorem(TwoCases, ShownClaim):
             for domain in DOMAINS
         }
 
-    def decays(self, summary: Summary) -> dict[int, Decay]:
+    def decay_bounds(self, summary: Summary) -> dict[int, DecayBound]:
         """Case -> constants of the decay."""
         rho2 = {1: 0.0, 2: summary.F_d**2 / 2}
         return {
-            case: Decay(float(np.min(terms)), rho2[case], 1.0, 0.5)
+            case: DecayBound(float(np.min(terms)), rho2[case], 1.0, 0.5)
             for (case, domain), terms in summary.constants[self.key].items()
             if domain == "run"
         }
@@ -284,7 +304,7 @@ class Theorem(TwoCases, ShownClaim):
 
     def assumptions(self, segment: Segment) -> list[Line]:
         """Bounds of Assumption 1 along the run, and feasibility of the reference, Assumption 2."""
-        summary, sample, terms = segment.summary, segment.sample, segment.terms
+        summary, terms = segment.summary, segment.terms
         df_norm = np.linalg.norm(terms.dd, axis=1)
         if summary.case == 1:
             df_norm = 0.0 * df_norm
@@ -292,16 +312,10 @@ class Theorem(TwoCases, ShownClaim):
         if summary.jumps.size:
             note = self.exclusion_note(summary)
             jump_note = f"Assumption 1 is broken by a jump of f: {note}"
-        distance = np.minimum(sample.q_d - sample.lower, sample.upper - sample.q_d)
-        reference = check_smallest(REFERENCE_INSIDE, segment.t, distance)
-        if not has(summary.run, "slack"):
-            # A safety filter keeps its bounds for any reference, so its status does not show
-            # whether the reference is inside them.
-            reference = with_status(summary, reference, Status.INFEASIBLE_REFERENCE)
         lines = [
             finite(BOUNDED, segment.t, np.linalg.norm(terms.d, axis=1)),
             finite(RATE_BOUNDED, segment.t, df_norm, jump_note),
-            reference,
+            reference_inside(segment),
         ]
         if segment.t[0] == 0:
             lines.append(check_smallest(START_INSIDE, segment.t, terms.distance[:1, 0]))
@@ -309,7 +323,7 @@ class Theorem(TwoCases, ShownClaim):
 
     # --- gains and rates --------------------------------------------------------------------------
 
-    def gains(self, summary: Summary) -> list[Line]:
+    def gain_lines(self, summary: Summary) -> list[Line]:
         """The gain conditions, and the rates along the run and over the admissible box."""
         lines = self.gain_conditions(summary)
         for case in CASES:
@@ -328,7 +342,7 @@ class Theorem(TwoCases, ShownClaim):
         conditions = (
             (K2, gains.K2 - LOWEST_K2, True),
             (kf_1, gains.kf - LOWEST_KF[1], True),
-            (kf_2, gains.kf - LOWEST_KF[2], summary.case == 2),
+            (kf_2, gains.kf - LOWEST_KF[2], summary.counts(2)),
         )
         lines = []
         for statement, above_lowest, counts in conditions:
@@ -372,7 +386,7 @@ class Theorem(TwoCases, ShownClaim):
             rho,
             value=rho,
             note=f"{eigenvalue}{searched}; set by {self.least[np.argmin(terms)]}",
-            counts=not (case == 2 and summary.case == 1),
+            counts=summary.counts(case),
         )
         return _unless_replaced(summary, line)
 
@@ -381,7 +395,7 @@ class Theorem(TwoCases, ShownClaim):
     def lines(self, segment: Segment) -> list[Line]:
         """The lines about every step of one segment."""
         lines = self.decay_lines(segment)
-        if segment.terms.claims["torque"].auxiliary:
+        if segment.terms.claims[TORQUE].auxiliary:
             lines.append(self._limited_inequality(segment))
         return [*lines, *self._dropped_lines(segment), self._joints_inside(segment)]
 
@@ -406,15 +420,15 @@ class Theorem(TwoCases, ShownClaim):
         torque included.
         """
         summary, terms = segment.summary, segment.terms
-        case, auxiliary = summary.case, terms.claims["torque"].auxiliary
+        case, auxiliary = summary.case, terms.claims[TORQUE].auxiliary
         reason = self.why_not_in_run(summary)
-        if not reason and not summary.decays[self.key, case].rho > 0:
+        if not reason and not summary.decay_bounds[self.key, case].rho > 0:
             reason = "the gain conditions are not met"
         if reason:
             return not_applicable(LIMITED, reason)
-        margins = auxiliary.growth - self.left_side(segment, case)
-        rho = summary.decays[self.key, case].rho
-        size = terms.size + rho * terms.V + np.abs(auxiliary.growth)
+        margins = auxiliary.power - self.left_side(segment, case)
+        rho = summary.decay_bounds[self.key, case].rho
+        size = terms.size + rho * terms.V + np.abs(auxiliary.power)
         largest = float(np.max(np.abs(summary.run.auxiliary)))
         note = f"max |lambda| = {largest:.4g} rad/s; instants with a limited torque are included"
         tolerances = summary.eps * size
@@ -430,7 +444,7 @@ class Theorem(TwoCases, ShownClaim):
 
     def _dropped_parts(self, segment: Segment) -> list[tuple[Statement, np.ndarray, str]]:
         """The dropped terms, their sizes, and why a proof drops none."""
-        torque, summary = segment.terms.claims["torque"], segment.summary
+        torque, summary = segment.terms.claims[TORQUE], segment.summary
         of_observer = ""
         if isinstance(summary.run.scenario.observer, Momentum):
             of_observer = "the claim is exact: the observer has momentum form"
@@ -441,7 +455,7 @@ class Theorem(TwoCases, ShownClaim):
 
     def _margin_of_proof(self, segment: Segment, case: int) -> np.ndarray:
         """The margin that the proof leaves for the dropped terms, (T,)."""
-        torque = segment.terms.claims["torque"]
+        torque = segment.terms.claims[TORQUE]
         dropped = torque.dropped_e2 + torque.dropped_f
         return dropped - self.left_side(segment, case)  # type: ignore[no-any-return]
 
@@ -468,7 +482,7 @@ class Theorem(TwoCases, ShownClaim):
             lines.append(line)
         return lines
 
-    def gathered(self, segment: Segment) -> dict[str, float]:
+    def segment_data(self, segment: Segment) -> dict[str, float]:
         """The largest share that each dropped term has of its margin."""
         summary, terms = segment.summary, segment.terms
         case = self.case_of(summary)
@@ -483,59 +497,53 @@ class Theorem(TwoCases, ShownClaim):
             shares[statement.name] = float(np.max(share))
         return shares
 
-    def conclusions(
-        self, summary: Summary, gathered: list[Any], lines: Mapping[str, Line]
+    def run_lines(
+        self, summary: Summary, data: list[Any], lines: Mapping[str, Line]
     ) -> Iterable[Line]:
         """The lines about dropped terms, with the largest share that they have of their margins."""
-        for name in dict.fromkeys(name for shares in gathered for name in shares):
-            share = max(0.0, *(shares.get(name, 0.0) for shares in gathered))
+        for name in dict.fromkeys(name for shares in data for name in shares):
+            share = max(0.0, *(shares.get(name, 0.0) for shares in data))
             note = f"at most {100 * share:.3g} % of that margin at one instant"
             yield dataclasses.replace(lines[name], note=note)
 
-    # --- conclusions and curves -------------------------------------------------------------------
+    # --- inside the bounds, curves ----------------------------------------------------------------
 
     def _joints_inside(self, segment: Segment) -> Line:
         """Properties (I) and (II): every joint inside its bounds, at every step."""
         summary = segment.summary
         statement = Statement("joints inside", "(I), (II)", "|xi_i| < 1: -k_l < e1 < k_u")
-        line = check_smallest(statement, segment.t, 1.0 - np.abs(segment.sample.xi))
-        line = with_status(summary, line, Status.BOUND_VIOLATED)
-        case = self.case_of(summary)
+        case, why_unclaimed = self.case_of(summary), ""
         if case is None and WEIGHTED.replaces_theorem(summary):
             case = WEIGHTED.case_of(summary)
         if case is None:
-            return observed_only(line, self.why_not_in_case(summary, summary.case))
-        scenario, first = summary.run.scenario, segment.terms.V[:1]
-        if xi_bound(scenario, segment.t[:1], first) is None:
-            return observed_only(line, NO_BOUND)
-        return line
+            why_unclaimed = self.why_not_in_case(summary, summary.case)
+        elif np.all(np.isnan(xi_bound_along(segment, segment.terms.V))):
+            why_unclaimed = NO_BOUND
+        margins = 1.0 - np.abs(segment.sample.xi)
+        return stays_inside(segment, statement, margins, Status.BOUND_VIOLATED, why_unclaimed)
 
     def traces(self, segment: Segment) -> Traces:
         """The curves of the figure.  For a law that has only a claim about itself, V and the left
         side are those of that claim.
         """
         summary, sample, terms = segment.summary, segment.sample, segment.terms
-        case, torque = self.case_of(summary), terms.claims["torque"]
+        case, torque = self.case_of(summary), terms.claims[TORQUE]
         traces = _unclaimed_traces(segment.t, terms.V, sample.xi, terms.e[:, 1], terms.d_tilde)
         dropped = torque.dropped_e2 + torque.dropped_f
         traces = traces._replace(dropped=dropped, excluded=terms.excluded)
-        left = traces.left
         if case is not None:
             envelope = segment.envelopes[self.key, case].bound
-            left = self.left_side(segment, case)
             bounds = self.bounds_along(segment, envelope)
             traces = traces._replace(
                 envelope=envelope,
+                left=self.left_side(segment, case),
                 xi_bound=bounds["xi, by V1"],
                 e2_bound=bounds["e2"],
                 f_tilde_bound=bounds["f_tilde"],
             )
         elif OWN.applies(summary):
-            own = terms.claims[OWN.key]
-            left = own.left_side
-            traces = traces._replace(V=own.V, dropped=np.zeros_like(left))
-        traces = traces._replace(left=np.where(terms.excluded, np.nan, left))
-        return Traces(*(x[segment.recorded] for x in traces))
+            traces = OWN.on_traces(segment, traces)._replace(dropped=np.zeros_like(dropped))
+        return at_recorded(segment, traces)  # type: ignore[no-any-return]
 
     def unclaimed_traces(self, run: Any) -> Traces:
         """The curves of a run of which nothing is claimed."""
@@ -544,6 +552,15 @@ class Theorem(TwoCases, ShownClaim):
 
 
 THEOREM = Theorem()
+
+
+def _eigenvalues(matrices: np.ndarray) -> np.ndarray:
+    """Eigenvalues of symmetric matrices, ascending, (T, n); NaN where a matrix is not finite, for
+    which NumPy would raise.
+    """
+    finite = np.all(np.isfinite(matrices), axis=(1, 2), keepdims=True)
+    unit = np.eye(matrices.shape[-1])
+    return np.where(finite[..., 0], np.linalg.eigvalsh(np.where(finite, matrices, unit)), np.nan)
 
 
 def eigenvalues_in(summary: Summary, domain: str) -> Any:
@@ -562,7 +579,7 @@ def rho_terms(gains: Gains, lambda_max: jax.typing.ArrayLike, case: int) -> jax.
       case: 1 for f' = 0, 2 for bounded f'.
     """
     return jnp.stack([
-        jnp.min(gains.decay),
+        jnp.min(gains.decay_rate),
         2.0 * jnp.min(gains.K2 - LOWEST_K2) / lambda_max,
         2.0 * jnp.min(gains.kf - LOWEST_KF[case]),
     ])  # fmt: skip
@@ -580,20 +597,14 @@ def _unless_replaced(summary: Summary, line: Line) -> Line:
 
 def _unclaimed_traces(t: Any, V: Any, xi: Any, e2: Any, f_tilde: Any) -> Traces:
     """The curves of samples of which nothing is claimed."""
-    nan = np.full(t.shape, np.nan)
-    return Traces(
-        t=t,
+    return unclaimed(  # type: ignore[no-any-return]
+        Traces,
+        t,
         V=V,
-        envelope=nan,
-        left=nan,
-        dropped=nan,
         xi=xi,
         xi_bound=np.full(xi.shape, np.nan),
         e2=np.linalg.norm(e2, axis=1),
-        e2_bound=nan,
         f_tilde=np.linalg.norm(f_tilde, axis=1),
-        f_tilde_bound=nan,
-        excluded=np.ones(t.shape, bool),
     )
 
 
@@ -630,8 +641,8 @@ def _auxiliary_terms(point: TorquePoint) -> AuxiliaryTerms:
     return AuxiliaryTerms(jnp.sum(point.now["s"] * sample.auxiliary), excluded)
 
 
-def _decay_of_backstepping(point: TorquePoint, e2: jax.Array) -> Any:
-    """The decay of sum w V1 + 1/2 e2^T M0 e2 with the gains of this instant, (); `()` for a law
+def _dissipation_of_backstepping(point: TorquePoint, e2: jax.Array) -> Any:
+    """Dissipation of sum w V1 + 1/2 e2^T M0 e2 with the gains of this instant, (); `()` for a law
     without decays or a barrier without a rate.
     """
     law, t, q = point.law, point.t, point.state.q
@@ -641,74 +652,60 @@ def _decay_of_backstepping(point: TorquePoint, e2: jax.Array) -> Any:
     stated = law.barrier.decay_rate(gain_at(decay_of(law, 0), t, law.k1, law.barrier, tube, q))
     if stated is None:
         return ()
-    decay = jnp.sum(law.weight * stated * law.barrier.value(tube, q)) + e2 @ (law.K2 * e2)
+    dissipation = jnp.sum(law.weight * stated * law.barrier.value(tube, q)) + e2 @ (law.K2 * e2)
     W = 0.5 * e2 @ (point.M0 @ e2)
     second = decay_of(law, 1)
     if second.constant:
-        return decay
-    return decay + 2.0 * energy_gain(second, t, W, e2) * W
+        return dissipation
+    return dissipation + 2.0 * energy_gain(second, t, W, e2) * W
 
 
-def torque_sizes(
-    point: TorquePoint, terms: Terms, K2: Any, weight: Any, guard: float
-) -> tuple[jax.Array, jax.Array]:
-    """Sum of the absolute values of the terms of V2', and error of sqrt(2 V2) for a relative error
-    of 1, () each.
+class SignalSizes:
+    """Sums of the absolute values of the terms of signals: rounding is relative to them.
 
     Args:
       point: of the loop.
-      terms: there.
       K2: gain of the velocity error, (n,), or None.
-      weight: of V1, (n,), or None for 1.
       guard: of the barrier on e1.
     """
-    scenario, state, M0 = point.scenario, point.state, point.M0
-    now, rates = point.now, point.rates
-    zero = jnp.zeros_like(state.q)
-    K2 = zero if K2 is None else K2
-    kf = zero if scenario.observer.kf is None else scenario.observer.kf
-    near = gap(now["xi"], guard)
-    speeds = speed_size(point)
-    accelerations = jnp.abs(now["ddq"]) + jnp.abs(rates["alpha"])
-    torque = torque_size(point, K2, near)
-    torque_rate = (
-        jnp.abs(M0) @ jnp.abs(rates["ddq"])
-        + jnp.abs(rates["tau"])
-        + jnp.abs(rates["disturbance_estimate"])
-        + K2 * accelerations
-        + kf * torque
-        + (jnp.abs(rates["s"]) + jnp.abs(now["s"]) * speeds) / near
-    )
-    size = (
-        speeds @ (jnp.abs(now["s"]) / near + torque)
-        + (jnp.abs(terms.d_tilde) + jnp.abs(terms.dd)) @ torque_rate
-        + torque @ jnp.abs(terms.dd_tilde)
-    )
-    tube = scenario.context.tube(point.t)
-    width = jnp.minimum(tube.k_l, tube.k_u)
-    weight = jnp.ones_like(width) if weight is None else weight
-    V_size = (
-        jnp.sum(weight * (jnp.abs(state.q) / (width * near)) ** 2)
-        + speeds @ (jnp.abs(M0) @ speeds)
-        + torque @ torque
-    )
-    return size, jnp.sqrt(V_size)
 
+    def __init__(self, point: TorquePoint, K2: Any, guard: float) -> None:
+        now, rates = point.now, point.rates
+        self.point = point
+        self.K2 = jnp.zeros_like(point.state.q) if K2 is None else K2
+        self.gap = relative_gap(now["xi"], guard)
+        self.e2 = jnp.abs(point.state.dq) + jnp.abs(now["alpha"]) + jnp.abs(now["dq_d"])
+        self.acceleration = jnp.abs(now["ddq"]) + jnp.abs(rates["alpha"])
+        self.torque = (
+            jnp.abs(point.M0) @ self.acceleration
+            + jnp.abs(now["tau"])
+            + jnp.abs(now["disturbance_estimate"])
+            + self.K2 * self.e2
+            + jnp.abs(now["s"]) / self.gap
+        )
 
-def speed_size(point: TorquePoint) -> jax.Array:
-    """Size of the terms of e2, (n,) [rad/s]."""
-    now = point.now
-    return jnp.abs(point.state.dq) + jnp.abs(now["alpha"]) + jnp.abs(now["dq_d"])
-
-
-def torque_size(point: TorquePoint, K2: jax.Array, near: jax.Array) -> jax.Array:
-    """Size of the terms of the torque, (n,) [N m]; `near` is the `gap` of the barrier on e1."""
-    now, rates = point.now, point.rates
-    accelerations = jnp.abs(now["ddq"]) + jnp.abs(rates["alpha"])
-    return (
-        jnp.abs(point.M0) @ accelerations
-        + jnp.abs(now["tau"])
-        + jnp.abs(now["disturbance_estimate"])
-        + K2 * speed_size(point)
-        + jnp.abs(now["s"]) / near
-    )
+    def of_V2(self, terms: Terms, weight: Any) -> tuple[jax.Array, jax.Array]:
+        """`Terms.size` and `Terms.sqrt_V_size`; `weight` is that of V1, (n,), or None for 1."""
+        point, e2, torque, gap = self.point, self.e2, self.torque, self.gap
+        scenario, state, now, rates = point.scenario, point.state, point.now, point.rates
+        M0 = jnp.abs(point.M0)
+        kf = scenario.observer.kf
+        kf = jnp.zeros_like(state.q) if kf is None else kf
+        torque_rate = (
+            M0 @ jnp.abs(rates["ddq"])
+            + jnp.abs(rates["tau"])
+            + jnp.abs(rates["disturbance_estimate"])
+            + self.K2 * self.acceleration
+            + kf * torque
+            + (jnp.abs(rates["s"]) + jnp.abs(now["s"]) * e2) / gap
+        )
+        size = (
+            e2 @ (jnp.abs(now["s"]) / gap + torque)
+            + (jnp.abs(terms.d_tilde) + jnp.abs(terms.dd)) @ torque_rate
+            + torque @ jnp.abs(terms.dd_tilde)
+        )
+        tube = scenario.context.tube(point.t)
+        width = jnp.minimum(tube.k_l, tube.k_u)
+        weight = jnp.ones_like(width) if weight is None else weight
+        of_V1 = jnp.sum(weight * (jnp.abs(state.q) / (width * gap)) ** 2)
+        return size, jnp.sqrt(of_V1 + e2 @ (M0 @ e2) + torque @ torque)

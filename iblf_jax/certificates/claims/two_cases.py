@@ -6,22 +6,25 @@ integration, and the bounds on xi, e2 and f_tilde inside it.
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple
 
 import jax
 import numpy as np
 
-from iblf_jax.certificates.claims._base import Claim, check_steps
+from iblf_jax.certificates.claims._base import Claim, check_steps, other_actuator
 from iblf_jax.certificates.claims.own import own_claim, stated_methods
 from iblf_jax.certificates.lines import Line, Statement, join_notes, not_applicable
 from iblf_jax.certificates.reconstruction import padded_index
-from iblf_jax.certificates.summary import Segment, Summary, weighted_lyapunov
+from iblf_jax.certificates.summary import (
+    Segment,
+    Summary,
+    weighted_lyapunov,
+)
 from iblf_jax.certificates.terms import adaptive_law, on_position
-from iblf_jax.control.actuators import Ideal
 from iblf_jax.control.controllers import Backstepping
 from iblf_jax.control.observers import AsPublished, Momentum
-from iblf_jax.core import checks, programs
+from iblf_jax.core import programs
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.simulation.scenario import Scenario
 
@@ -32,8 +35,8 @@ NO_BOUND = "the barrier states no bound on xi from V1"
 class Gains(NamedTuple):
     """The gains on which rho depends; (n,) each."""
 
-    decay: jax.Array
-    """Decay rate of V1 of each joint along alpha [1/s]."""
+    decay_rate: jax.Array
+    """Of V1 of each joint along alpha [1/s]."""
     K2: jax.Array
     kf: jax.Array
 
@@ -49,12 +52,21 @@ class TwoCases(Claim):
     """Which envelope a bound is of, in words before the case."""
 
     @abc.abstractmethod
-    def why_not_in_case(self, summary: Summary, case: int) -> str:
-        """Why a case of the claim does not apply to a run; "" if it does."""
+    def why_no_rate(self, summary: Summary, case: int) -> str:
+        """Why a case has no positive rate; "" if it has one."""
 
     @abc.abstractmethod
     def bound_statements(self, summary: Summary) -> dict[str, Statement]:
         """The bounds that follow from the envelope, by name."""
+
+    def why_not_in_case(self, summary: Summary, case: int) -> str:
+        """Why a case of the claim does not apply to a run; "" if it does."""
+        reason = self.why_not_in_run(summary)
+        if reason:
+            return reason
+        if case == 1 and summary.case == 2:
+            return f"case 1 is for f' = 0; here |f'| reaches {summary.F_d:.4g} N m/s, see case 2"
+        return self.why_no_rate(summary, case) or summary.why_never
 
     def case_of(self, summary: Summary) -> int | None:
         """The stronger case that applies to a run, or None."""
@@ -66,7 +78,7 @@ class TwoCases(Claim):
 
     def left_side(self, segment: Segment, case: int) -> np.ndarray:
         """The left side of the differential inequality at every step, (T,)."""
-        terms, decay = segment.terms, segment.summary.decays[self.key, case]
+        terms, decay = segment.terms, segment.summary.decay_bounds[self.key, case]
         rate = terms.dV
         if decay.w_f != 1.0:
             rate = rate + (decay.w_f - 1.0) * np.sum(terms.d_tilde * terms.dd_tilde, axis=1)
@@ -87,7 +99,7 @@ class TwoCases(Claim):
         reason = self.why_not_in_case(summary, case)
         if reason:
             return not_applicable(statement, reason)
-        decay = summary.decays[self.key, case]
+        decay = summary.decay_bounds[self.key, case]
         size = max(1.0, decay.w_f) * terms.size + decay.rho * weighted_lyapunov(terms, decay.w_f)
         margins, note = -self.left_side(segment, case), self.exclusion_note(summary)
         return check_steps(segment, statement, margins, summary.eps * size, note=note)
@@ -99,7 +111,7 @@ class TwoCases(Claim):
         if reason:
             return not_applicable(statement, reason)
         bound, tolerance = segment.envelopes[self.key, case]
-        V = weighted_lyapunov(segment.terms, summary.decays[self.key, case].w_f)
+        V = weighted_lyapunov(segment.terms, summary.decay_bounds[self.key, case].w_f)
         note = self.exclusion_note(summary)
         return check_steps(segment, statement, bound - V, tolerance, note=note)
 
@@ -112,7 +124,7 @@ class TwoCases(Claim):
         if case is None:
             reason = self.why_not_in_case(summary, summary.case)
             return [not_applicable(statement, reason) for statement in statements.values()]
-        envelope, w_f = segment.envelopes[self.key, case], summary.decays[self.key, case].w_f
+        envelope, w_f = segment.envelopes[self.key, case], summary.decay_bounds[self.key, case].w_f
         bounds = self.bounds_along(segment, envelope.bound, w_f)
         widened = self.bounds_along(segment, envelope.bound + envelope.tolerance, w_f)
         sizes = self.sizes_along(segment)
@@ -147,7 +159,7 @@ class TwoCases(Claim):
         summary = segment.summary
         return {
             "e2": np.sqrt(2 * V / summary.extrema.lambda_min),
-            "xi, by V1": along(segment, xi_bound, V),
+            "xi, by V1": xi_bound_along(segment, V),
             "xi": np.sqrt(2 * V[:, None] / np.asarray(on_position(summary.law)[1])),
             "f_tilde": np.sqrt(2 * V / w_f),
         }
@@ -170,22 +182,22 @@ class TwoCases(Claim):
 
 
 @programs.jit
-def xi_bound(scenario: Scenario, t: jax.Array, V: jax.Array) -> jax.Array | None:
+def _xi_bound(scenario: Scenario, t: jax.Array, V: jax.Array) -> jax.Array | None:
     """The barrier's own bound on |xi_i| where w_i V1_i <= V, (T, n), or None if it states none."""
     barrier, weight = on_position(unwrapped(scenario.controller))
     return jax.vmap(lambda t, V: barrier.xi_bound(V / weight, scenario.context.tube(t)))(t, V)
 
 
-def along(
-    segment: Segment, bound: Callable[..., Any], V: np.ndarray, *signals: np.ndarray
-) -> np.ndarray:
-    """A bound along a segment, (T, n), computed in blocks of one size; NaN if none is stated."""
+def xi_bound_along(segment: Segment, V: np.ndarray) -> np.ndarray:
+    """The bound on |xi_i| along a segment, (T, n), computed in blocks of one size; NaN if the
+    barrier states none.
+    """
     index = padded_index(V.size)
-    arguments = (segment.t, *signals, V.astype(segment.t.dtype))
-    found = bound(segment.summary.run.scenario, *(x[index] for x in arguments))
-    if found is None:
+    arguments = (segment.t[index], V.astype(segment.t.dtype)[index])
+    stated = _xi_bound(segment.summary.run.scenario, *arguments)
+    if stated is None:
         return np.full(segment.sample.q.shape, np.nan)
-    return np.asarray(found)[: V.size]
+    return np.asarray(stated)[: V.size]
 
 
 # --- the loops of Theorem 2 -----------------------------------------------------------------------
@@ -220,14 +232,13 @@ def why_not_in_loop(scenario: Scenario) -> str:
     """Why the observer and the actuator of a scenario have no claim of this kind; "" if they
     have.
     """
-    observer, actuator = scenario.observer, scenario.actuator
+    observer, actuator = scenario.observer, other_actuator(scenario)
     if not isinstance(observer, AsPublished | Momentum):
         needs = "Theorem 2 needs the observer (3.11), printed or in momentum form"
         return f"{needs}; {type(observer).__name__} has no claim of this kind"
-    if not isinstance(actuator, Ideal):
+    if actuator:
         about = "Theorem 2 is about a torque that acts as it is commanded"
-        kind = checks.with_article(type(actuator).__name__)
-        return f"{about}; {kind} has no claim of this kind"
+        return f"{about}; {actuator} has no claim of this kind"
     return ""
 
 

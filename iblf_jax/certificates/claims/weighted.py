@@ -32,7 +32,7 @@ from iblf_jax.certificates.claims.two_cases import (
     why_no_theorem,
 )
 from iblf_jax.certificates.lines import Line, Statement, check_positive, not_applicable
-from iblf_jax.certificates.summary import Decay, Segment, Summary
+from iblf_jax.certificates.summary import DecayBound, Segment, Summary
 from iblf_jax.control.controllers import Backstepping
 from iblf_jax.control.observers import Momentum
 from iblf_jax.core.pytree import unwrapped
@@ -50,26 +50,20 @@ class Weighted(TwoCases):
     """The claim with weights."""
 
     key: ClassVar[str] = "weighted"
-    equation: ClassVar[str] = "(W.1)"
     inequalities: ClassVar[Mapping[int, Statement]] = {
-        1: Statement("weighted inequality, case 1", "(W.1)", "V_w' + rho V_w <= 0", "N m rad/s"),
-        2: Statement(
-            "weighted inequality, case 2",
-            "(W.1)",
-            "V_w' + rho V_w - w_f |f'|^2/(2 b) <= 0",
-            "N m rad/s",
-        ),
+        case: Statement(
+            f"weighted inequality, case {case}", "(W.1)", f"V_w' + rho V_w{term} <= 0", "N m rad/s"
+        )
+        for case, term in {1: "", 2: " - w_f |f'|^2/(2 b)"}.items()
     }
     envelopes: ClassVar[Mapping[int, Statement]] = {
-        1: Statement(
-            "weighted envelope, case 1", "(W.3)", "V_w(t) <= V_w(0) exp(-rho t)", "N m rad"
-        ),
-        2: Statement(
-            "weighted envelope, case 2",
+        case: Statement(
+            f"weighted envelope, case {case}",
             "(W.3)",
-            "V_w(t) <= V_w(0) exp(-rho t) + rho2/rho",
+            f"V_w(t) <= V_w(0) exp(-rho t){term}",
             "N m rad",
-        ),
+        )
+        for case, term in {1: "", 2: " + rho2/rho"}.items()
     }
     bounds: ClassVar[Mapping[str, Statement]] = {
         "xi, by V1": Statement(
@@ -91,17 +85,10 @@ class Weighted(TwoCases):
             return "the claim with weights is about the corrected law with a momentum observer"
         return ""
 
-    def why_not_in_case(self, summary: Summary, case: int) -> str:
-        """Why a case does not apply to a run; "" if it does."""
-        reason = self.why_not_in_run(summary)
-        if reason:
-            return reason
-        if case == 1 and summary.case == 2:
-            return f"case 1 is for f' = 0; here |f'| reaches {summary.F_d:.4g} N m/s, see case 2"
+    def why_no_rate(self, summary: Summary, case: int) -> str:
+        """Why a case has no positive rate; "" if it has one."""
         if case not in summary.constants[self.key]:
             return "the numbers of the run are not finite"
-        if summary.excluded == summary.samples:
-            return f"{summary.why_excluded} all the time"
         return ""
 
     def replaces_theorem(self, summary: Summary) -> bool:
@@ -125,12 +112,12 @@ class Weighted(TwoCases):
                 found[case] = best
         return found
 
-    def decays(self, summary: Summary) -> dict[int, Decay]:
+    def decay_bounds(self, summary: Summary) -> dict[int, DecayBound]:
         """Case -> constants of the decay."""
         found = {}
         for case, chosen in summary.constants[self.key].items():
             gain = chosen.w_f / (2.0 * chosen.b) if case == 2 else 0.0
-            found[case] = Decay(chosen.rho, chosen.rho2, chosen.w_f, gain)
+            found[case] = DecayBound(chosen.rho, chosen.rho2, chosen.w_f, gain)
         return found
 
     def numbers(self, summary: Summary) -> dict[str, Any]:
@@ -158,7 +145,7 @@ class Weighted(TwoCases):
             return not_applicable(statement, reason)
         gains, mu = gains_of(summary.run.scenario), float(summary.extrema.mu)
         chosen = summary.constants[self.key][case]
-        limits = (np.min(gains.decay), 2.0 * mu, 2.0 * np.min(gains.kf))
+        limits = (np.min(gains.decay_rate), 2.0 * mu, 2.0 * np.min(gains.kf))
         least = ("the decay rate of V1", "K2 over M0", "kf")[int(np.argmin(limits))]
         numbers = f"a = {chosen.a:.4g}, w_f = {chosen.w_f:.4g} rad/(N m)"
         if case == 2:
@@ -168,8 +155,7 @@ class Weighted(TwoCases):
             f" {mu:.4g} 1/s; limited by {least}"
         )
         terms = rate_terms(gains, mu, chosen.a, chosen.b, chosen.w_f)
-        counts = not (case == 2 and summary.case == 1)
-        margin = float(np.min(terms))
+        margin, counts = float(np.min(terms)), summary.counts(case)
         return check_positive(statement, margin, value=chosen.rho, note=note, counts=counts)
 
 
@@ -197,7 +183,7 @@ def rate_terms(gains: Gains, mu: float, a: float, b: float, w_f: float) -> np.nd
 
     Args:
       gains: gains and decay rates.
-      mu: the smallest eigenvalue of M0^-1 K2, () [1/s].
+      mu: smallest lambda_min(M0^-1 K2) over the run, () [1/s].
       a, b, w_f: as in the docstring of this module.
     """
     decay, K2, kf = (np.asarray(x, float) for x in gains)
@@ -222,7 +208,7 @@ def best_constants(
 
     Args:
       gains: gains and decay rates.
-      mu: the same over the run, () [1/s].
+      mu: smallest lambda_min(M0^-1 K2) over the run, () [1/s].
       V_rest: V_w(0) without f_tilde, () [N m rad].
       half_square: |f_tilde(0)|^2 / 2, () [(N m)^2].
       F_d: sup |f'|, () [N m/s].
@@ -230,11 +216,11 @@ def best_constants(
       case: 1 for f' = 0, 2 for bounded f'.
     """
     decay, K2, kf = (np.asarray(x, float) for x in gains)
-    top = min(float(np.min(decay)), 2.0 * mu, 2.0 * float(np.min(kf)))
-    if not (np.all(np.isfinite([top, V_rest, half_square, F_d])) and top > 0):
+    rho_limit = min(float(np.min(decay)), 2.0 * mu, 2.0 * float(np.min(kf)))
+    if not (np.all(np.isfinite([rho_limit, V_rest, half_square, F_d])) and rho_limit > 0):
         return None
     # Axes: rates rho, then fractions of the largest b.
-    rho = top * GRID[:, None]
+    rho = rho_limit * GRID[:, None]
     a = 1.0 - rho / (2.0 * mu)
     fractions = {1: np.zeros((1, 1)), 2: GRID[None, :]}[case]
     b = 2.0 * (np.min(kf) - rho / 2.0) * fractions

@@ -99,13 +99,12 @@ def funnel(first, last):
     )
 
 
+corridor = ij.Bounds(lower=funnel(-9.0, -150.0), upper=funnel(9.0, 150.0))
+speeds = ij.Bounds(ij.bounds.Constant(-V_MAX), ij.bounds.Constant(V_MAX))
 scenario = ij.Scenario(
     plant=RelativeMotion(),
     reference=Approach(),
-    bounds=(
-        ij.Bounds(lower=funnel(-9.0, -150.0), upper=funnel(9.0, 150.0)),
-        ij.Bounds(ij.bounds.Constant(-V_MAX), ij.bounds.Constant(V_MAX)),
-    ),
+    bounds=(corridor, speeds),
     controller=DockingProgramme(),
     initial=ij.Initial(x=[START, [0.0, 0.0]]),
 )

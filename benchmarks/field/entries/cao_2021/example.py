@@ -85,8 +85,7 @@ class SettlingTimeLaw:
         size = jnp.linalg.norm(jnp.exp(-jnp.sum((inputs - CENTRES) ** 2, axis=1) / 9.0))
         u = -(self.k2 * z2 + mu1 * h2 * z1 + R2 * estimate * size * z2) / mu2
         rates = ((alpha - alpha_f) / FILTER, R4 * size * (z2 @ z2) - R3 * estimate)
-        no = jnp.zeros(q.shape, bool)
-        return ij.controllers.Command(u, tube.dq_d, 0.0 * q, no, no), rates
+        return ij.controllers.Command(u, tube.dq_d, 0.0 * q, q != q, q != q), rates
 
 
 def arm(centre, inertia):
@@ -95,13 +94,12 @@ def arm(centre, inertia):
     return ij.robots.TwoLink(centre=[centre, 0.31], inertia=[inertia, 0.02042], **numbers)
 
 
+positions = ij.Bounds(lower=Shrinking(-WIDTH), upper=Shrinking(WIDTH))
+speeds = ij.Bounds(ij.bounds.Constant(-SPEED), ij.bounds.Constant(SPEED))
 scenario = ij.Scenario(
     plant=arm(0.35, 0.06125),
     reference=ij.references.Sinusoid(offset=0.0, amplitude=0.3, phase=[0.0, np.pi / 2]),
-    bounds=(
-        ij.Bounds(lower=Shrinking(-WIDTH), upper=Shrinking(WIDTH)),
-        ij.Bounds(ij.bounds.Constant(-SPEED), ij.bounds.Constant(SPEED)),
-    ),
+    bounds=(positions, speeds),
     controller=SettlingTimeLaw(k1=4.0, k2=15.0, speed_factor=1.0),
     disturbance=ij.disturbances.Sinusoids([0.0, -0.1], 1.0, np.pi / 2, [UNKNOWN, 0.0]),
     initial=ij.Initial(q=[0.15, 0.4]),

@@ -82,14 +82,12 @@ class ConstrainedPD:
 
 def task(T, law, q=(0.2, -0.15, -0.25), w=(0.0, 0.0, 0.0), r0=0.3):
     """The published task."""
+    sides = ((r0, 0.008), (0.4, 0.005))
     return ij.Scenario(
         plant=Spacecraft(INERTIA, [0.05, 0.1, 0.15]),
         model=Spacecraft(INERTIA, 0.0),
         reference=ij.references.Sinusoid(0.0, 0.0),
-        bounds=(
-            ij.Bounds(FiniteTime(-r0, -0.008, T), FiniteTime(r0, 0.008, T)),
-            ij.Bounds(FiniteTime(-0.4, -0.005, T), FiniteTime(0.4, 0.005, T)),
-        ),
+        bounds=[ij.Bounds(FiniteTime(-r, -f, T), FiniteTime(r, f, T)) for r, f in sides],
         controller=law,
         initial=ij.Initial(x=[q, w]),
     )

@@ -112,14 +112,11 @@ def between(lower, upper):
     return ij.Bounds(lower=ij.bounds.Constant(lower), upper=ij.bounds.Constant(upper))
 
 
+shrinking = ij.Bounds(lower=Shrinking(-30.0, -10.0), upper=Shrinking(28.0, 10.0))
 scenario = ij.Scenario(
     plant=ij.plants.StrictFeedback(drift, gain, n=1, order=3),
     reference=ij.references.Sinusoid(offset=0.0, amplitude=3.0, frequency=0.5),
-    bounds=(
-        ij.Bounds(lower=Shrinking(-30.0, -10.0), upper=Shrinking(28.0, 10.0)),
-        between(-30.0, 20.0),
-        between(-180.0, 150.0),
-    ),
+    bounds=(shrinking, between(-30.0, 20.0), between(-180.0, 150.0)),
     controller=PrescribedTime(time=1.55, k=[0.1, 0.1, 10.0]),
     initial=ij.Initial(x=[[7.5], [5.0], [-10.0]]),
 )
