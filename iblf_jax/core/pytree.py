@@ -246,6 +246,11 @@ def _getter(names: tuple[str, ...]) -> Callable[[Any], tuple]:
     return lambda obj: ()
 
 
+def is_absent(x: Any) -> bool:
+    """Whether an optional part of a pytree is absent: `()`, which has no leaves."""
+    return isinstance(x, tuple) and not x
+
+
 def layers(part: Any) -> list[Any]:
     """A component and the components that it wraps, outermost first. The class attribute `wraps`
     is the name of the field that holds the wrapped component.

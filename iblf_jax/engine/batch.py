@@ -217,7 +217,9 @@ def carry_shapes(batch: Batch, method: str) -> Carry:
 def finalize(
     loop: StepLoop, batch: Batch, request: RunRequest, carry: Carry, at_start: Linearization
 ) -> Outcome:
-    """The outcome after the last step, without records; `at_start` is the linearization there."""
+    """The outcome after the last step, without records; `at_start` is the linearization at the
+    start of the run.
+    """
 
     def at_nearest_and_end(inputs, carry):
         watched = at_start.jacobian.shape[-1]

@@ -73,7 +73,8 @@ def first_that_works(
 ) -> T:
     """The value of `attempt` for the first executor of a plan that works, else that of `by_scan`.
 
-    A compiler that was stopped says nothing about the executor, so that attempt is made once more.
+    A compiler that was stopped says nothing about the executor, so that the same executor is tried
+    a second time.
 
     Args:
       execution: the plan.

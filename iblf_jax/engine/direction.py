@@ -30,8 +30,8 @@ from iblf_jax.engine.request import RunRequest
 from iblf_jax.kernels import UnsupportedError, is_zero, new_primitive, without_symbol
 
 
-class Runs(NamedTuple):
-    """What is run on lists of leaves; static."""
+class TracedRuns(NamedTuple):
+    """Runs of lists of leaves inside a transformation of JAX; static."""
 
     treedef: Any
     """Of the `Inputs`."""
@@ -54,7 +54,7 @@ class Runs(NamedTuple):
 
     def repeated(
         self, size: int, operands: Sequence[jax.Array], is_batched: Sequence[bool]
-    ) -> tuple[Runs, list[jax.Array]]:
+    ) -> tuple[TracedRuns, list[jax.Array]]:
         """All runs for every entry of a batch axis.
 
         Args:
@@ -93,7 +93,10 @@ def with_more_runs(
 
 
 def derivative(
-    runs: Runs, places: tuple[int, ...], leaves: Sequence[jax.Array], moves: Sequence[jax.Array]
+    runs: TracedRuns,
+    places: tuple[int, ...],
+    leaves: Sequence[jax.Array],
+    moves: Sequence[jax.Array],
 ) -> tuple[list[jax.Array], dict[str, jax.Array]]:
     """The derivative of a single run's records and metrics along a direction.
 
@@ -117,7 +120,7 @@ def derivative(
     return flat[:count], dict(zip(names, flat[count:], strict=True))
 
 
-def _outputs(runs: Runs, leaves: Sequence[jax.Array]) -> tuple[list[jax.Array], dict]:
+def _outputs(runs: TracedRuns, leaves: Sequence[jax.Array]) -> tuple[list[jax.Array], dict]:
     """The floats that are recorded, and the metrics that have derivatives, by the scan."""
     outcome = run_all(scan, runs.batch(leaves), runs.request)
     metrics = {
@@ -129,25 +132,25 @@ def _outputs(runs: Runs, leaves: Sequence[jax.Array]) -> tuple[list[jax.Array], 
 
 
 @CACHE.memoised(64)
-def _shapes(runs: Runs, shapes: tuple) -> Any:
+def _shapes(runs: TracedRuns, shapes: tuple) -> Any:
     """The shapes of `_outputs`, for leaves of these shapes and types (`shapes_of`)."""
     structs = [jax.ShapeDtypeStruct(*shape) for shape in shapes]
     return jax.eval_shape(partial(_outputs, runs), structs)
 
 
-def _names(runs: Runs, shapes: tuple) -> list[str]:
+def _names(runs: TracedRuns, shapes: tuple) -> list[str]:
     """The names of the metrics that have derivatives, in the order of the outputs."""
     return sorted(_shapes(runs, shapes)[1])
 
 
-def _divided(runs: Runs, operands: Sequence[Any]) -> tuple[list, list]:
+def _divided(runs: TracedRuns, operands: Sequence[Any]) -> tuple[list, list]:
     """The leaves and the moves among the operands of the primitive."""
     count = len(runs.is_per_run)
     return list(operands[:count]), list(operands[count:])
 
 
 def _function_of(
-    runs: Runs, places: tuple[int, ...], leaves: Sequence[jax.Array]
+    runs: TracedRuns, places: tuple[int, ...], leaves: Sequence[jax.Array]
 ) -> tuple[Callable, list[jax.Array]]:
     """All outputs by the scan as a function of the leaves at `places`, and these leaves."""
 
@@ -160,7 +163,7 @@ def _function_of(
     return function, [leaves[place] for place in places]
 
 
-def _along(*operands: jax.Array, runs: Runs, places: tuple[int, ...]) -> list[jax.Array]:
+def _along(*operands: jax.Array, runs: TracedRuns, places: tuple[int, ...]) -> list[jax.Array]:
     """The outputs of the primitive."""
     leaves, moves = _divided(runs, operands)
 
@@ -174,7 +177,9 @@ def _along(*operands: jax.Array, runs: Runs, places: tuple[int, ...]) -> list[ja
     )
 
 
-def _along_by_scan(*operands: jax.Array, runs: Runs, places: tuple[int, ...]) -> list[jax.Array]:
+def _along_by_scan(
+    *operands: jax.Array, runs: TracedRuns, places: tuple[int, ...]
+) -> list[jax.Array]:
     """As `_along`."""
     leaves, moves = _divided(runs, operands)
     function, at = _function_of(runs, places, leaves)
@@ -182,7 +187,7 @@ def _along_by_scan(*operands: jax.Array, runs: Runs, places: tuple[int, ...]) ->
 
 
 def _gradient(
-    runs: Runs,
+    runs: TracedRuns,
     places: tuple[int, ...],
     which: tuple[int, ...],
     leaves: Sequence[jax.Array],
@@ -214,7 +219,9 @@ def _gradient(
     )
 
 
-def _batched_gradient(runs: Runs, places: tuple[int, ...], which: tuple[int, ...]) -> Callable:
+def _batched_gradient(
+    runs: TracedRuns, places: tuple[int, ...], which: tuple[int, ...]
+) -> Callable:
     """The gradient by kernels as a function of leaves and cotangents, for one batch axis more where
     JAX batches it.
     """
@@ -234,7 +241,7 @@ def _batched_gradient(runs: Runs, places: tuple[int, ...], which: tuple[int, ...
 
 @programs.jit(static_argnums=(0, 1, 2))
 def _gradient_by_kernel(
-    runs: Runs, places: tuple[int, ...], which: tuple[int, ...], operands: Sequence[jax.Array]
+    runs: TracedRuns, places: tuple[int, ...], which: tuple[int, ...], operands: Sequence[jax.Array]
 ) -> list[jax.Array]:
     leaves, cotangents = _divided(runs, operands)
     records, metrics = _shapes(runs, shapes_of(leaves))
@@ -256,7 +263,7 @@ def _gradient_by_kernel(
 # ------------------------------------------------------------------------------- rules of JAX
 
 
-def _abstract(*operands: Any, runs: Runs, places: tuple[int, ...]) -> list:
+def _abstract(*operands: Any, runs: TracedRuns, places: tuple[int, ...]) -> list:
     leaves, _ = _divided(runs, operands)
     shapes = _shapes(runs, shapes_of(leaves))
     return [jax.core.ShapedArray(x.shape, x.dtype) for x in jax.tree.leaves(shapes)]

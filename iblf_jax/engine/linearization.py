@@ -44,9 +44,10 @@ class Linearization(NamedTuple):
     """Of the run; its torque is turned into what it accelerates, as that takes the robot's mass
     matrix."""
     jacobian: Any = ()
-    """By the numbers that `accuracy` watches, by differences of three sizes, (3, m', m') [1/s];
-    `stability.resolved_jacobian` makes one of them.  `()` until all steps are made, because each
-    records its column: carried from step to step, the m'^2 numbers would be most of the program."""
+    """By the numbers that `error_estimate` watches, by differences of three sizes, (3, m', m')
+    [1/s]; `stability.resolved_jacobian` makes one of them.  `()` until all steps are made, because
+    each records its column: carried from step to step, the m'^2 numbers would be most of the
+    program."""
 
     def with_columns(self, columns: jax.Array) -> Linearization:
         """The linearization after its steps, which recorded these columns, (..., steps, m')."""
@@ -59,9 +60,9 @@ class Linearization(NamedTuple):
 class LinearizationStep(Step):
     """The closed loop's derivative along one direction after the other.
 
-    The directions are at first the unit vectors of the numbers that `accuracy` watches.  Where
-    these are the complete state, the modes follow from them; otherwise a power iteration adds more
-    directions.
+    The directions are at first the unit vectors of the numbers that `error_estimate` watches.
+    Where these are the complete state, the modes follow from them; otherwise a power iteration adds
+    more directions.
     """
 
     def __call__(
@@ -154,7 +155,7 @@ def linearization_at(
     time: jax.Array, state: Any, watched: int, unresolved: error_estimate.UnresolvedSignals
 ) -> Linearization:
     """The carry of a `LinearizationStep` at a state, as `perturbed_state` gives it, of which
-    `accuracy` watches so many numbers.
+    `error_estimate` watches so many numbers.
     """
     x = ravel_pytree(state)[0]
     lengths: Any = ()

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from iblf_jax.core.pytree import is_absent
 from iblf_jax.core.status import Status, flag, has_flag
 from iblf_jax.engine.carry import Carry, Inputs
 from iblf_jax.engine.linearization import Linearization, fastest_mode
@@ -45,7 +46,7 @@ def outcome_of(
     scenario = inputs.scenario
     estimate = error_estimate.with_unresolved(carry.accuracy, unresolved)
     rounding: dict[str, jax.Array] = {}
-    if estimate.growth != ():
+    if not is_absent(estimate.growth):
         bounds = _bounds_of_growth(inputs, carry, instants)
         estimate, rounding = error_growth.with_growth(estimate, bounds, unresolved.width)
     modes = jax.vmap(partial(fastest_mode, inputs.scenario))(instants)

@@ -1,6 +1,6 @@
 """`simulate` runs one scenario and returns a `Rollout`.
 
-request = RunRequest.of(...)     checks what is requested
+request = runs.request(...)      checks what is requested
 output  = run_one(...)           plans, compiles and executes it (`single_run`); under a
                                  transformation of JAX `run_transformable` (`transformable`)
 result  = Rollout(...)           arrays with names and units
@@ -52,10 +52,10 @@ def simulate(
         x' = rate(t, x),   x = (q, q', states of law, observer and actuator)        (closed_loop)
 
     `jax.jit`, `vmap`, `grad`, `jacfwd` and their compositions apply to it; every array of the
-    result is differentiable with respect to leaves of the scenario.  New values of leaves do not
-    recompile, unless other numbers of an arm's geometry become 0, 1, -1 or equal.  A new structure
-    or method does.  A new number of steps or `record_every` recompiles only the steps; on "vmap",
-    the complete run.
+    result is differentiable with respect to leaves of the scenario.  New values of leaves
+    reuse the compiled program, unless they change which numbers of an arm's geometry are 0, 1, -1
+    or equal.  A new structure or method does not.  A new number of steps or `record_every`
+    recompiles only the steps; on "vmap", the complete run.
 
     Args:
       scenario: what to run, of n joints.
@@ -110,7 +110,7 @@ def _checked_record(record_every: int, steps: int) -> int:
     raise checks.fail(
         "record_every",
         record_every,
-        f"at most {MAX_SAMPLES} recorded samples of {steps} steps",
+        f"an interval with at most {MAX_SAMPLES} recorded samples in {steps} steps",
         remedy,
     )
 
@@ -137,18 +137,15 @@ def run_rollout(
         outcome = run_one(scenario, folds, dt, request, noise)
     else:
         outcome = run_transformable(scenario, folds, dt, request, noise)
-    arrays, controller_state, observer_state, actuator_state, measured = outcome.records
+    states = outcome.records._asdict()
     return Rollout(
+        **states.pop("signals"),
+        **states,
         scenario=scenario,
-        controller_state=controller_state,
-        observer_state=observer_state,
         metrics=Metrics(outcome.metrics, metric_units(folds, scenario)),
         status=outcome.status,
         fastest_mode=outcome.fastest_mode,
         dt=dt,
-        actuator_state=actuator_state,
-        measured=measured,
         method=request.method,
         steps=request.steps,
-        **arrays,
     )

@@ -33,9 +33,9 @@ def sample_status(sample: Sample) -> jax.Array:
     if not has(sample, "slack"):  # a filter keeps its bounds wherever the reference goes
         narrowest = jnp.minimum(sample.q_d - sample.lower, sample.upper - sample.q_d)
         found |= flag(jnp.any(narrowest < NARROWEST), Status.INFEASIBLE_REFERENCE)
-    for slack in (sample.slack, sample.region_slack):
-        if not isinstance(slack, tuple):
-            found |= flag(jnp.any(slack > 0), Status.FILTER_INFEASIBLE)
+    for signal in ("slack", "region_slack"):
+        if has(sample, signal):
+            found |= flag(jnp.any(getattr(sample, signal) > 0), Status.FILTER_INFEASIBLE)
     if len(sample.x) > 2:
         found |= flag(jnp.any(~jnp.isfinite(sample.tau)), Status.SINGULAR_GAIN)
     if has(sample, "region_margin"):

@@ -44,7 +44,7 @@ class StepTimes(NamedTuple):
 
     span: discontinuities.Span
     division: discontinuities.Division
-    behind: jax.Array
+    previous_piece_length: jax.Array
     """Length of the last piece of the previous step, () [s]; 0 at the first instant."""
     restarts: Any
     """Whether a jump lies in this step or in earlier ones that its error estimate uses, () bool;
@@ -71,7 +71,7 @@ def step_times(inputs: Inputs, index: jax.Array, method: str, arrivals: tuple | 
     if arrivals is not None:
         here, last = arrivals
     before = discontinuities.Span((number - 1.0) * dt, start, dt)
-    behind = jnp.where(
+    previous_piece_length = jnp.where(
         index > 0, discontinuities.last_piece_length(times, before, last), jnp.zeros_like(dt)
     )
     restarts = None
@@ -82,7 +82,7 @@ def step_times(inputs: Inputs, index: jax.Array, method: str, arrivals: tuple | 
     if inputs.scenario.process_noise is not None:
         pieces = with_noise_rates(inputs.scenario, inputs.noise, index, dt, division.pieces)
         division = division._replace(pieces=pieces)
-    return StepTimes(span, division, behind, restarts)
+    return StepTimes(span, division, previous_piece_length, restarts)
 
 
 class LoopAlongStep(NamedTuple):

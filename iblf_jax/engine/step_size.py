@@ -4,7 +4,7 @@ that drive it.
 The first candidate follows the fastest mode of the loop.  Then two runs are integrated side by
 side: one in steps dt, the other with each of these steps divided into three unequal ones, so that
 no signal passes through whole periods between the stages of both.  The step is reduced until the
-two runs agree and the error estimate of the run (`accuracy`) is within its tolerance.
+two runs agree and the error estimate of the run (`error_estimate`) is within its tolerance.
 """
 
 from __future__ import annotations
@@ -309,7 +309,7 @@ def _find_part(
         dt = jnp.asarray(period / parts, scenario.initial.q.dtype)
         fitted = with_history(scenario, period / parts)
         found = run_one(fitted, (), dt, RunRequest(periods * parts, method, parts), noise)
-        signals = found.records[0]
+        signals = found.records.signals
         q = signals["x"][:, 0]
         width = signals["level_upper"][:, 0] - signals["level_lower"][:, 0]
         poor = has_flag(int(found.status), Status.STEP_TOO_LARGE)

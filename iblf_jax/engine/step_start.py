@@ -61,8 +61,9 @@ def sampled_start(
     times = step_times(inputs, index, method, arrivals)
     along = LoopAlongStep(evaluated, inputs, state, (torques.torque, torques.next))
     accumulators, metric_samples = _before_sample(along, carry, due, times)
-    behind = jnp.where(due, jnp.zeros_like(dt), times.behind)
-    return StepStart(along, times._replace(behind=behind), accumulators, metric_samples)
+    length = jnp.where(due, jnp.zeros_like(dt), times.previous_piece_length)
+    times = times._replace(previous_piece_length=length)
+    return StepStart(along, times, accumulators, metric_samples)
 
 
 def _before_sample(
@@ -79,7 +80,7 @@ def _before_sample(
     pending = along.state.sampled.commands
     schedule: Any = scenario.sampling
     torque = sampling.torque_before(schedule, dt, commands, pending)
-    t, behind = times.span.start, times.behind
+    t, previous_piece_length = times.span.start, times.previous_piece_length
     seen_at = (
         t
         if times.division.pieces[0].earliest is None
@@ -88,7 +89,7 @@ def _before_sample(
 
     def seen(accumulators):
         sample = along.evaluate(scenario, seen_at, carry.state, dt, torque)[1]
-        sample = weighed(sample, t, 0.5 * behind, jnp.zeros_like(dt))
+        sample = weighed(sample, t, 0.5 * previous_piece_length, jnp.zeros_like(dt))
         return updated(folds, accumulators, sample), sample
 
     after, sample = run_if(due, seen, carry.accumulators)

@@ -25,6 +25,7 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.core.attributes import attributes
+from iblf_jax.core.pytree import is_absent
 from iblf_jax.core.status import Status, flag
 from iblf_jax.engine.carry import Carry, Inputs, Nearest, Step, StepOptions, keep_if
 from iblf_jax.engine.metric_folds import begun_at, updated, weighed
@@ -128,12 +129,15 @@ def advance(
         along = along._replace(arriving=along.arriving.with_commands_of_step(commands))
     ahead = jnp.where(times.span.in_run, first.length, jnp.zeros_like(inputs.dt))
     step = jnp.where(index > 0, inputs.dt, jnp.zeros_like(inputs.dt))
-    sample = weighed(stepped.aux, times.span.start, 0.5 * (times.behind + ahead), step)
+    sample = weighed(
+        stepped.aux, times.span.start, 0.5 * (times.previous_piece_length + ahead), step
+    )
     walls = distances(inputs.scenario, sample)
     sample = with_extremes(
         inputs.scenario, inputs.noise, index, inputs.dt, sample, state.x, carry.distances, walls
     )
-    begun, accumulators = _observed(inputs, index, start.accumulators, sample)
+    begun = begun_at(index, inputs.folds, sample, start.accumulators)
+    accumulators = updated(inputs.folds, begun, sample)
     if along.jumps_with_law:
         stepped, accumulators = across_jumps(
             along, first, state, method, stepped, begun, accumulators
@@ -189,14 +193,6 @@ def _with_commands(
     return after._replace(delayed=commands), without_commands
 
 
-def _observed(
-    inputs: Inputs, index: jax.Array, accumulators: tuple, sample: Sample
-) -> tuple[tuple, tuple]:
-    """The accumulators before and after the sample of an instant."""
-    begun = begun_at(index, inputs.folds, sample, accumulators)
-    return begun, updated(inputs.folds, begun, sample)
-
-
 def _concluded(
     method: str,
     inputs: Inputs,
@@ -206,7 +202,7 @@ def _concluded(
     parts: list,
     later: tuple[LoopState, Any],
     before: LoopState,
-    goes_on: jax.Array,
+    in_run: jax.Array,
     restarts: Any,
     too_many_jumps: Any,
 ) -> tuple[LoopState, jax.Array, Nearest, error_estimate.Accuracy]:
@@ -220,7 +216,7 @@ def _concluded(
       parts: lengths and slopes of the pieces of the step.
       later: the state at the end of the step, and the flags raised within it.
       before: the state at its start.
-      goes_on: whether the step is made, () bool.
+      in_run: whether the run goes on after the instant, () bool.
       restarts, too_many_jumps: of `StepTimes` and its division.
     """
     near = jnp.max(jnp.abs(jax.lax.stop_gradient(sample.xi)))
@@ -242,7 +238,7 @@ def _concluded(
             too_many_jumps,
             error_growth.rounds_continuously(inputs.scenario),
         )
-        if estimate.growth != ():
+        if not is_absent(estimate.growth):
             grown = _grown_error(method, inputs, carry, index, parts, before, width)
             estimate = estimate._replace(growth=grown)
     after, raised = later
@@ -251,12 +247,12 @@ def _concluded(
         status = status | raised
     limit = plants.speed_limit(inputs.scenario.plant)
     valid = is_valid(after, limit) & (status & int(Status.NOT_FINITE) == 0)
-    status |= flag(~valid & goes_on, Status.NOT_FINITE)
+    status |= flag(~valid & in_run, Status.NOT_FINITE)
     if plants.is_chain(inputs.scenario.plant):
         stages = [slope for _, slopes in parts for slope in slopes]
         lost = jnp.any(jnp.stack([has_no_input(slope) for slope in stages]))
-        status |= flag(lost & goes_on, Status.SINGULAR_GAIN)
-    return keep_if(valid & goes_on, after, before), status, nearest, estimate
+        status |= flag(lost & in_run, Status.SINGULAR_GAIN)
+    return keep_if(valid & in_run, after, before), status, nearest, estimate
 
 
 def _grown_error(
@@ -290,13 +286,23 @@ def _grown_error(
     )
 
 
-def recorded(folds: Any, found: Advanced):
-    """What a run keeps of an instant: the sample, and the states of law and observer."""
+class Record(NamedTuple):
+    """What a run keeps of an instant; the states have the names of the fields of a `Rollout`."""
+
+    signals: dict[str, Any]
+    controller_state: Any
+    observer_state: Any
+    actuator_state: Any
+    measured: Any
+
+
+def recorded(folds: Any, found: Advanced) -> Record:
+    """The signals of an instant, and the states of law, observer, actuator and sensor."""
     state, measured = found.state, ()
-    if state.sampled:
+    if not is_absent(state.sampled):
         measured = state.sampled.measured
-    states = state.controller, state.observer, state.actuator, measured
-    return attributes(found.sample, FIELDS), *states
+    signals = attributes(found.sample, FIELDS)
+    return Record(signals, state.controller, state.observer, state.actuator, measured)
 
 
 POSITIONS = ("t", "q", "e1", "lower", "upper", "q_d")

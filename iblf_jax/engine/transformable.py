@@ -38,7 +38,7 @@ from iblf_jax.engine.compile import (
     run_by_executor,
 )
 from iblf_jax.engine.derivatives import DerivativeSizes, choose_derivatives
-from iblf_jax.engine.direction import Runs, derivative
+from iblf_jax.engine.direction import TracedRuns, derivative
 from iblf_jax.engine.loops import kernel_loop, scan
 from iblf_jax.engine.outcome import Outcome
 from iblf_jax.engine.request import RunRequest
@@ -62,14 +62,14 @@ def run_transformable(
     backend, reason = registry.default_backend()
     compiles = request.backend != "vmap" and reason is None
     request = request._replace(constants=constants_of(scenario), backend="auto")
-    runs = Runs(treedef, request, backend, (False,) * len(leaves))
+    runs = TracedRuns(treedef, request, backend, (False,) * len(leaves))
     if compiles:
         return _differentiable(runs)(*leaves)
     return _run_by_scan(runs, *leaves)
 
 
 @programs.jit(static_argnums=0)
-def _run_by_scan(runs: Runs, *leaves: jax.Array) -> Outcome:
+def _run_by_scan(runs: TracedRuns, *leaves: jax.Array) -> Outcome:
     """The run by the scan."""
     inputs = jax.tree.unflatten(runs.treedef, leaves)
     loop = partial(scan, rolled=thresholds.rolls_stages(operations(inputs)))
@@ -77,7 +77,7 @@ def _run_by_scan(runs: Runs, *leaves: jax.Array) -> Outcome:
 
 
 @CACHE.memoised(64)
-def _differentiable(runs: Runs, beside_derivative: bool = False) -> Callable:
+def _differentiable(runs: TracedRuns, beside_derivative: bool = False) -> Callable:
     """The run, with derivatives by the kernel.
 
     Args:
@@ -140,7 +140,7 @@ def _replaced(leaves: tuple, places: tuple[int, ...], moved: Sequence[jax.Array]
     return tuple(new.get(i, x) for i, x in enumerate(leaves))
 
 
-def _run_by_kernel(runs: Runs, *leaves: jax.Array) -> Outcome:
+def _run_by_kernel(runs: TracedRuns, *leaves: jax.Array) -> Outcome:
     """The run by the kernel."""
     if checks.is_concrete(leaves):
         inputs = jax.tree.unflatten(runs.treedef, leaves)
@@ -149,14 +149,14 @@ def _run_by_kernel(runs: Runs, *leaves: jax.Array) -> Outcome:
     return jax.tree.map(lambda x: x[0], _over_runs(_values, runs)(*leaves))
 
 
-def _is_by_scenario(runs: Runs, places: Places) -> bool:
+def _is_by_scenario(runs: TracedRuns, places: Places) -> bool:
     """Whether all leaves at these places belong to the scenario."""
     scenario = jax.tree.unflatten(runs.treedef, runs.is_per_run).scenario
     number_of_leaves = len(jax.tree.leaves(scenario))
     return all(i < number_of_leaves for level in places for i in level)
 
 
-def _by_kernel(runs: Runs, places: Places, leaves: tuple) -> Any:
+def _by_kernel(runs: TracedRuns, places: Places, leaves: tuple) -> Any:
     """A derivative of records and metrics by the kernel, differentiable; None where there is
     none.
     """
@@ -185,7 +185,7 @@ def _by_kernel(runs: Runs, places: Places, leaves: tuple) -> Any:
     return first_that_works(runs.plan, lambda _: kernel(*leaves), lambda: None)
 
 
-def _by_scan(runs: Runs, places: Places, leaves: tuple) -> Any:
+def _by_scan(runs: TracedRuns, places: Places, leaves: tuple) -> Any:
     """As `_by_kernel`, by the scan."""
     if not places:
         found = _run_by_scan(runs, *leaves)
@@ -210,7 +210,7 @@ def _by_scan(runs: Runs, places: Places, leaves: tuple) -> Any:
     return jax.vmap(along, out_axes=len(places) - 1)(units)
 
 
-def _derivative_sizes(runs: Runs, places: Places, leaves: tuple) -> DerivativeSizes:
+def _derivative_sizes(runs: TracedRuns, places: Places, leaves: tuple) -> DerivativeSizes:
     """The sizes that decide how a derivative of one run's records and metrics is computed."""
     every = runs.request.record_every
     columns = [sum(jnp.size(leaves[i]) for i in level) for level in places]
@@ -228,7 +228,7 @@ def _derivative_sizes(runs: Runs, places: Places, leaves: tuple) -> DerivativeSi
     )
 
 
-def _over_runs(function: Callable, runs: Runs, *static: Any) -> Callable:
+def _over_runs(function: Callable, runs: TracedRuns, *static: Any) -> Callable:
     """function(runs, *static, leaves) for many runs at once where JAX batches it: more runs of one
     call.
     """
@@ -245,7 +245,7 @@ def _over_runs(function: Callable, runs: Runs, *static: Any) -> Callable:
 
 
 @programs.jit(static_argnums=0)
-def _values(runs: Runs, leaves: tuple) -> Outcome:
+def _values(runs: TracedRuns, leaves: tuple) -> Outcome:
     def run(loop, batch):
         return run_all(loop, batch, runs.request)
 
@@ -254,7 +254,7 @@ def _values(runs: Runs, leaves: tuple) -> Outcome:
 
 
 @programs.jit(static_argnums=(0, 1))
-def _columns(runs: Runs, places: Places, leaves: tuple) -> Any:
+def _columns(runs: TracedRuns, places: Places, leaves: tuple) -> Any:
     loop = kernel_loop(registry.EXECUTORS[runs.backend])
     return columns(loop, runs.batch(leaves), places, runs.request)
 

@@ -81,10 +81,10 @@ def rollout_to_xarray(run: Rollout) -> xarray.Dataset:
 
     Returns:
       A Dataset with the dimensions time (T), joint (n), region if the scenario has regions, and run
-      (B) first for a batch; for plants in strict-feedback form level (r) and higher_level (r - 2,
-      the levels from the third on).  Its variables are the Rollout's fields and metrics, each with
-      `units` and `description`.  A metric with the name of another variable is called
-      `metric_<name>`.
+      (B) first for a batch; for plants in strict-feedback form level (r), higher_level (r - 2, the
+      levels from the third on) and model_level (the levels of the model).  Its variables are the
+      Rollout's fields and metrics, each with `units` and `description`.  A metric with the name of
+      another variable is called `metric_<name>`.
 
     Raises:
       ValueError: not a Rollout, or a traced one.
@@ -322,10 +322,11 @@ def _components_and_levels(run: Rollout, variables: Mapping[str, Any]) -> dict[s
     sizes: dict[str, int] = {}
     for dims, values, *_ in variables.values():
         sizes |= dict(zip(dims, np.shape(values), strict=True))
-    for dimension, first in (("level", 1), ("higher_level", 3)):
+    for dimension, first in (("level", 1), ("model_level", 1), ("higher_level", 3)):
         if dimension in sizes:
-            numbers = np.arange(first, first + sizes[dimension], dtype=np.int32)
-            text = f"level of the plant, from {first}: {', '.join(levels[first - 1 :])}"
+            last = first + sizes[dimension]
+            numbers = np.arange(first, last, dtype=np.int32)
+            text = f"level of the plant, from {first}: {', '.join(levels[first - 1 : last - 1])}"
             found[dimension] = (dimension, numbers, _attrs("1", text))
     return found
 

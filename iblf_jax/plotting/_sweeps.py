@@ -57,7 +57,8 @@ def summary(data: xarray.Dataset, metric: str) -> tuple[xarray.DataArray, str]:
     values = data[metric]
     label = metric.replace("_", " ")
     unit = values.attrs.get("units", "1")
-    entries = [name for name in ("level", "higher_level", "joint") if name in values.dims]
+    rows = ("level", "model_level", "higher_level", "joint")
+    entries = [name for name in rows if name in values.dims]
     if entries:
         values = values.min(entries) if metric in SMALLER_IS_WORSE else values.max(entries)
         label = f"{label} of the worst joint"

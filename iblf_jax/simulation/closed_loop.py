@@ -1,11 +1,12 @@
 """The closed loop: the one place where plant, sensor, law, observer and actuator meet.
 
-    state  x = (q, q', state of the law, state of the observer, state of the actuator)
+    state  x = (x_1 ... x_r), of a robot (q, q'), with the states of law, observer and actuator
     q" = M^-1 (tau + disturbance + friction - C q' - G)      M, C, G, friction of the plant at t
     f  = M0 q" + C0 q' + G0 - tau                            the uncertain term             (2.1)
     V2 = sum V1 + 1/2 e2^T M0 e2 + 1/2 f_tilde^T f_tilde                                   (3.12)
 
-The second term of V2 is left out for a law whose V1 `includes_e2`.
+The equations are those of a robot; another plant has its own (`plants`). The second term of V2 is
+left out for a law whose V1 `includes_e2`.
 
 `evaluate` returns the rate of the state and a `Sample` of every signal. Where a caller uses the
 rate only, as in the later stages of an integrator, the compiler removes the rest.
@@ -29,7 +30,7 @@ from iblf_jax.control.controllers import Command
 from iblf_jax.control.observers import Observer
 from iblf_jax.control.sensors import Measurement
 from iblf_jax.control.sensors._base import measurement_of
-from iblf_jax.core.pytree import unwrapped
+from iblf_jax.core.pytree import is_absent, unwrapped
 from iblf_jax.simulation.delays import initial_commands
 from iblf_jax.simulation.levels import (
     completed,
@@ -81,26 +82,25 @@ def law_signals(
     the levels that it received from an observer, and `sent` is the `SentCommand` of an event
     trigger, or `()`.
     """
-    has_other_input = not isinstance(command.input, tuple)
     return LawSignals(
-        command.alpha,
-        command.V1,
-        f_hat,
-        command.guard_active,
-        command.saturated,
-        command.slack,
-        command.region_slack,
-        command.alpha_higher,
-        command.tau if has_other_input else (),
-        estimated,
-        command.auxiliary,
-        sent.number if sent else (),
+        alpha=command.alpha,
+        V1=command.V1,
+        f_hat=f_hat,
+        guard_active=command.guard_active,
+        saturated=command.saturated,
+        slack=command.slack,
+        region_slack=command.region_slack,
+        alpha_higher=command.alpha_higher,
+        torque=() if is_absent(command.input) else command.tau,
+        estimated=estimated,
+        auxiliary=command.auxiliary,
+        events=() if is_absent(sent) else sent.number,
     )
 
 
 def plant_input(command: Command) -> jax.Array:
     """The input of the plant that a law commands, (n,): its torque, unless it has another input."""
-    return command.tau if isinstance(command.input, tuple) else command.input
+    return command.tau if is_absent(command.input) else command.input
 
 
 class SampledState(NamedTuple):
@@ -149,11 +149,11 @@ class LoopState(NamedTuple):
 def initial_state(scenario: Scenario) -> LoopState:
     """The state at t = 0; an actuator starts with the torque that balances the model's gravity."""
     x, loop = start_levels(scenario), scenario.loop
-    known = x[: loop.model.order]
+    x_model = x[: loop.model.order]
     state = LoopState(
         x,
-        loop.law.init(known, scenario.context),
-        discrete_observer(scenario).init(known, loop.model),
+        loop.law.init(x_model, scenario.context),
+        discrete_observer(scenario).init(x_model, loop.model),
     )
     if scenario.sampling is None and isinstance(scenario.actuator, Ideal):
         return state
@@ -168,10 +168,10 @@ def _initial_sampled_state(scenario: Scenario, state: LoopState, tau: jax.Array)
     """State of a sampled loop before its first sample: every command in transit is `tau`."""
     sampling: Any = scenario.sampling
     loop, x = scenario.loop, state.x
-    known, t = x[: loop.model.order], jnp.zeros_like(x[0, 0])
-    f_hat = jax.eval_shape(partial(estimate, scenario, loop.observer), t, known, state.observer)
+    x_model, t = x[: loop.model.order], jnp.zeros_like(x[0, 0])
+    f_hat = jax.eval_shape(partial(estimate, scenario, loop.observer), t, x_model, state.observer)
     command, _ = jax.eval_shape(
-        loop.law.command, t, known, f_hat, scenario.context, state.controller
+        loop.law.command, t, x_model, f_hat, scenario.context, state.controller
     )
     here = measurement_of(x)
     estimated = jax.eval_shape(
@@ -191,7 +191,7 @@ def _initial_sampled_state(scenario: Scenario, state: LoopState, tau: jax.Array)
 
 def has_delay(state: LoopState) -> bool:
     """Whether a state contains past commands, because the input has a delay."""
-    return not isinstance(state.delayed, tuple)
+    return not is_absent(state.delayed)
 
 
 def integrated_part(state: LoopState) -> LoopState:
@@ -203,14 +203,14 @@ def integrated_part(state: LoopState) -> LoopState:
     """
     if has_delay(state):
         return state._replace(delayed=jnp.zeros_like(state.x[0]))
-    if state.sampled == ():
+    if is_absent(state.sampled):
         return state
     return state._replace(controller=(), observer=(), sampled=())
 
 
 def with_integrated_part(state: LoopState, part: LoopState) -> LoopState:
     """The state with its `integrated_part` replaced."""
-    if state.sampled == ():
+    if is_absent(state.sampled):
         return part._replace(delayed=state.delayed)
     return state._replace(x=part.x, actuator=part.actuator)
 
@@ -238,12 +238,12 @@ def evaluate(
         delay; the newest command if not given.
     """
     loop, x = scenario.loop, state.x
-    known = x[: loop.model.order]
+    x_model = x[: loop.model.order]
     controller_rate: Any = ()
     observer_rate: Any = ()
     undelayed: Any = ()
     if scenario.sampling is None:
-        f_hat = estimate(scenario, loop.observer, t, known, state.observer)
+        f_hat = estimate(scenario, loop.observer, t, x_model, state.observer)
         true = measurement_of(x)
         measured = completed(scenario, loop.observer, t, true, state.observer)
         answer, controller_rate = loop.law.command(
@@ -260,17 +260,17 @@ def evaluate(
         command = state.sampled.commands[0] if torque is None else torque
         signals = state.sampled.signals
     delivered = scenario.actuator.at(t).deliver(command, x[1], state.actuator)
-    moved = motion(scenario, t, x, delivered.tau)
+    x_rate = motion(scenario, t, x, delivered.tau)
     if scenario.sampling is None:
-        observer_rate = loop.observer.derivative(t, known, answer.tau, loop.model, state.observer)
+        observer_rate = loop.observer.derivative(t, x_model, answer.tau, loop.model, state.observer)
     rate = LoopState(
-        moved,
+        x_rate,
         controller=controller_rate,
         observer=observer_rate,
         actuator=delivered.rate,
         delayed=undelayed,
     )
-    sample = sample_at(scenario, t, dt, x, moved, delivered.tau, delivered.limited, signals)
+    sample = sample_at(scenario, t, dt, x, x_rate, delivered.tau, delivered.limited, signals)
     return rate, sample
 
 
@@ -306,7 +306,7 @@ def sample_at(
     t: jax.Array,
     dt: jax.Array | float,
     x: jax.Array,
-    moved: jax.Array,
+    x_rate: jax.Array,
     tau: jax.Array,
     limited: jax.Array,
     signals: LawSignals,
@@ -318,22 +318,22 @@ def sample_at(
       t: time, () [s].
       dt: weight of the sample in an integral over time, () [s].
       x: state of the plant, (r, n).
-      moved: its rate, (r, n).
+      x_rate: x', (r, n).
       tau: input of the plant, (n,): of a robot the torque on the joints [N m].
       limited: whether the actuator delivered less than the command, (n,) bool.
       signals: of the law.
     """
     tube = scenario.context.tube(t)
-    terms = _uncertain_signals(scenario, t, x, moved, tau, signals)
+    terms = _uncertain_signals(scenario, t, x, x_rate, tau, signals)
     lower, upper = _bounds_of_levels(scenario, t, tube, x, signals)
     errors = [x[0] - tube.q_d, x[1] - signals.alpha]
-    if not isinstance(signals.alpha_higher, tuple):
+    if not is_absent(signals.alpha_higher):
         errors += list(x[2:] - signals.alpha_higher)
     optional: dict[str, Any] = {}
     if scenario.regions:
         robot = plants.robot_of(scenario.plant)
         optional["region_margin"] = margins(scenario.regions, robot, x[0])
-    if signals.estimated != ():
+    if not is_absent(signals.estimated):
         optional |= signals.estimated._asdict()
     return Sample(
         t=t,
@@ -375,7 +375,7 @@ def _uncertain_signals(
     scenario: Scenario,
     t: jax.Array,
     x: jax.Array,
-    moved: jax.Array,
+    x_rate: jax.Array,
     tau: jax.Array,
     signals: LawSignals,
 ) -> _UncertainSignals:
@@ -383,20 +383,20 @@ def _uncertain_signals(
     sum w_i V_i.
     """
     model = scenario.loop.model
-    x, rate = x[: model.order], moved[: model.order]
+    x, x_rate = x[: model.order], x_rate[: model.order]
     balance = model.steady_input(x[0])
-    if not isinstance(signals.torque, tuple):
+    if not is_absent(signals.torque):
         # The plant has another input than the torque of the law.
         tau, balance = signals.torque, None
     if balance is None:
         balance = steady_input(scenario, x[0])
-    found = model.uncertain(t, x, rate, tau)
-    known = model.as_uncertain(x, signals.f_hat)
+    found = model.uncertain(t, x, x_rate, tau)
+    estimated = model.as_uncertain(x, signals.f_hat)
     includes_e2 = unwrapped(scenario.controller).includes_e2
     e2 = None if includes_e2 else x[1] - signals.alpha
     V = jnp.sum(signals.V1)
-    added = model.energy_of_errors(x, e2, found - known)
-    return _UncertainSignals(balance, found, known, V if added is None else V + added)
+    added = model.energy_of_errors(x, e2, found - estimated)
+    return _UncertainSignals(balance, found, estimated, V if added is None else V + added)
 
 
 def _bounds_of_levels(
@@ -407,21 +407,21 @@ def _bounds_of_levels(
     The bounds of the velocities of a robot may follow q_d'; those of the levels of another plant
     may follow the virtual control alpha_{i-1} of the law.
     """
-    sides = [(tube.lower, tube.upper)]
+    bounds_of_levels = [(tube.lower, tube.upper)]
     last = max(i for i, bounds in enumerate(scenario.bounds) if bounds is not None)
     centres = [signals.alpha, *jnp.zeros_like(x[2:])]
-    if not isinstance(signals.alpha_higher, tuple):
+    if not is_absent(signals.alpha_higher):
         centres[1:] = signals.alpha_higher
     infinite = jnp.full_like(x[0], jnp.inf)
     above = zip(scenario.bounds[1 : last + 1], centres, strict=False)
     for level, (bounds, centre) in enumerate(above, start=2):
         if bounds is None:
-            sides.append((-infinite, infinite))
+            bounds_of_levels.append((-infinite, infinite))
         elif level == 2 and has_speed_limits(scenario):
-            sides.append(scenario.context.speed_limits(t))
+            bounds_of_levels.append(scenario.context.speed_limits(t))
         else:
-            sides.append(bounds_at(bounds, t, centre))
-    lower, upper = zip(*sides, strict=True)
+            bounds_of_levels.append(bounds_at(bounds, t, centre))
+    lower, upper = zip(*bounds_of_levels, strict=True)
     return jnp.stack(lower), jnp.stack(upper)
 
 
@@ -503,7 +503,7 @@ def law_update(
 
 def _with_sent_input(command: Command, sent: SentCommand) -> Command:
     """A command with the torque and the input that an event trigger sent."""
-    if isinstance(command.input, tuple):
+    if is_absent(command.input):
         return command._replace(tau=sent.input)
     return command._replace(tau=sent.torque, input=sent.input)
 
@@ -584,7 +584,7 @@ def perturbed_state(state: LoopState) -> Any:
     """The variables by which the loop is linearised: its state without past commands, or the
     `PerturbedState` of a sampled loop.
     """
-    if state.sampled == ():
+    if is_absent(state.sampled):
         return state._replace(delayed=())
     memory = (state.controller, state.observer, state.sampled.sensor)
     return PerturbedState(integrated_part(state), state.sampled.commands[0], memory)

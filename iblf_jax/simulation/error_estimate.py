@@ -47,6 +47,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from iblf_jax.core.linalg import matvec, solve, solve_spd
+from iblf_jax.core.pytree import is_absent
 from iblf_jax.core.units import POSITION
 from iblf_jax.simulation.closed_loop import LoopState, perturbed_state
 from iblf_jax.simulation.discontinuities import has_jump
@@ -84,7 +85,7 @@ class Accuracy(NamedTuple):
     pending: tuple[jax.Array, ...]
     """Contributions of past rates to the local errors at the next instants, (2 n,) each: n for the
     positions, then n for their final displacement, from x'_q + R x'_y."""
-    drift: jax.Array
+    accumulated_error: jax.Array
     """Accumulated error L of the same 2 n numbers."""
     response: jax.Array
     """R, (n, m - n); of a sampled loop its columns of the levels from the second on."""
@@ -103,17 +104,17 @@ def _watched(state: LoopState, values: LoopState) -> list:
     """The leaves of `values` at the levels of the plant and at the floating-point states of
     observer and actuator of `state`. The state of the law is not watched.
     """
-    kinds = jax.tree.leaves((state.x, state.observer, state.actuator))
+    reference_leaves = jax.tree.leaves((state.x, state.observer, state.actuator))
     found = jax.tree.leaves((values.x, values.observer, values.actuator))
-    pairs = zip(kinds, found, strict=True)
-    return [x for kind, x in pairs if jnp.issubdtype(kind.dtype, jnp.floating)]
+    pairs = zip(reference_leaves, found, strict=True)
+    return [x for leaf, x in pairs if jnp.issubdtype(leaf.dtype, jnp.floating)]
 
 
 def watched_indices(state: LoopState) -> np.ndarray:
     """Indices of the m watched numbers in the flat `closed_loop.perturbed_state`; all of them for a
     sampled loop.
     """
-    if state.sampled:
+    if not is_absent(state.sampled):
         return np.arange(sum(x.size for x in jax.tree.leaves(perturbed_state(state))))
     leaves, structure = jax.tree.flatten(state)
     ends = np.cumsum([0, *(x.size for x in leaves)])
@@ -174,7 +175,7 @@ def begin(method: str, jacobian: jax.Array, state: LoopState) -> Accuracy:
     R = response(jacobian, n)
     none = jnp.zeros((2 * n,), jacobian.dtype)
     pending = (none,) * steps_back(method)
-    if state.sampled:
+    if not is_absent(state.sampled):
         # Only a method of one stage uses an earlier rate; only levels have a local error.
         pending = (none,) if len(tableau(method).c) == 1 else ()
         R = _of_levels(R, state)
@@ -250,7 +251,7 @@ def _update_by_differences(
         added = jnp.where(restarts, by_stages, added)
     if absolute:
         added = jnp.abs(added)
-    drift = (1.0 - SLOWEST_RATE * dt) * accuracy.drift + added
+    accumulated = (1.0 - SLOWEST_RATE * dt) * accuracy.accumulated_error + added
     pending = [
         x + newest_first[per_step * (k + 1)] * here
         for k, x in enumerate((*accuracy.pending[1:], jnp.zeros_like(here)))
@@ -258,7 +259,7 @@ def _update_by_differences(
     if table.halfway:
         middle = _rate(accuracy, slopes[table.halfway])
         pending = [x + newest_first[2 * k + 1] * middle for k, x in enumerate(pending)]
-    return _with_drift(accuracy, tuple(pending), drift, width)
+    return _with_error(accuracy, tuple(pending), accumulated, width)
 
 
 def _update_by_stages(
@@ -272,24 +273,24 @@ def _update_by_stages(
     """The estimate of a sampled loop: from the stages of one step. A method of one stage is
     compared with the step before.
     """
-    drift = (1.0 - SLOWEST_RATE * dt) * accuracy.drift
+    accumulated = (1.0 - SLOWEST_RATE * dt) * accuracy.accumulated_error
 
     def motion_rate(slope: LoopState) -> jax.Array:
         return _rate(accuracy, slope._replace(observer=(), actuator=()))
 
     if not accuracy.pending:
         for length, slopes in pieces:
-            drift = drift + _error_by_stages(motion_rate, table, length, slopes)
-        return _with_drift(accuracy, (), drift, width)
+            accumulated = accumulated + _error_by_stages(motion_rate, table, length, slopes)
+        return _with_error(accuracy, (), accumulated, width)
     before = accuracy.pending[0]
     for length, slopes in pieces:
         here = motion_rate(slopes[0])
         local_error = (here - before) / 2.0
         if restarts is not None:
             local_error = jnp.where(restarts, 0.0, local_error)
-        drift = drift + jax.lax.stop_gradient(length) * local_error
+        accumulated = accumulated + jax.lax.stop_gradient(length) * local_error
         before = here
-    return _with_drift(accuracy, (motion_rate(pieces[0][1][0]),), drift, width)
+    return _with_error(accuracy, (motion_rate(pieces[0][1][0]),), accumulated, width)
 
 
 def _error_by_stages(
@@ -372,15 +373,18 @@ def _size(slope: LoopState) -> Any:
     return sum(jnp.sum(jnp.abs(x)) for x in jax.tree.leaves(jax.lax.stop_gradient(slope)))
 
 
-def _with_drift(
-    accuracy: Accuracy, pending: tuple[jax.Array, ...], drift: jax.Array, width: jax.Array
+def _with_error(
+    accuracy: Accuracy,
+    pending: tuple[jax.Array, ...],
+    accumulated: jax.Array,
+    width: jax.Array,
 ) -> Accuracy:
     """The estimate with a new accumulated error."""
     n = width.size
-    size = jnp.maximum(jnp.abs(drift[:n]), jnp.abs(drift[n:]))
+    size = jnp.maximum(jnp.abs(accumulated[:n]), jnp.abs(accumulated[n:]))
     return accuracy._replace(
         pending=pending,
-        drift=drift,
+        accumulated_error=accumulated,
         error=jnp.maximum(accuracy.error, size),
         relative=jnp.maximum(accuracy.relative, jnp.max(size / width)),
     )

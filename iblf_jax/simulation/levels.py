@@ -7,7 +7,7 @@ plant of order 2 of a robot, and parts of x of those that users wrote for q and 
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,16 +16,19 @@ from iblf_jax.control.controllers import Law
 from iblf_jax.control.observers import Observer
 from iblf_jax.control.sensors._base import Measurement
 from iblf_jax.core import taylor
-from iblf_jax.core.linalg import solve_spd
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.world import plants
 from iblf_jax.world.plants import Plant
 from iblf_jax.world.robots import at_time, friction_torque, inverse_dynamics
+from iblf_jax.world.robots._base import forward_dynamics
+
+if TYPE_CHECKING:
+    from iblf_jax.simulation.scenario import Scenario
 
 # --- the start ------------------------------------------------------------------------------------
 
 
-def start_levels(scenario: Any) -> jax.Array:
+def start_levels(scenario: Scenario) -> jax.Array:
     """The state of the plant at t = 0, (r, n).
 
     A start given by q and q' alone is in the steady state of the plant: the static equilibrium of a
@@ -40,7 +43,7 @@ def start_levels(scenario: Any) -> jax.Array:
     return plants.state_of_levels(initial.q, initial.dq, higher)
 
 
-def levels_on_reference(scenario: Any, t: jax.Array) -> jax.Array:
+def levels_on_reference(scenario: Scenario, t: jax.Array) -> jax.Array:
     """The state of a plant that follows its reference exactly and without disturbance, (r, n)."""
     plant, position = scenario.loop.plant, scenario.reference.position
     curves = [taylor.in_time(position, t, plant.order - 1)]
@@ -65,7 +68,7 @@ def _curve_of_next_level(plant: Plant, level: int, t: jax.Array, curves: list) -
     return taylor.along(above, points)
 
 
-def steady_input(scenario: Any, q: jax.Array) -> jax.Array:
+def steady_input(scenario: Scenario, q: jax.Array) -> jax.Array:
     """The input with which an actuator starts, (n,): it balances the gravity of the model, and is 0
     for a plant that states no such input.
 
@@ -76,7 +79,7 @@ def steady_input(scenario: Any, q: jax.Array) -> jax.Array:
     return jnp.zeros_like(q) if found is None else found
 
 
-def stated_steady_input(scenario: Any, q: jax.Array) -> jax.Array | None:
+def stated_steady_input(scenario: Scenario, q: jax.Array) -> jax.Array | None:
     """The `steady_input` of the model, or of the plant where only the model is a robot; None for a
     plant that states none.
     """
@@ -86,7 +89,7 @@ def stated_steady_input(scenario: Any, q: jax.Array) -> jax.Array | None:
     return model.steady_input(q)  # type: ignore[no-any-return]
 
 
-def has_speed_limits(scenario: Any) -> bool:
+def has_speed_limits(scenario: Scenario) -> bool:
     """Whether the bounds of the second level are those of a robot's velocities, which may follow
     q_d'.
     """
@@ -97,7 +100,7 @@ def has_speed_limits(scenario: Any) -> bool:
 
 
 def estimate(
-    scenario: Any, observer: Observer, t: jax.Array, x: jax.Array, state: Any
+    scenario: Scenario, observer: Observer, t: jax.Array, x: jax.Array, state: Any
 ) -> jax.Array:
     """The estimate that the law receives: the torque f_hat, (n,) [N m], or d_hat, (r, n).
 
@@ -116,7 +119,7 @@ def estimate(
 
 
 def completed(
-    scenario: Any, observer: Observer, t: jax.Array, measured: Measurement, state: Any
+    scenario: Scenario, observer: Observer, t: jax.Array, measured: Measurement, state: Any
 ) -> Measurement:
     """The levels that the law receives: those of a measurement, with the estimates of an observer
     in the place of the levels that it does not read.
@@ -142,11 +145,11 @@ class EstimatedLevels(NamedTuple):
 
 
 def estimated_levels(
-    scenario: Any,
+    scenario: Scenario,
     observer: Observer,
     t: jax.Array,
     reading: Measurement,
-    known: Measurement,
+    received: Measurement,
     true: jax.Array,
     state: Any,
 ) -> EstimatedLevels | tuple[()]:
@@ -157,14 +160,14 @@ def estimated_levels(
       observer: as the loop runs it.
       t: time, () [s].
       reading: the measurement.
-      known: the same, with the estimates of the observer.
+      received: the same, with the estimates of the observer.
       true: the levels of the plant, (r, n).
       state: of the observer.
     """
     if not observer.completes:
         return ()
     model = scenario.loop.model
-    x_hat = known.x[: model.order]
+    x_hat = received.x[: model.order]
     excess = observer.limit_excess(t, reading.x[: model.order], model, state)
     return EstimatedLevels(x_hat, x_hat - true[: model.order], excess)
 
@@ -172,7 +175,7 @@ def estimated_levels(
 # --- motion of the plant --------------------------------------------------------------------------
 
 
-def motion(scenario: Any, t: jax.Array, x: jax.Array, u: jax.Array) -> jax.Array:
+def motion(scenario: Scenario, t: jax.Array, x: jax.Array, u: jax.Array) -> jax.Array:
     """The rate x' of the plant's state under the input u, (r, n)."""
     given, model, disturbance = scenario.plant.at(t), scenario.model, scenario.disturbance
     plant = plants.as_plant(given)
@@ -183,25 +186,25 @@ def motion(scenario: Any, t: jax.Array, x: jax.Array, u: jax.Array) -> jax.Array
         torque: jax.Array | float = 0.0 if friction is None else friction
         u = u + disturbance.torque(t, q, dq, given, model)
     else:
-        known = plants.robot_of(model)
-        torque = disturbance.torque(t, q, dq, robot, known) + friction_torque(robot, dq)
+        robot_model = plants.robot_of(model)
+        torque = disturbance.torque(t, q, dq, robot, robot_model) + friction_torque(robot, dq)
     rate = plants.flow(plant, t, x, u, torque)
     added = disturbance.rates(t, x, given, model)
     return rate if added is None else rate + added
 
 
 def acceleration(
-    scenario: Any, t: jax.Array, q: jax.Array, dq: jax.Array, tau: jax.Array
+    scenario: Scenario, t: jax.Array, q: jax.Array, dq: jax.Array, tau: jax.Array
 ) -> jax.Array:
     """Acceleration of a robot under the torque `tau`, (n,) [rad/s^2]."""
     plant = at_time(scenario.plant, t)
     external = scenario.disturbance.torque(t, q, dq, plant, scenario.model)
     applied = tau + external + friction_torque(plant, dq)
-    return solve_spd(plant.mass_matrix(q), applied - plant.coriolis(q, dq, dq) - plant.gravity(q))
+    return forward_dynamics(plant, q, dq, applied)
 
 
 def torque_needed(
-    scenario: Any, t: jax.Array, q: jax.Array, dq: jax.Array, ddq: jax.Array
+    scenario: Scenario, t: jax.Array, q: jax.Array, dq: jax.Array, ddq: jax.Array
 ) -> jax.Array:
     """The torque for which a robot has the acceleration `ddq`, (n,) [N m]: the inverse of
     `acceleration`.

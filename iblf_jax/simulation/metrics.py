@@ -25,10 +25,10 @@ from typing import Any, ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.observers._base import observer_of_x
+from iblf_jax.control.observers.none import observer_of_x
 from iblf_jax.core import checks
 from iblf_jax.core.families import Part, attribute
-from iblf_jax.core.pytree import Leaf, component, layers, leaf, note_code
+from iblf_jax.core.pytree import Leaf, component, is_absent, layers, leaf, note_code
 from iblf_jax.core.status import Status
 from iblf_jax.core.units import (
     HIGHER,
@@ -635,7 +635,7 @@ class LevelEstimation(Fold):
 
     def finish(self, acc: _LevelErrorState) -> dict[str, jax.Array]:
         """peak_level_error, (r, n); limited_time, (), where the estimates have limits."""
-        if isinstance(acc.excess, tuple):
+        if is_absent(acc.excess):
             return {"peak_level_error": acc.peak}
         return {"peak_level_error": acc.peak, "limited_time": acc.time}
 
@@ -759,7 +759,7 @@ def has_signal(scenario: Scenario, signal: str) -> bool:
     if signal == "events":
         return scenario.sampling is not None and scenario.sampling.trigger is not None
     has_filter = any(law.filters for law in layers(scenario.controller))
-    return has_filter and (signal == "slack" or has_regions)
+    return {"slack": has_filter, "region_slack": has_filter and has_regions}[signal]
 
 
 def check_needs(field: str, fold: Any, scenario: Scenario) -> None:

@@ -332,7 +332,7 @@ def with_extremes(
         last = rows[level - 1]
         least = least_distances(before[:, level - 1], last, variance, jnp.stack(numbers, axis=1))
         rows[level - 1] = jnp.where(instant > 0, least, last)
-    return dataclasses.replace(sample, sides=jnp.stack(rows, axis=1))
+    return dataclasses.replace(sample, least_distances=jnp.stack(rows, axis=1))
 
 
 # --- switching times ------------------------------------------------------------------------------

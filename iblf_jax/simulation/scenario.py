@@ -24,7 +24,7 @@ from iblf_jax.control.controllers import Law, LawContext, TrackingLaw
 from iblf_jax.control.controllers._base import check_law, law_of_x
 from iblf_jax.control.observers import DisturbanceObserver, NoObserver, Observer
 from iblf_jax.control.observers import _base as observers
-from iblf_jax.control.observers._base import observer_of_x
+from iblf_jax.control.observers.none import observer_of_x
 from iblf_jax.control.sensors import AnySensor, Sensor
 from iblf_jax.control.sensors import Ideal as IdealSensor
 from iblf_jax.control.sensors import _base as sensors

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from iblf_jax.core.pytree import is_absent
 from iblf_jax.core.units import (
     INPUT,
     LAST_LEVEL,
@@ -19,13 +20,24 @@ from iblf_jax.core.units import (
     PlantUnit,
 )
 
+PER_LEVEL = ("level", "joint")
+"""Dimensions of a signal or metric with one row per level of the plant."""
+PER_MODEL_LEVEL = ("model_level", "joint")
+"""With one row per level of the model, which has fewer where a robot is the model of a plant of
+higher order."""
+PER_HIGHER_LEVEL = ("higher_level", "joint")
+"""With one row per level from the third on."""
+PER_REGION = ("region",)
+
 
 class Recorded(NamedTuple):
-    """SI unit and meaning of a recorded signal."""
+    """SI unit, meaning and dimensions of a recorded signal."""
 
     unit: str
     """A `PlantUnit` where it depends on the plant."""
     meaning: str
+    dimensions: tuple[str, ...] = ()
+    """At an instant, where they are others than one number a joint."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -35,23 +47,25 @@ class Signals:
     """
 
     t: Annotated[Array, Recorded("s", "time")]
-    x: Annotated[Array, Recorded(LEVELS, "levels of the state")]
+    x: Annotated[Array, Recorded(LEVELS, "levels of the state", PER_LEVEL)]
     """(r, n); of a robot q and q'."""
     tau: Annotated[Array, Recorded(INPUT, "applied torque")]
-    e: Annotated[Array, Recorded(LEVELS, "errors of the levels")]
+    e: Annotated[Array, Recorded(LEVELS, "errors of the levels", PER_LEVEL)]
     """e_1 = x_1 - q_d and e_i = x_i - alpha_{i-1}, (r, n); (2, n) under a law of robots."""
     xi: Annotated[Array, Recorded("1", "position error relative to its bound")]
     """Inside the bounds if |xi| < 1."""
     q_d: Annotated[Array, Recorded(POSITION, "reference position")]
     dq_d: Annotated[Array, Recorded(VELOCITY, "reference velocity")]
-    level_lower: Annotated[Array, Recorded(LEVELS, "lower bounds of the levels")]
+    level_lower: Annotated[Array, Recorded(LEVELS, "lower bounds of the levels", PER_LEVEL)]
     """Up to the last level with bounds, -infinity for one without."""
-    level_upper: Annotated[Array, Recorded(LEVELS, "upper bounds of the levels")]
+    level_upper: Annotated[Array, Recorded(LEVELS, "upper bounds of the levels", PER_LEVEL)]
     alpha: Annotated[Array, Recorded(VELOCITY, "virtual velocity")]
     """The virtual control of the second level; those of others are x_i - e_i."""
-    disturbance: Annotated[Array, Recorded(UNCERTAIN, "lumped uncertain term f")]
-    """Of (2.1)."""
-    disturbance_estimate: Annotated[Array, Recorded(UNCERTAIN, "estimate of the uncertain term")]
+    disturbance: Annotated[Array, Recorded(UNCERTAIN, "lumped uncertain term f", PER_LEVEL)]
+    """Of (2.1), (n,); of a model in strict-feedback form d of (S.1), (r, n)."""
+    disturbance_estimate: Annotated[
+        Array, Recorded(UNCERTAIN, "estimate of the uncertain term", PER_LEVEL)
+    ]
     V: Annotated[Array, Recorded("1", "Lyapunov function V2")]
     """Of (3.12), ()."""
     _: dataclasses.KW_ONLY
@@ -60,11 +74,12 @@ class Signals:
     ] = ()
     """`()` under laws without a filter."""
     region_margin: Annotated[
-        Any, Recorded("m", "distance of the regions' points to their boundaries")
+        Any, Recorded("m", "distance of the regions' points to their boundaries", PER_REGION)
     ] = ()
     """One number a region; `()` where there are none."""
     region_slack: Annotated[
-        Any, Recorded("m/s^2", "violation of the safety filter's conditions on the regions")
+        Any,
+        Recorded("m/s^2", "violation of the safety filter's conditions on the regions", PER_REGION),
     ] = ()
     """`()` without regions or without a filter."""
     auxiliary: Annotated[
@@ -73,8 +88,8 @@ class Signals:
     """`()` under laws without one."""
     events: Annotated[Any, Recorded("1", "number of commands that the event trigger has sent")] = ()
     """(); `()` without an event trigger."""
-    x_hat: Annotated[Any, Recorded(LEVELS, "levels that the law received")] = ()
-    """One row a level; `()` without an observer that estimates levels."""
+    x_hat: Annotated[Any, Recorded(LEVELS, "levels that the law received", PER_MODEL_LEVEL)] = ()
+    """One row a level of the model; `()` without an observer that estimates levels."""
 
     @property
     def q(self) -> Array:
@@ -153,7 +168,8 @@ class Sample(Signals):
     """The loop at one instant: the recorded signals, and further ones that metrics use."""
 
     dt: Array
-    """Weight of this sample in an integral over time, sum dt g, () [s].
+    """Weight of this sample in an integral over time, sum dt g, () [s]; `step` is the time since
+    the instant before.
 
     The weights are those of the trapezoidal rule: the step, and half of it for the first and the
     last sample.  Where signals jump there are two samples of one time, the limits from either side,
@@ -171,7 +187,7 @@ class Sample(Signals):
     """`x_hat` less the levels at the instant at which the law ran, (r, n); `()` without it."""
     limit_excess: Any = dataclasses.field(default=(), kw_only=True)
     """Positive where a limit of an observer's estimates is active, () [1]; `()` without limits."""
-    sides: Any = dataclasses.field(default=(), kw_only=True)
+    least_distances: Any = dataclasses.field(default=(), kw_only=True)
     """Smallest distances of the levels to their lower and their upper bounds since the instant
     before, (2, m, n), under process noise (`noise.least_distances`); `()` without."""
 
@@ -180,7 +196,7 @@ def has(sample: Signals, signal: str) -> bool:
     """Whether a sample or a run has an optional signal: bounds of the velocities, a slack, margins
     of regions.
     """
-    return not isinstance(getattr(sample, signal), tuple)
+    return not is_absent(getattr(sample, signal))
 
 
 def least_margin(sample: Sample, level: int) -> Array:
@@ -188,8 +204,8 @@ def least_margin(sample: Sample, level: int) -> Array:
     before, (n,): that at the instant where no noise acts.
     """
     i = level - 1
-    if has(sample, "sides"):
-        return jnp.minimum(sample.sides[0, i], sample.sides[1, i])
+    if has(sample, "least_distances"):
+        return jnp.minimum(sample.least_distances[0, i], sample.least_distances[1, i])
     return margin_of(sample, level, sample.x[i])
 
 
@@ -197,9 +213,10 @@ def least_xi_margin(sample: Sample) -> Array:
     """The same distance of the first level, relative to that of the reference to the bound,
     1 - |xi|, (n,) [1].
     """
-    if has(sample, "sides"):
+    if has(sample, "least_distances"):
         below, above = sample.q_d - sample.lower, sample.upper - sample.q_d
-        return jnp.minimum(sample.sides[0, 0] / below, sample.sides[1, 0] / above)
+        distances = sample.least_distances
+        return jnp.minimum(distances[0, 0] / below, distances[1, 0] / above)
     return 1.0 - jnp.abs(sample.xi)
 
 
@@ -230,41 +247,6 @@ def virtual_controls(sample: Sample) -> list[Array]:
     return [sample.alpha, *higher]
 
 
-PER_REGION = ("region_margin", "region_slack", "largest_region_slack")
-"""Signals and metrics with one number per region."""
-PER_LEVEL = (
-    "disturbance",
-    "disturbance_estimate",
-    "estimate_rmse",
-    "x",
-    "e",
-    "level_lower",
-    "level_upper",
-    "x_hat",
-    "peak_level_error",
-)
-"""Signals and metrics with one row per level: the estimates of levels of every model, and the
-others of a model in strict-feedback form."""
-PER_HIGHER_LEVEL = ("level_margin", "level_alpha_margin")
-"""Signals and metrics with one row per level from the third on."""
-
-
-def dimension_names(name: str, shape: tuple[int, ...], joints: int) -> tuple[str, ...]:
-    """Names of the dimensions of a signal at one instant, or of a metric of one run: "joint" for
-    (n,), "level" or "higher_level" and "joint" for one row per level, "region" for one number per
-    region, else names of its own.
-    """
-    if name in PER_REGION:
-        return ("region",)
-    if shape == (joints,):
-        return ("joint",)
-    if len(shape) == 2 and name in PER_LEVEL:
-        return ("level", "joint")
-    if name in PER_HIGHER_LEVEL:
-        return ("higher_level", "joint")
-    return tuple(f"{name}_axis_{i}" for i in range(len(shape)))
-
-
 SIGNALS: dict[str, Recorded] = {
     **{
         name: hint.__metadata__[0]
@@ -274,3 +256,26 @@ SIGNALS: dict[str, Recorded] = {
     **{name: view.recorded for name, view in VIEWS.items()},
 }
 """Name of a signal -> its unit and meaning, time first."""
+
+METRIC_DIMENSIONS = {
+    "estimate_rmse": PER_LEVEL,
+    "peak_level_error": PER_MODEL_LEVEL,
+    "level_margin": PER_HIGHER_LEVEL,
+    "level_alpha_margin": PER_HIGHER_LEVEL,
+    "largest_region_slack": PER_REGION,
+}
+"""Dimensions of the metrics that have others than one number a joint."""
+
+
+def dimension_names(name: str, shape: tuple[int, ...], joints: int) -> tuple[str, ...]:
+    """Names of the dimensions of a signal at one instant, or of a metric of one run: those that it
+    declares where it has as many, else "joint" for (n,), and else names of its own.
+    """
+    declared = METRIC_DIMENSIONS.get(name, ())
+    if name in SIGNALS:
+        declared = SIGNALS[name].dimensions
+    if declared and len(shape) == len(declared):
+        return declared
+    if shape == (joints,):
+        return ("joint",)
+    return tuple(f"{name}_axis_{i}" for i in range(len(shape)))

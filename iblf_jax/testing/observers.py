@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.control.observers import Observer
-from iblf_jax.control.observers._base import contract_of, observer_of_x
+from iblf_jax.control.observers._base import contract_of
+from iblf_jax.control.observers.none import observer_of_x
 from iblf_jax.core import checks
 from iblf_jax.testing._contract import (
     Findings,

@@ -14,6 +14,7 @@ from iblf_jax.observers import AsPublished, Momentum, NoObserver
 from iblf_jax.robots import mass_matrix_rate
 
 import iblf_jax as ij
+from iblf_jax.control.observers.none import observer_of_x
 from iblf_jax.simulation.closed_loop import LoopState, evaluate
 from iblf_jax.simulation.scenario import canonical
 
@@ -95,7 +96,7 @@ def test_no_observer_estimates_nothing():
     for scenario, shape in ((robot, (2,)), (drive, (3, 2))):
         model = scenario.loop.model
         x = jnp.ones((model.order, 2))
-        observer = NoObserver().of_x()
+        observer = observer_of_x(NoObserver())
         estimate = observer.estimate(0.0, x, model, ())
         assert estimate.shape == shape and not np.any(np.asarray(estimate))
         assert jax.tree.leaves(observer.init(x, model)) == []

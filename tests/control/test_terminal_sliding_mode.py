@@ -197,3 +197,26 @@ def test_a_sampled_loop_is_assessed_with_the_slope_of_the_layer():
         reported.append(bool(int(run.status) & int(Status.SAMPLING_TOO_SLOW)))
     assert radii[0] < 1.0 < radii[1]
     assert reported == [False, True]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "wrapped",
+    [
+        lambda law: ij.controllers.Saturated(law, limit=1e4),
+        lambda law: ij.controllers.Saturated(law, limit=1e-3),
+        lambda law: ij.controllers.Saturated(law, limit=1e-3, auxiliary=5.0, edge="smooth"),
+        lambda law: ij.controllers.SafetyFilter(law, limit=30.0),
+    ],
+    ids=["unreached limit", "limit", "auxiliary state", "filter"],
+)
+def test_limits_of_laws_within_others_are_left_out_of_the_linearisation(wrapped):
+    """Wherever a limit is active the radius would be at least 1, that of an open loop."""
+    law = LAW | {"beta": 2.0, "K": 20.0, "layer": 0.05}
+    start = ij.Initial(q=[0.8, 0.6], dq=[0.0, 0.0])
+    scenario = loop(law, initial=start, sampling=ij.Sampling(period=1e-3))
+    scenario = ij.with_parts(scenario, controller=wrapped(scenario.controller))
+    with notices.muted():
+        run = ij.simulate(scenario, duration=0.02, dt=1e-3)
+    assert float(run.metrics.sampling_radius) < 1.0
+    assert not int(run.status) & int(Status.SAMPLING_TOO_SLOW)

@@ -322,7 +322,7 @@ def test_where_kernels_cannot_the_scan_differentiates(paper, monkeypatch):
         return jnp.sum(
             transformable.run_transformable(
                 scenario, (), dt, request.RunRequest(30, "euler", 1)
-            ).records[0]["x"][-1, 0]
+            ).records.signals["x"][-1, 0]
         )
 
     K2, dt, calls = jnp.asarray([20.0, 15.0]), jnp.asarray(1e-3), []

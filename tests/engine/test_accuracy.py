@@ -67,10 +67,10 @@ def positions(scenario, varied, dt, steps, method):
         lambda varied, dt: run_batch(scenario, varied, folds, dt, RunRequest(steps, method, every))
     )
     found = run({path: jnp.asarray(x) for path, x in varied.items()}, jnp.asarray(dt))
-    arrays = found.records[0]
+    arrays = found.records.signals
     return (
         np.asarray(arrays["x"][..., 0, :]),
-        np.asarray((arrays["level_upper"] - arrays["level_lower"])[..., 0, :]),
+        np.asarray(arrays["level_upper"] - arrays["level_lower"])[..., 0, :],
         np.asarray(found.metrics[RELATIVE]),
         np.asarray(found.status),
     )

@@ -102,7 +102,7 @@ def agree(name, dtype, run):
     times = (x.metrics["first_violation_time"] for x in (found, expected))
     np.testing.assert_allclose(*times, rtol=0, atol=1.01 * DT)
     for field in ("x", "e", "xi", "tau", "disturbance_estimate"):
-        one, other = (x.records[0][field][ok] for x in (found, expected))
+        one, other = (x.records.signals[field][ok] for x in (found, expected))
         scale = max(1.0, np.abs(other).max())
         np.testing.assert_allclose(one, other, rtol=0, atol=TOLERANCE[dtype] * scale, err_msg=field)
 

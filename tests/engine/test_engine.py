@@ -113,7 +113,8 @@ def test_any_explicit_method_is_a_row_of_the_table(short_loop, monkeypatch):
         assert_same(jax.tree.map(lambda x: x[0], lowered), written_out)
     off = np.max(
         np.abs(
-            written_out.records[0]["x"] - outcome(inputs, RunRequest(50, "rk4", 10)).records[0]["x"]
+            written_out.records.signals["x"][:, 0]
+            - outcome(inputs, RunRequest(50, "rk4", 10)).records.signals["x"][:, 0]
         )
     )
     assert 0 < off < 1e-6

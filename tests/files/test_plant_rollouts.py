@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+from loops_of_plants import rigid_law
 from plant_cases import body, pendulum
 
 import iblf_jax as ij
-from iblf_jax.files.rollouts import load_datasets
+from iblf_jax.files.rollouts import load_datasets, load_rollouts
 
 
 @pytest.fixture(scope="module")
@@ -65,3 +66,19 @@ def test_components_of_different_units():
     data = ij.simulate(body(), duration=0.1, dt=1e-2).to_xarray()
     assert data.q.attrs == {"units": "m, m, rad", "description": "pose"}
     assert data.margin.attrs["units"] == "m, m, rad"
+
+
+@pytest.mark.parametrize("ending", [".nc", ".npz"])
+def test_estimated_levels_of_a_robot_within_a_plant_have_rows_of_the_model(tmp_path, ending):
+    """The plant has four levels, and its model two."""
+    plant = rigid_law().plant
+    scenario = rigid_law(model=plant.rigid(), observer=ij.observers.StateObserver(bandwidth=100.0))
+    run = ij.simulate(scenario, duration=0.02, dt=1e-3)
+    data = run.to_xarray()
+    assert data.x.sizes == {"time": 21, "level": 4, "joint": 2}
+    assert data.x_hat.sizes == {"time": 21, "model_level": 2, "joint": 2}
+    assert data.peak_level_error.dims == ("model_level", "joint")
+    assert np.array_equal(data.model_level, [1, 2])
+    ij.save_rollouts(run, tmp_path / f"run{ending}")
+    loaded = load_rollouts(tmp_path / f"run{ending}")
+    assert np.array_equal(loaded.x_hat, run.x_hat)

@@ -67,13 +67,13 @@ class Barrier(Part):
 
     @abc.abstractmethod
     def slope(self, tube: Tube, q: jax.Array) -> jax.Array:
-        """S = dV1/dq of each joint."""
+        """The slope s = dV1/dq of each joint, (n,)."""
 
     @abc.abstractmethod
     def virtual_velocity(
         self, tube: Tube, q: jax.Array, k1: jax.Array, o: jax.Array | None
     ) -> jax.Array:
-        """Alpha of each joint [rad/s], given the gains k1 [1/s] and o [1/s^2]."""
+        """The virtual velocity alpha of each joint [rad/s] for the gains k1 [1/s], o [1/s^2]."""
 
     def decay_rate(self, k1: jax.Array) -> jax.Array | None:
         """The claim of step one: rate_i [1/s] with V1_i' <= -rate_i V1_i where e2 = 0 and no guard

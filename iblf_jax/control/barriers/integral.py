@@ -39,8 +39,6 @@ class Integral(Barrier):
     """
 
     guard: float = static(default=GUARD)
-    uses_o: ClassVar[bool] = True
-    value_unit: ClassVar[str] = "1"
     slope_derivatives: ClassVar[int] = 0
 
     def check(self) -> None:

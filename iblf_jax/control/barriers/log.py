@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import jax
 import jax.numpy as jnp
 
@@ -42,8 +40,6 @@ class Log(Barrier):
 
     p: int = static(default=1)
     guard: float = static(default=GUARD)
-    uses_o: ClassVar[bool] = True
-    value_unit: ClassVar[str] = "1"
 
     @property
     def slope_derivatives(self) -> int:

@@ -41,7 +41,6 @@ class PrescribedPerformance(Barrier):
 
     guard: float = static(default=GUARD)
     uses_o: ClassVar[bool] = False
-    value_unit: ClassVar[str] = "1"
     ratio_jumps: ClassVar[bool] = False
     exact_decay: ClassVar[bool] = True
 

@@ -50,10 +50,6 @@ class Quadratic(Barrier):
         """2 k1: V1' = -2 k1 V1 at e2 = 0, (n,) [1/s]."""
         return 2.0 * k1
 
-    def xi_bound(self, V: jax.Array, tube: Tube) -> None:
-        """No claim: V1 does not see the bounds."""
-        return None
-
     def error_at(self, V: jax.Array, tube: Tube, above: jax.Array) -> jax.Array:
         """+-sqrt(2 V), (n,) [rad]."""
         size = jnp.broadcast_to(jnp.sqrt(2.0 * V), tube.q_d.shape)

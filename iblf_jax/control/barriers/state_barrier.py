@@ -132,7 +132,3 @@ class StateBarrier(Barrier):
 
         # The lower side is the upper side of the mirrored tube.
         return jnp.maximum(reached(tube.k_l, tube.k_u), reached(tube.k_u, tube.k_l))
-
-    def error_at(self, V: jax.Array, tube: Tube, above: jax.Array) -> None:
-        """Not known in closed form."""
-        return None

@@ -9,6 +9,7 @@ was active.
 from __future__ import annotations
 
 import abc
+import dataclasses
 from collections.abc import Iterator
 from functools import partial
 from typing import Any, ClassVar, NamedTuple, Self
@@ -53,8 +54,8 @@ class LawContext(NamedTuple):
     """What a law that `takes_shift` adds to the virtual control of the last level, and to its
     rate."""
     plant: Any = None
-    """The plant, for the methods of a `LyapunovLaw` whose V contains its true parameters; None
-    where a law commands, because it does not know them."""
+    """The plant with its true parameters.  Set only where V is evaluated; None where the law
+    commands."""
 
     def shifted(self, alpha: jax.Array, rate: jax.Array) -> tuple[jax.Array, jax.Array]:
         """The virtual control of the last level and its rate, (n,) each, with the shift if there is
@@ -174,7 +175,7 @@ class TrackingLaw(Timed):
         return False
 
     @attribute
-    def unlimited(self) -> Self:
+    def unlimited(self) -> TrackingLaw:
         """The same law without a limit of its own, by which a sampled loop is linearised."""
         return self
 
@@ -231,27 +232,33 @@ class Law(TrackingLaw):
     def switching(
         self, t: jax.Array, x: jax.Array, d_hat: jax.Array, context: LawContext, state: State
     ) -> jax.Array | None:
-        """As `RobotLaw.switching`; arguments as `command`."""
+        """The functions of x, (m,), at whose zeros the command jumps; None for a continuous
+        command.  Arguments as `command`; unlike `RobotLaw.switching` it receives d_hat.
+        """
         return None
 
     def energy(self, t: jax.Array, x: jax.Array, context: LawContext) -> jax.Array | None:
-        """As `RobotLaw.energy`."""
+        """V for d_tilde = 0, (), of a law that states an `input_slope`; `AdaptiveParameters` needs
+        it.
+        """
         return None
 
     def energy_decay(self, t: jax.Array, x: jax.Array, context: LawContext) -> jax.Array | None:
-        """As `RobotLaw.energy_decay`."""
+        """How fast `energy` decays, (), where the plant equals the model and there is no
+        disturbance.
+        """
         return None
 
     def lyapunov(
         self, t: jax.Array, x: jax.Array, d_tilde: jax.Array, context: LawContext, state: State
     ) -> jax.Array | None:
-        """As `LyapunovLaw.lyapunov`."""
+        """V >= 0, () or (n,), for the error d_tilde of the estimate; None for a law without."""
         return None
 
     def decay(
         self, t: jax.Array, x: jax.Array, d_tilde: jax.Array, context: LawContext, state: State
     ) -> jax.Array | None:
-        """As `LyapunovLaw.decay`."""
+        """W >= 0, () or (n,): how fast V decreases where d_tilde = 0; None for a law without."""
         return None
 
     def disturbance_terms(
@@ -313,8 +320,8 @@ class RobotLaw(TrackingLaw):
     def energy(
         self, t: jax.Array, q: jax.Array, dq: jax.Array, context: LawContext
     ) -> jax.Array | None:
-        """The Lyapunov function of a law with an `input_slope` without a term of the estimate, (),
-        for `AdaptiveParameters`.
+        """V for f_tilde = 0, (), of a law that states an `input_slope`; `AdaptiveParameters` needs
+        it.
         """
         return None
 
@@ -457,6 +464,11 @@ class Wrapping(Law):
     def advice(self) -> list[str]:
         """The wrapped law's warnings."""
         return self.law.advice()
+
+    @property
+    def unlimited(self) -> TrackingLaw:
+        """The wrapper around the wrapped law without its limits."""
+        return dataclasses.replace(self, law=self.law.unlimited)  # type: ignore[type-var]
 
     def init(self, x: jax.Array, context: LawContext) -> State:
         """The wrapped law's state."""

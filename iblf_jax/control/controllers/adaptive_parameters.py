@@ -54,11 +54,12 @@ from iblf_jax.control.controllers._base import (
 from iblf_jax.core import checks
 from iblf_jax.core.component_paths import member_of, replaced, resolve
 from iblf_jax.core.families import is_default
-from iblf_jax.core.linalg import inner, solve_spd
+from iblf_jax.core.linalg import inner
 from iblf_jax.core.pytree import Leaf, component, leaf, static
 from iblf_jax.core.units import PlantUnit, of_entry
 from iblf_jax.world import plants
 from iblf_jax.world.robots import inverse_dynamics
+from iblf_jax.world.robots._base import forward_dynamics
 
 SHARE_OF_BAND = 0.05
 """Width of the projection's band in that of the box, if none is given."""
@@ -159,7 +160,9 @@ class AdaptiveParameters(Wrapping):
         base = contract_of(law)
         stated = ((law.energy, base.energy), (law.energy_decay, base.energy_decay))
         if any(is_default(own, default) for own, default in stated):
-            raise checks.fail(field, type(law).__name__, "a law with an `energy`", LAWS)
+            raise checks.fail(
+                field, type(law).__name__, "a law that states `energy` and `energy_decay`", LAWS
+            )
         if law.variant == "printed":
             remedy = "With C0 q' the term 1/2 e2^T M0' e2 remains. Take variant=\"corrected\"."
             raise checks.fail(f"{field}.variant", "printed", "corrected", remedy)
@@ -403,7 +406,7 @@ class AdaptiveParameters(Wrapping):
             return jnp.sum(slopes * (flow + disturbance - true_flow))
         q, dq = x[0], x[1]
         driving = command.tau + disturbance
-        ddq = _acceleration(context.model, q, dq, driving)
+        ddq = forward_dynamics(context.model, q, dq, driving)
         needed = inverse_dynamics(true.model, q, dq, dq, ddq)
         return inner(command.input_slope, needed - command.tau)
 
@@ -467,12 +470,6 @@ def _unit_at(part: Any, tokens: list[str | int]) -> str:
     if not isinstance(unit, tuple):
         return str(unit)
     return str(of_entry(unit, tuple(index), len(index)))
-
-
-def _acceleration(model: Any, q: jax.Array, dq: jax.Array, torque: jax.Array) -> jax.Array:
-    """q" of a robot under a torque, (n,) [rad/s^2]."""
-    rest = torque - model.coriolis(q, dq, dq) - model.gravity(q)
-    return solve_spd(model.mass_matrix(q), rest)
 
 
 # --- dependence on the parameters ---------------------------------------------------------------

@@ -394,12 +394,20 @@ class BarrierBackstepping(Law):
             V = V + self.weights[i] * barrier.value(tube, x[i])
             guard_active |= guard_is_active(tube, x[i], barrier.guard)
         saturated = jnp.zeros_like(guard_active)
-        command = Command(levels[-1].alpha, tubes[1].q_d, V, guard_active, saturated)
         plant = plants.as_plant(context.model)
         slope = plants.transposed_gain(plant, self.order, t, x, levels[-1].slope)
-        command = command._replace(input_slope=slope)
+        alpha_higher: Any = ()
         if self.order > 2:
-            command = command._replace(alpha_higher=jnp.stack([tube.q_d for tube in tubes[2:]]))
+            alpha_higher = jnp.stack([tube.q_d for tube in tubes[2:]])
+        command = Command(
+            tau=levels[-1].alpha,
+            alpha=tubes[1].q_d,
+            V1=V,
+            guard_active=guard_active,
+            saturated=saturated,
+            alpha_higher=alpha_higher,
+            input_slope=slope,
+        )
         return command, rates
 
     def levels(

@@ -46,7 +46,7 @@ from iblf_jax.control.controllers._base import (
     check_law,
 )
 from iblf_jax.core import checks
-from iblf_jax.core.pytree import Leaf, component, leaf
+from iblf_jax.core.pytree import Leaf, component, is_absent, leaf
 from iblf_jax.core.units import INPUT
 
 TANH_GAP = 0.2785
@@ -95,7 +95,7 @@ class EventCompensated(Wrapping):
         """
         command, rate = self.inner.command(t, x, d_hat, context, state)
         z, v = command.input_slope, command.tau
-        if isinstance(z, tuple) or not isinstance(command.input, tuple):
+        if is_absent(z) or not is_absent(command.input):
             expected = "a law whose command has an `input_slope`, and a torque as its input"
             remedy = "Such as iblf_jax.controllers.Backstepping."
             raise checks.fail("EventCompensated.law", type(self.law).__name__, expected, remedy)

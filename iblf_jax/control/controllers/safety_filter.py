@@ -30,6 +30,7 @@ in acceleration as `nearest` says; the command holds it, runs record it, and it 
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any, ClassVar
 
 import jax
@@ -105,6 +106,11 @@ class SafetyFilter(Wrapping):
         checks.one_of("SafetyFilter.nearest", self.nearest, NEAREST)
         checks.one_of("SafetyFilter.shape1", self.shape1, SHAPES1)
         checks.one_of("SafetyFilter.shape2", self.shape2, SHAPES2)
+
+    @property
+    def unlimited(self) -> SafetyFilter:
+        """The filter without a limit of the torque, around the wrapped law without limits."""
+        return dataclasses.replace(self, law=self.law.unlimited, limit=None)
 
     def box(
         self, t: jax.Array, q: jax.Array, dq: jax.Array, context: LawContext

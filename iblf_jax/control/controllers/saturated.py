@@ -43,6 +43,7 @@ Then V(t, y) has the rate that it has without limits, plus (dV/dx_{r-1})^T G_{r-
 
 from __future__ import annotations
 
+import dataclasses
 from typing import NamedTuple
 
 import jax
@@ -60,7 +61,7 @@ from iblf_jax.control.controllers._base import (
 )
 from iblf_jax.core import checks
 from iblf_jax.core.input_limits import check_lower_limit, is_beyond, lower_or_opposite
-from iblf_jax.core.pytree import Leaf, component, leaf, static
+from iblf_jax.core.pytree import Leaf, component, is_absent, leaf, static
 from iblf_jax.core.units import INPUT
 from iblf_jax.world import plants
 from iblf_jax.world.robots import Robot
@@ -68,7 +69,8 @@ from iblf_jax.world.robots._base import is_robot
 
 EDGES = ("hard", "smooth")
 SHARPNESS = 8
-"""Even exponent of the smooth limit: it reduces half the limit by 0.05 %, and the limit by 8 %."""
+"""Even exponent of the smooth limit, which reduces a torque of half the limit by 0.05 %, and one of
+the limit by 8 %."""
 
 
 class AuxiliaryState(NamedTuple):
@@ -126,6 +128,15 @@ class Saturated(Wrapping):
     def has_auxiliary(self) -> bool:
         """Whether there is an auxiliary state."""
         return self.auxiliary is not None
+
+    @property
+    def unlimited(self) -> TrackingLaw:
+        """The wrapped law without limits; with the auxiliary state, if there is one."""
+        law = self.law.unlimited
+        if self.auxiliary is None:
+            return law
+        beyond = jnp.full_like(self.limit, jnp.inf)
+        return dataclasses.replace(self, law=law, limit=beyond, lower_limit=None, edge="hard")
 
     def init(self, x: jax.Array, context: LawContext) -> State:
         """State of the wrapped law, and lambda(0) = 0."""
@@ -214,7 +225,7 @@ def _with_shifted_control(command: Command, order: int, value: jax.Array) -> Com
     if order == 2:
         return command._replace(alpha=command.alpha + value)
     higher = command.alpha_higher
-    if isinstance(higher, tuple):
+    if is_absent(higher):
         return command
     last = (higher[-1] + value)[None]
     return command._replace(alpha_higher=jnp.concatenate([higher[:-1], last]))

@@ -161,10 +161,6 @@ class RobotObserver(DisturbanceObserver):
         """
         return None
 
-    def of_x(self) -> Observer:
-        """The observer as the closed loop calls it."""
-        return ObserverOfRobot(self)
-
 
 @component
 class ObserverOfRobot(Observer):
@@ -230,14 +226,6 @@ def _torque_on_joints(model: Plant, x: jax.Array, u: jax.Array) -> jax.Array:
     torque = model.joint_torque(x, u)
     assert torque is not None
     return torque
-
-
-def observer_of_x(observer: DisturbanceObserver) -> Observer:
-    """An observer as the closed loop calls it."""
-    if isinstance(observer, Observer):
-        return observer
-    assert isinstance(observer, RobotObserver)
-    return observer.of_x()
 
 
 def contract_of(observer: Any) -> type[Observer] | type[RobotObserver]:

@@ -29,7 +29,7 @@ def kf_advice(observer: Any) -> list[str]:
     )
     lost = "Below it the paper's bound on V2 is not proven"
     rest = (
-        'with reading="corrected" and observers.Momentum, ij.certify computes another bound, its'
+        'with variant="corrected" and observers.Momentum, ij.certify computes another bound, its'
         ' claim "weighted", which holds for every kf > 0'
     )
     return [f"observer.kf = {kf}: {need}. {lost}; {rest}."]

@@ -5,7 +5,12 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.observers._base import Observer, RobotObserver
+from iblf_jax.control.observers._base import (
+    DisturbanceObserver,
+    Observer,
+    ObserverOfRobot,
+    RobotObserver,
+)
 from iblf_jax.core.pytree import component
 from iblf_jax.world.plants import Plant
 from iblf_jax.world.robots import Robot
@@ -13,7 +18,7 @@ from iblf_jax.world.robots import Robot
 
 @component
 class _NoEstimate(Observer):
-    """d_hat = 0, for a plant in strict-feedback form.  Source: none; the baseline."""
+    """d_hat = 0 for any plant: a `NoObserver` in the closed loop.  Source: none; the baseline."""
 
     def init(self, x: jax.Array, model: Plant) -> tuple[()]:
         """No state."""
@@ -69,8 +74,13 @@ class NoObserver(RobotObserver):
         """No state."""
         return ()
 
-    def of_x(self) -> Observer:
-        """No estimate for any plant; a class that inherits from this one has its own."""
-        if type(self) is not NoObserver:
-            return super().of_x()
+
+def observer_of_x(observer: DisturbanceObserver) -> Observer:
+    """An observer as the closed loop calls it."""
+    if isinstance(observer, Observer):
+        return observer
+    # It serves any plant; a class that inherits from it has an estimate of its own.
+    if type(observer) is NoObserver:
         return _NoEstimate()
+    assert isinstance(observer, RobotObserver)
+    return ObserverOfRobot(observer)

@@ -26,7 +26,7 @@ from iblf_jax.core import checks
 from iblf_jax.core.attributes import attributes, has_members
 from iblf_jax.core.disk_cache import keep_programs
 from iblf_jax.core.families import adopt, attribute
-from iblf_jax.core.linalg import inner, matvec
+from iblf_jax.core.linalg import inner, matvec, solve_spd
 from iblf_jax.core.time import TimeVarying
 
 T = TypeVar("T")
@@ -274,6 +274,12 @@ def inverse_dynamics(
     if is_velocity:  # a robot may have a shorter form for one object
         u = v
     return robot.inverse_dynamics(q, v, u, acceleration)
+
+
+def forward_dynamics(robot: Robot, q: jax.Array, v: jax.Array, torque: jax.Array) -> jax.Array:
+    """The acceleration M^-1 (torque - C v - G) under all torques on the joints, (n,) [rad/s^2]."""
+    rest = torque - robot.coriolis(q, v, v) - robot.gravity(q)
+    return solve_spd(robot.mass_matrix(q), rest)
 
 
 def from_energy(cls: type[T]) -> type[T]:
