@@ -75,9 +75,9 @@ def structures() -> dict[str, ij.Scenario]:
         found[type(barrier).__name__] = ij.with_parts(paper, controller=law)
     computed = ij.controllers.ComputedTorque(Kp=25.0, Kd=10.0)
     found["ComputedTorque"] = ij.with_parts(paper, controller=computed)
-    limited = ij.controllers.Saturated(law=paper.controller, limit=[30.0, 10.0])
+    limited = ij.controllers.Saturated(law=paper.controller, limit=[4.0, 1.0])
     found["Saturated"] = ij.with_parts(paper, controller=limited)
-    found["Momentum"] = ij.with_parts(paper, observer=ij.observers.Momentum(kf=4.0))
+    found["AsPublished"] = ij.with_parts(paper, observer=ij.observers.AsPublished(kf=4.0))
     found["Motor"] = ij.with_parts(paper, actuator=ij.actuators.Motor(bandwidth=300.0))
     found["Sampling"] = ij.with_parts(paper, sampling=ij.Sampling(period=2e-3))
     encoder = ij.sensors.Encoder(
