@@ -172,9 +172,6 @@ class Certificate(Result):
             shown.append(self.omitted)
         return "\n".join(shown)
 
-    def _repr_html_(self) -> str:
-        return present("card", self)
-
     def table_html(self) -> str:
         """The lines that apply as an HTML table, those that fail in bold, and below it why the
         others do not apply.

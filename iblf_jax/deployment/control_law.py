@@ -17,8 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.control.sensors import Ideal, Levels, Measurement
+from iblf_jax.control.sensors._base import measurement_of
 from iblf_jax.core import checks
-from iblf_jax.core.pytree import Leaf, component, leaf
+from iblf_jax.core.pytree import Leaf, component, is_absent, leaf
 from iblf_jax.engine import LOWERING_LIMITS
 from iblf_jax.kernels import Program, Shapes, compile_step, written_out
 from iblf_jax.simulation.closed_loop import discrete_observer, law_update, plant_input
@@ -116,7 +117,7 @@ def _with_reference(scenario: Scenario, inputs: SampleInputs) -> Scenario:
     if isinstance(inputs.q_d, tuple):
         return scenario
     reference = GivenReference(inputs.t, inputs.q_d, inputs.dq_d, inputs.ddq_d)
-    if not isinstance(inputs.further_d, tuple):
+    if not is_absent(inputs.further_d):
         reference = dataclasses.replace(reference, further_d=inputs.further_d)
     return dataclasses.replace(scenario, reference=reference)
 
@@ -124,8 +125,7 @@ def _with_reference(scenario: Scenario, inputs: SampleInputs) -> Scenario:
 def inputs_at_start(scenario: Scenario) -> SampleInputs:
     """The time 0 and the levels of the plant at the start that the law measures."""
     x = start_levels(scenario)[: scenario.loop.model.order]
-    higher = x[2:] if len(x) > 2 else ()
-    return SampleInputs(jnp.zeros((), x.dtype), x[0], x[1], higher)
+    return SampleInputs(jnp.zeros((), x.dtype), *measurement_of(x))
 
 
 def _levels(inputs: SampleInputs) -> jax.Array:
@@ -193,9 +193,7 @@ def _measurement(
         normal = jnp.zeros((velocity.draws, scenario.n), inputs.q.dtype)
         rows[row], found = velocity.estimate(rows[row - 1], rows[row], normal, period, state)
         after.append(found)
-    if len(rows) == 2:
-        return Measurement(rows[0], rows[1]), tuple(after)
-    return Measurement(rows[0], rows[1], jnp.stack(rows[2:])), tuple(after)
+    return measurement_of(jnp.stack(rows)), tuple(after)
 
 
 class VelocityFilter(NamedTuple):

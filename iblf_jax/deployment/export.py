@@ -20,7 +20,7 @@ import numpy as np
 from iblf_jax.control.actuators import Ideal
 from iblf_jax.core import checks, notices, taylor
 from iblf_jax.core.progress import announced
-from iblf_jax.core.pytree import astype
+from iblf_jax.core.pytree import astype, is_absent
 from iblf_jax.core.status import FAILED, Status, describe, has_flag
 from iblf_jax.deployment.build import write_files
 from iblf_jax.deployment.c_names import FILES, RESERVED
@@ -364,7 +364,7 @@ def vectors(scenario: Scenario, external_reference: bool) -> Vectors:
     t = jnp.asarray(np.arange(samples) * period, dtype)
     at_start = inputs_at_start(scenario)
     levels = [run.measured.q, run.measured.dq]
-    if not isinstance(at_start.higher, tuple):
+    if not is_absent(at_start.higher):
         levels.append(run.measured.higher[:, : len(at_start.higher)])
     inputs = SampleInputs(t, *[_rounded(x, samples, dtype) for x in levels])
     first = jax.tree.map(lambda x: x[None], at_start)

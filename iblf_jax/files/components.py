@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import dataclasses
 import typing
-from collections.abc import Callable, Container, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -21,6 +20,7 @@ import numpy as np
 from iblf_jax.control import actuators, barriers, controllers, decays, observers, sensors
 from iblf_jax.core import checks, modules
 from iblf_jax.core.pytree import field_values, is_component_class, is_leaf_field
+from iblf_jax.files import earlier
 from iblf_jax.files.modules import ReadPart, encode_module
 from iblf_jax.files.values import (
     NONE,
@@ -129,41 +129,6 @@ def members_of(hint: Any) -> tuple[str, dict[str, Any]]:
         for name, cls in one.members.items():
             seen.setdefault(name, []).append(cls)
     return "any family", {name: found[0] for name, found in seen.items() if len(found) == 1}
-
-
-def _of_full_state(table: dict[str, Any]) -> dict[str, Any]:
-    """The table of `FullState`, the law of order 2 of earlier versions, as one of
-    `BarrierBackstepping`.
-    """
-    integral = {"kind": "integral"}
-    given = dict(table)
-    found: dict[str, Any] = {
-        "kind": "barrier_backstepping",
-        "k": _rows(given.pop("k1", NONE), given.pop("K2", NONE)),
-        "barriers": [given.pop("barrier", integral), given.pop("velocity_barrier", integral)],
-        "c": _rows(0.0, given.pop("c", NONE)),
-        "weights": _rows(given.pop("weight", 1.0), 1.0),
-    }
-    o = given.pop("o", NONE)
-    if o != NONE:
-        found["o"] = _rows(o, o)
-    return given | found
-
-
-def _rows(first: Any, second: Any) -> list[Any]:
-    """The values of two levels, of as many joints each."""
-    joints = max((len(x) for x in (first, second) if isinstance(x, list)), default=0)
-    if joints == 0:
-        return [first, second]
-    return [x if isinstance(x, list) else [x] * joints for x in (first, second)]
-
-
-FORMER: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {"full_state": _of_full_state}
-"""Name of a member of earlier versions, which files may contain -> its table as that of a member
-of today."""
-
-FORMER_KEYS = {"reading": "variant"}
-"""Name of a field or an argument in files of earlier versions -> the present one."""
 
 
 # --- to tables
@@ -281,8 +246,8 @@ def _decode_member(table: dict[str, Any], hint: Any, path: str) -> Any:
     family, members = members_of(hint)
     expected = f"the name of one of the {family}"
     kind = table.get("kind")
-    if isinstance(kind, str) and kind in FORMER and kind not in members:
-        table = FORMER[kind](table)
+    if isinstance(kind, str) and kind in earlier.FORMER_MEMBERS and kind not in members:
+        table = earlier.FORMER_MEMBERS[kind](table)
         kind = table["kind"]
     if kind is None:
         remedy = f'Write kind = "{next(iter(members))}".'
@@ -296,18 +261,11 @@ def _decode_member(table: dict[str, Any], hint: Any, path: str) -> Any:
     return decode_fields(members[kind], {key: x for key, x in table.items() if key != "kind"}, path)
 
 
-def with_present_names(table: Mapping[str, Any], known: Container[str]) -> dict[str, Any]:
-    """A table with the present names of fields and arguments that earlier versions named
-    otherwise.
-    """
-    return {key if key in known else FORMER_KEYS.get(key, key): x for key, x in table.items()}
-
-
 def decode_fields(cls: Any, table: Any, path: str) -> Any:
     """A component of class `cls` from its table; checks every key."""
     checks.flat_enough(path, as_table(table, path))
     fields = {field.name: field for field in dataclasses.fields(cls) if field.init}
-    table = with_present_names(table, fields)
+    table = earlier.with_present_names(table, fields)
     known_keys(table, path, fields)
     hints = field_hints(cls)
     values = {}

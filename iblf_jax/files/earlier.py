@@ -2,12 +2,12 @@
 
 Earlier versions had the bounds of levels above the first in `Scenario.velocity_bounds` and
 `Scenario.state_bounds`, and recorded the levels of a run as `q`, `dq` and `higher`, their errors
-and bounds likewise.
+and bounds likewise. Some members, fields and arguments had other names or forms.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Container, Mapping
 from typing import Any
 
 import jax
@@ -32,6 +32,50 @@ LEVELS_ABOVE = {
     "level_upper": "higher_upper",
 }
 """Signal of the levels -> the earlier variable with the rows from the third on."""
+
+
+def _of_full_state(table: dict[str, Any]) -> dict[str, Any]:
+    """The table of `FullState`, the law of order 2 of earlier versions, as one of
+    `BarrierBackstepping`.
+    """
+    integral = {"kind": "integral"}
+    given = dict(table)
+    found: dict[str, Any] = {
+        "kind": "barrier_backstepping",
+        "k": _rows(given.pop("k1", NONE), given.pop("K2", NONE)),
+        "barriers": [given.pop("barrier", integral), given.pop("velocity_barrier", integral)],
+        "c": _rows(0.0, given.pop("c", NONE)),
+        "weights": _rows(given.pop("weight", 1.0), 1.0),
+    }
+    o = given.pop("o", NONE)
+    if o != NONE:
+        found["o"] = _rows(o, o)
+    return given | found
+
+
+def _rows(first: Any, second: Any) -> list[Any]:
+    """The values of two levels, of as many joints each."""
+    joints = max((len(x) for x in (first, second) if isinstance(x, list)), default=0)
+    if joints == 0:
+        return [first, second]
+    return [x if isinstance(x, list) else [x] * joints for x in (first, second)]
+
+
+FORMER_MEMBERS: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
+    "full_state": _of_full_state,
+}
+"""Name of a member of earlier versions, which files may contain -> its table as that of a member
+of today."""
+
+FORMER_NAMES = {"reading": "variant"}
+"""Name of a field or an argument in files of earlier versions -> the present one."""
+
+
+def with_present_names(table: Mapping[str, Any], known: Container[str]) -> dict[str, Any]:
+    """A table with the present names of fields and arguments that earlier versions named
+    otherwise.
+    """
+    return {key if key in known else FORMER_NAMES.get(key, key): x for key, x in table.items()}
 
 
 def with_bounds_of_levels(data: Mapping[str, Any]) -> dict[str, Any]:

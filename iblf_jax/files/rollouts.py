@@ -33,7 +33,7 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.core.attributes import attributes
-from iblf_jax.core.pytree import astype
+from iblf_jax.core.pytree import astype, is_absent
 from iblf_jax.core.status import Status, describe
 from iblf_jax.files import digest, earlier
 from iblf_jax.files.earlier import LEVEL_SIGNALS
@@ -350,7 +350,7 @@ def _trajectories(run: Rollout, batch: tuple[str, ...]) -> dict[str, Any]:
     for name, value in attributes(run, SIGNALS).items():
         # The views show all rows of the signals of a robot.
         is_shown = name in LEVEL_SIGNALS and np.shape(value)[-2] <= len(LEVEL_SIGNALS[name])
-        if name != "t" and not isinstance(value, tuple) and not is_shown:
+        if name != "t" and not is_absent(value) and not is_shown:
             if name in ("level_lower", "level_upper"):
                 value = _of_all_levels(value, run.x, np.inf if name == "level_upper" else -np.inf)
             add(name, value, signal_unit(run.scenario, name), meanings[name])

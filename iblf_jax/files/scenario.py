@@ -48,7 +48,6 @@ from iblf_jax.files.components import (
     decode_fields,
     encode_fields,
     field_hints,
-    with_present_names,
 )
 from iblf_jax.files.modules import (
     needs_a_module,
@@ -396,7 +395,7 @@ def preset_scenario(name: Any, arguments: dict[str, Any]) -> Scenario:
         raise checks.fail("preset", name, "the name of a preset", did_you_mean(name, PRESETS))
     preset = PRESETS[name]
     taken = inspect.signature(preset).parameters
-    arguments = with_present_names(arguments, taken)
+    arguments = earlier.with_present_names(arguments, taken)
     known_keys(arguments, "arguments", taken)
     hints = field_hints(preset)
     for key, parameter in taken.items():

@@ -24,8 +24,10 @@ from iblf_jax.control.controllers.adaptive_parameters import (
 from iblf_jax.control.sensors import Ideal as IdealSensor
 from iblf_jax.core import checks
 from iblf_jax.core.attributes import attributes
+from iblf_jax.core.pytree import is_absent
 from iblf_jax.core.status import FAILED, Status, describe
 from iblf_jax.simulation.results import Rollout
+from iblf_jax.simulation.signals import has
 from iblf_jax.simulation.units import status_words
 from iblf_jax.world import plants
 from iblf_jax.world.robots import joint_names
@@ -89,7 +91,7 @@ def _parameters_of_plant(run: Rollout) -> np.ndarray:
 
 def _received(run: Rollout, i: int) -> Any:
     """A level, counted from 0, as the law received it: estimated or measured."""
-    if not isinstance(run.x_hat, tuple):
+    if has(run, "x_hat"):
         return np.asarray(run.x_hat)[:, i]
     return (run.measured.q, run.measured.dq)[i]
 
@@ -114,14 +116,14 @@ estimate that the law received, and its disturbance with estimate and error."""
 
 def _row_if_any(values: Any, i: int) -> np.ndarray:
     """As `_row`; NaN for a level that the signal does not have."""
-    if isinstance(values, tuple) or i < values.shape[1]:
+    if is_absent(values) or i < values.shape[1]:
         return _row(values, i)
     return np.full((1, 1), np.nan)
 
 
 def _row(values: Any, i: int) -> np.ndarray:
     """One row of a signal (T, m, n) with infinite entries as NaN; NaN for a run without it."""
-    if isinstance(values, tuple):
+    if is_absent(values):
         return np.full((1, 1), np.nan)
     row = np.asarray(values)[:, i]
     return np.where(np.isfinite(row), row, np.nan)
@@ -189,7 +191,7 @@ class Curve:
             values = DERIVED[field](self.run)
         else:
             values = attributes(self.run, [field])[field]
-        if isinstance(values, tuple):
+        if is_absent(values):
             values = np.full(self.run.q.shape, np.nan)
         if field in EXTERNAL:
             return np.asarray(values)
@@ -230,7 +232,7 @@ class Curve:
     @property
     def is_estimated(self) -> bool:
         """Whether the law received estimates of levels from an observer."""
-        return not isinstance(self.run.x_hat, tuple)
+        return has(self.run, "x_hat")
 
     @property
     def has_speed_limits(self) -> bool:
@@ -240,7 +242,7 @@ class Curve:
     @property
     def has_regions(self) -> bool:
         """Whether the scenario confines points of the robot to regions."""
-        return not isinstance(self.run.region_margin, tuple)
+        return has(self.run, "region_margin")
 
     @property
     def failed(self) -> bool:

@@ -250,10 +250,6 @@ class Proof(Result):
         """Tube, verdict and numbers as a dataset."""
         return present("proof dataset", self)
 
-    def _repr_html_(self) -> str:
-        """The card in a notebook."""
-        return present("card", self)
-
     def __repr__(self) -> str:
         return "\n".join([self.sentence(), *self.details()])
 

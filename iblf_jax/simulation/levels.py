@@ -35,11 +35,11 @@ def start_levels(scenario: Scenario) -> jax.Array:
     flexible joint, the current that holds gravity.
     """
     initial, plant = scenario.initial, scenario.loop.plant
-    if plant.order == 2 or initial.higher is not None:
-        return plants.state_of_levels(
-            initial.q, initial.dq, () if plant.order == 2 else initial.higher
-        )
-    higher = plant.steady_levels(initial.q, initial.dq)
+    higher: Any = ()
+    if plant.order > 2:
+        higher = initial.higher
+    if higher is None:
+        higher = plant.steady_levels(initial.q, initial.dq)
     return plants.state_of_levels(initial.q, initial.dq, higher)
 
 

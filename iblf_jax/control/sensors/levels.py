@@ -16,6 +16,7 @@ from iblf_jax.control.sensors._base import (
     Sensor,
     State,
     contract_of,
+    measurement_of,
 )
 from iblf_jax.control.sensors.unmeasured import Unmeasured
 from iblf_jax.core import checks
@@ -146,6 +147,4 @@ class Levels(Sensor):
                 found, after = span.part.measure(levels[0], levels[1], own, period, before)
                 rows += [found.q, found.dq]
             states.append(after)
-        if len(rows) == 2:
-            return Measurement(rows[0], rows[1]), tuple(states)
-        return Measurement(rows[0], rows[1], jnp.stack(rows[2:])), tuple(states)
+        return measurement_of(jnp.stack(rows)), tuple(states)

@@ -23,6 +23,7 @@ from iblf_jax.core import checks
 from iblf_jax.core.attributes import has_members
 from iblf_jax.core.families import adopt, attribute, is_default
 from iblf_jax.core.linalg import matvec, solve_gain, solve_spd
+from iblf_jax.core.pytree import is_absent
 from iblf_jax.core.status import VELOCITY_LIMIT
 from iblf_jax.core.units import ByLevel, Unit, per_second, product
 from iblf_jax.kernels import jaxprs
@@ -195,7 +196,7 @@ class Plant(Dynamics):
 def state_of_levels(q: jax.Array, dq: jax.Array, higher: Any) -> jax.Array:
     """The state x of a plant, (r, n), from its first two levels and the others."""
     first = jnp.stack([q, dq])
-    return first if isinstance(higher, tuple) else jnp.concatenate([first, higher])
+    return first if is_absent(higher) else jnp.concatenate([first, higher])
 
 
 def is_chain(part: Any) -> TypeGuard[Plant]:
