@@ -400,9 +400,15 @@ def _level_margins(sample: Sample) -> list[jax.Array]:
     """The margins of the levels from the third on, and of the virtual controls for them, (r - 2, n)
     each; the latter only under a law that has them.
     """
+
+    def for_all_levels(margins: jax.Array) -> jax.Array:
+        # JAX answers an index behind the last row with the last row: every level has a row.
+        missing = len(sample.x) - 2 - len(margins)
+        return jnp.pad(margins, ((0, missing), (0, 0)), constant_values=jnp.inf)
+
     of_alphas = alpha_margins_above(sample)
-    found = [least_margins_above(sample)]
-    return found if of_alphas is None else [*found, of_alphas]
+    found = [for_all_levels(least_margins_above(sample))]
+    return found if of_alphas is None else [*found, for_all_levels(of_alphas)]
 
 
 @component

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from members import FAMILIES, ROBOTS
 
+import iblf_jax as ij
 from iblf_jax.testing import robots
 from iblf_jax.testing._contract import Findings
 
@@ -68,3 +69,26 @@ def test_every_member_is_listed(family):
     instances, registry, _ = FAMILIES[family]
     missing = set(registry.values()) - {type(x) for x in instances.values()}
     assert not missing, f"add an instance of {missing} to tests/members.py"
+
+
+@ij.component
+class Halved(ij.controllers.RobotLaw):
+    """Half of the torque of another law, as a law of q and q'."""
+
+    law: ij.controllers.TrackingLaw
+
+    def init(self, q, dq, context):
+        return self.law.init(q, dq, context)
+
+    def command(self, t, q, dq, f_hat, context, state):
+        command, rate = self.law.command(t, q, dq, f_hat, context, state)
+        return command._replace(tau=0.5 * command.tau), rate
+
+
+def test_a_law_of_q_and_dq_that_calls_a_law_of_x_is_told_what_to_change():
+    scenario = ij.presets.zhang_yan_2024()
+    plain = ij.with_parts(scenario, controller=Halved(scenario.controller))
+    assert ij.simulate(plain, duration=0.01).ok
+    saturated = ij.controllers.Saturated(scenario.controller, limit=10.0)
+    with pytest.raises(ValueError, match=r"Halved\.law: got a Saturated, a law of x, .*law_of_x"):
+        ij.simulate(ij.with_parts(scenario, controller=Halved(saturated)), duration=0.01)

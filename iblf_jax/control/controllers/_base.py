@@ -11,6 +11,7 @@ from __future__ import annotations
 import abc
 import dataclasses
 from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
 from typing import Any, ClassVar, NamedTuple, Self
 
@@ -393,7 +394,8 @@ class LawOfRobot(Law):
 
     def init(self, x: jax.Array, context: LawContext) -> State:
         """State of the law."""
-        return self.law.init(x[0], x[1], context)
+        with _explained_for_wrappers(self.law):
+            return self.law.init(x[0], x[1], context)
 
     def command(
         self, t: jax.Array, x: jax.Array, d_hat: jax.Array, context: LawContext, state: State
@@ -401,7 +403,8 @@ class LawOfRobot(Law):
         """Command of the law."""
         # One array for each level: robots test whether two velocities are the same object.
         q, dq = x[0], x[1]
-        return self.law.command(t, q, dq, d_hat, context, state)
+        with _explained_for_wrappers(self.law):
+            return self.law.command(t, q, dq, d_hat, context, state)
 
     def switching(
         self, t: jax.Array, x: jax.Array, d_hat: jax.Array, context: LawContext, state: State
@@ -440,6 +443,27 @@ class LawOfRobot(Law):
     ) -> jax.Array | None:
         """T of the law."""
         return self.law.disturbance_terms(t, x[0], x[1], d_tilde, dd, context, state)
+
+
+@contextmanager
+def _explained_for_wrappers(law: RobotLaw) -> Iterator[None]:
+    """Says what to change where a law of q and q' called a law of x that it contains as if that
+    were a law of q and q', with one argument too many.
+    """
+    try:
+        yield
+    except TypeError as error:
+        of_x = [field for field, part in vars(law).items() if isinstance(part, Law)]
+        if not of_x:
+            raise
+        name, field = type(law).__name__, of_x[0]
+        raise checks.fail(
+            f"{name}.{field}",
+            checks.Words(f"{checks.with_article(type(vars(law)[field]).__name__)}, a law of x"),
+            "a law of q and q', as it is called",
+            f"Write {name} as a law of x: inherit from ij.controllers.Law, take x in the place of"
+            f" q and dq, and call ij.controllers.law_of_x(self.{field}).",
+        ) from error
 
 
 def law_of_x(law: TrackingLaw) -> Law:
