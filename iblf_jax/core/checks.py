@@ -26,6 +26,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.core import former_names
 from iblf_jax.core.attributes import has_members, missing_members
 from iblf_jax.core.devices import default_devices, platform
 from iblf_jax.core.families import adopt, required_members
@@ -151,9 +152,12 @@ def fail(field: str, got: Any, expected: str, remedy: str = "") -> ValueError:
 
 
 def nearest(name: Any, known: Iterable[str]) -> str:
-    """The remedy for a misspelt word, "Did you mean ...?"; nothing where no known word is near."""
-    given, words = str(name)[: LONGEST_TEXT["value"]], map(str, known)
-    close = difflib.get_close_matches(given, list(words), n=2, cutoff=0.6)
+    """The remedy for a misspelt or a former word; nothing where no known word is near."""
+    given, words = str(name)[: LONGEST_TEXT["value"]], list(map(str, known))
+    present, form = former_names.ARGUMENTS.get(given, ("", ""))
+    if present in words:
+        return f"Write {form} in its place."
+    close = difflib.get_close_matches(given, words, n=2, cutoff=0.6)
     return f"Did you mean {' or '.join(close)}?" if close else ""
 
 

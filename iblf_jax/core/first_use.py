@@ -9,6 +9,8 @@ import sys
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from iblf_jax.core.former_names import no_attribute
+
 
 def on_first_use(
     package: str, table: Mapping[str, tuple[str, str | None]]
@@ -23,7 +25,7 @@ def on_first_use(
 
     def get(name: str) -> Any:
         if name not in table:
-            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+            raise no_attribute(package, name)
         module, attribute = table[name]
         imported = importlib.import_module(module)
         names[name] = imported if attribute is None else getattr(imported, attribute)

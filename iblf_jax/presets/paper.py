@@ -31,6 +31,7 @@ def customary_two_link() -> TwoLink:
     return TwoLink(mass=mass, length=length, centre=length / 2, inertia=mass * length**2 / 4)
 
 
+@checks.known_keywords
 def zhang_yan_2024(*, law: str = "integral", variant: str = "printed", p: int = 1) -> Scenario:
     """The simulation of the paper's section 4, equations (4.1) to (4.3).
 
@@ -111,6 +112,7 @@ def printed_gap(*, variant: str = "printed") -> Scenario:
     )
 
 
+@checks.known_keywords
 def zhang_yan_2024_saturated(
     *,
     law: str = "integral",
@@ -142,6 +144,7 @@ def zhang_yan_2024_saturated(
     )
 
 
+@checks.known_keywords
 def zhang_yan_2024_funnel(
     *, law: str = "prescribed_performance", variant: str = "corrected"
 ) -> Scenario:
@@ -168,6 +171,7 @@ def zhang_yan_2024_funnel(
     return dataclasses.replace(scenario, bounds=Bounds(lower=lower, upper=upper))
 
 
+@checks.known_keywords
 def zhang_yan_2024_full_state(*, kf: float = 100.0, c: float = 8.0) -> Scenario:
     """The paper's arm, reference, bounds and disturbance with additional bounds on the velocities,
     and a law that satisfies both.

@@ -5,6 +5,8 @@ A barrier or a law of your own stays finite at the bound by `guarded_error`, and
 `guard_is_active`.
 """
 
+from typing import TYPE_CHECKING
+
 from iblf_jax.control.barriers._base import Barrier as Barrier
 from iblf_jax.control.barriers._base import GuardedError as GuardedError
 from iblf_jax.control.barriers._base import guard_is_active as guard_is_active
@@ -18,6 +20,10 @@ from iblf_jax.control.barriers.quadratic import Quadratic as Quadratic
 from iblf_jax.control.barriers.state_barrier import StateBarrier as StateBarrier
 from iblf_jax.control.barriers.tan import Tan as Tan
 from iblf_jax.control.barriers.transformed_error import TransformedError as TransformedError
+from iblf_jax.core import former_names
+
+if not TYPE_CHECKING:  # with it, a type checker would accept every name
+    __getattr__ = former_names.explained(__name__)
 
 MEMBERS = {
     "integral": Integral,

@@ -2,6 +2,8 @@
 plants in strict-feedback form `Law`; `law_by_name` makes the paper's systems.
 """
 
+from typing import TYPE_CHECKING
+
 from iblf_jax.control.controllers._base import Command as Command
 from iblf_jax.control.controllers._base import Law as Law
 from iblf_jax.control.controllers._base import LawContext as LawContext
@@ -36,6 +38,10 @@ from iblf_jax.control.controllers.terminal_sliding_mode import (
     TerminalSlidingMode as TerminalSlidingMode,
 )
 from iblf_jax.control.controllers.with_drive import WithDrive as WithDrive
+from iblf_jax.core import former_names
+
+if not TYPE_CHECKING:  # with it, a type checker would accept every name
+    __getattr__ = former_names.explained(__name__)
 
 MEMBERS = {
     "backstepping": Backstepping,

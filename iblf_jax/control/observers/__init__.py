@@ -2,6 +2,8 @@
 of those of plants in strict-feedback form `Observer`.
 """
 
+from typing import TYPE_CHECKING
+
 from iblf_jax.control.observers._base import DisturbanceObserver as DisturbanceObserver
 from iblf_jax.control.observers._base import Observer as Observer
 from iblf_jax.control.observers._base import RobotObserver as RobotObserver
@@ -12,6 +14,10 @@ from iblf_jax.control.observers.level import LevelObserver as LevelObserver
 from iblf_jax.control.observers.momentum import Momentum as Momentum
 from iblf_jax.control.observers.none import NoObserver as NoObserver
 from iblf_jax.control.observers.state_observer import StateObserver as StateObserver
+from iblf_jax.core import former_names
+
+if not TYPE_CHECKING:  # with it, a type checker would accept every name
+    __getattr__ = former_names.explained(__name__)
 
 MEMBERS = {
     "none": NoObserver,

@@ -2,6 +2,8 @@
 contracts are the base classes `RobotSensor`, `Sensor`, `LevelSensor` and `Velocity`.
 """
 
+from typing import TYPE_CHECKING
+
 from iblf_jax.control.sensors._base import AnySensor as AnySensor
 from iblf_jax.control.sensors._base import LevelSensor as LevelSensor
 from iblf_jax.control.sensors._base import Measurement as Measurement
@@ -17,6 +19,10 @@ from iblf_jax.control.sensors.levels import Levels as Levels
 from iblf_jax.control.sensors.measured import Measured as Measured
 from iblf_jax.control.sensors.tracking import Tracking as Tracking
 from iblf_jax.control.sensors.unmeasured import Unmeasured as Unmeasured
+from iblf_jax.core import former_names
+
+if not TYPE_CHECKING:  # with it, a type checker would accept every name
+    __getattr__ = former_names.explained(__name__)
 
 MEMBERS = {"ideal": Ideal, "encoder": Encoder, "levels": Levels}
 """Every sensor by the name that a scenario file gives it."""

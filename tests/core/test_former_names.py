@@ -1,0 +1,38 @@
+"""Former public names are refused with what to write in their place."""
+
+from __future__ import annotations
+
+import importlib
+import re
+
+import pytest
+
+import iblf_jax as ij
+from iblf_jax.core.former_names import NAMES
+
+RENAMED = [(module, *pair) for module, names in NAMES.items() for pair in names.items()]
+
+
+@pytest.mark.parametrize(("module", "former", "present"), RENAMED)
+def test_a_former_name_is_refused_with_the_present_one(module, former, present):
+    found = importlib.import_module(module)
+    assert not hasattr(found, former)
+    with pytest.raises(AttributeError, match=f"{former}.*now named {re.escape(present)}"):
+        getattr(found, former)
+    assert hasattr(found, re.match(r"\w+", present)[0])
+
+
+def test_a_former_argument_is_refused_with_the_present_one():
+    scenario = ij.presets.zhang_yan_2024()
+    with pytest.raises(TypeError, match=r"Write variant=\.\.\. in its place"):
+        ij.presets.zhang_yan_2024(reading="corrected")
+    with pytest.raises(TypeError, match=r"Write variant=\.\.\. in its place"):
+        ij.controllers.Backstepping(k1=2.0, K2=20.0, reading="corrected")
+    with pytest.raises(ValueError, match=r"Write bounds=\(positions, velocities\) in its place"):
+        ij.with_parts(scenario, velocity_bounds=scenario.bounds[0])
+
+
+def test_an_argument_is_a_former_one_only_where_the_present_one_is_known():
+    with pytest.raises(TypeError, match="reading") as error:
+        ij.presets.zhang_yan_2024_full_state(reading="corrected")
+    assert "in its place" not in str(error.value)
