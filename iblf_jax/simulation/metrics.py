@@ -19,7 +19,7 @@ A fold is a component: its thresholds are leaves. Its `units` name the results o
 from __future__ import annotations
 
 import abc
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import jax
@@ -736,36 +736,54 @@ class Events(Fold):
         }
 
 
+class SignalSource(NamedTuple):
+    """What gives runs an optional signal."""
+
+    part: str
+    """The part of a scenario that the signal needs, with an example."""
+    is_in: Callable[[Scenario], bool]
+    """Whether a scenario has it."""
+
+
+def _has_bounds_above_second(scenario: Scenario) -> bool:
+    return any(bounds is not None for bounds in scenario.bounds[2:])
+
+
+def _has_filter(scenario: Scenario) -> bool:
+    return any(law.filters for law in layers(scenario.controller))
+
+
 SIGNAL_SOURCES = {
-    "x_hat": "an observer of levels, such as ij.observers.StateObserver(bandwidth=100.0)",
-    "dq_lower": "bounds of the second level, such as bounds=(positions, velocities)",
-    "level_lower": "bounds of a level from the third on",
-    "region_margin": "regions, such as (ij.regions.HalfSpace(normal=[0, 1], offset=0.1),)",
-    "slack": "a law with a filter, such as ij.controllers.SafetyFilter(law)",
-    "region_slack": "regions and a law with a filter, such as ij.controllers.SafetyFilter(law)",
-    "auxiliary": "an auxiliary state, such as ij.controllers.Saturated(law, limit, auxiliary=5.0)",
-    "events": "a trigger, such as ij.Sampling(period, trigger=ij.EventTrigger(relative=0.1))",
+    "x_hat": SignalSource(
+        "an observer of levels, such as ij.observers.StateObserver(bandwidth=100.0)",
+        lambda scenario: observer_of_x(scenario.observer).completes,
+    ),
+    "dq_lower": SignalSource(
+        "bounds of the second level, such as bounds=(positions, velocities)",
+        lambda scenario: scenario.bounds[1] is not None,
+    ),
+    "level_lower": SignalSource("bounds of a level from the third on", _has_bounds_above_second),
+    "region_margin": SignalSource(
+        "regions, such as (ij.regions.HalfSpace(normal=[0, 1], offset=0.1),)",
+        lambda scenario: bool(scenario.regions),
+    ),
+    "slack": SignalSource(
+        "a law with a filter, such as ij.controllers.SafetyFilter(law)", _has_filter
+    ),
+    "region_slack": SignalSource(
+        "regions and a law with a filter, such as ij.controllers.SafetyFilter(law)",
+        lambda scenario: bool(scenario.regions) and _has_filter(scenario),
+    ),
+    "auxiliary": SignalSource(
+        "an auxiliary state, such as ij.controllers.Saturated(law, limit, auxiliary=5.0)",
+        lambda scenario: any(law.has_auxiliary for law in layers(scenario.controller)),
+    ),
+    "events": SignalSource(
+        "a trigger, such as ij.Sampling(period, trigger=ij.EventTrigger(relative=0.1))",
+        lambda scenario: scenario.sampling is not None and scenario.sampling.trigger is not None,
+    ),
 }
-"""Optional signal -> the part of a scenario that it needs, with an example."""
-
-
-def has_signal(scenario: Scenario, signal: str) -> bool:
-    """Whether runs of a scenario have an optional signal, one of `SIGNAL_SOURCES`."""
-    if signal == "dq_lower":
-        return scenario.bounds[1] is not None
-    if signal == "level_lower":
-        return any(bounds is not None for bounds in scenario.bounds[2:])
-    if signal == "x_hat":
-        return observer_of_x(scenario.observer).completes
-    has_regions = len(scenario.regions) > 0
-    if signal == "region_margin":
-        return has_regions
-    if signal == "auxiliary":
-        return any(law.has_auxiliary for law in layers(scenario.controller))
-    if signal == "events":
-        return scenario.sampling is not None and scenario.sampling.trigger is not None
-    has_filter = any(law.filters for law in layers(scenario.controller))
-    return {"slack": has_filter, "region_slack": has_filter and has_regions}[signal]
+"""Optional signal -> where it comes from."""
 
 
 def check_needs(field: str, fold: Any, scenario: Scenario) -> None:
@@ -776,9 +794,10 @@ def check_needs(field: str, fold: Any, scenario: Scenario) -> None:
     if needs is None:
         return
     checks.one_of(f"{field}.needs", needs, SIGNAL_SOURCES)
-    if not has_signal(scenario, needs):
+    source = SIGNAL_SOURCES[needs]
+    if not source.is_in(scenario):
         got = f"{checks.with_article(type(fold).__name__)} that reads {needs}"
-        raise checks.fail(field, got, f"a scenario with {SIGNAL_SOURCES[needs]}")
+        raise checks.fail(field, got, f"a scenario with {source.part}")
 
 
 def as_folds(
@@ -877,7 +896,7 @@ def optional_folds(scenario: Scenario) -> tuple[Fold, ...]:
     further levels and of regions, slacks of a filter, errors of estimated levels, the auxiliary
     state of a limited torque, and the events of a trigger.
     """
-    return tuple(fold() for fold in OPTIONAL if has_signal(scenario, fold.needs))
+    return tuple(fold() for fold in OPTIONAL if SIGNAL_SOURCES[fold.needs].is_in(scenario))
 
 
 MEMBERS = {
