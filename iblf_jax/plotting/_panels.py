@@ -248,7 +248,7 @@ def draw_bounds(
     axes: Axes, curve: Curve, quantity: PanelQuantity, joint: int, window: Window, **options: Any
 ) -> list[np.ndarray]:
     """Draws the bounds of a quantity as grey lines with a pale band between them; returns them."""
-    if quantity.bounds is None or np.isnan(curve[quantity.bounds[0]]).all():
+    if quantity.bounds is None or not np.isfinite(curve[quantity.bounds[0]]).any():
         return []
     style = {"color": _style.bound(), "linewidth": 1.0, "zorder": 1.8} | options
     style.setdefault("label", quantity.bounds_label)

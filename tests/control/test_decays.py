@@ -204,6 +204,7 @@ def test_settling_time_of_an_arm_and_the_case_in_which_it_is_broken():
         jumps=np.zeros(0),
         excluded=0,
         samples=1001,
+        why_never="",
         why_invalid="",
     )
     (broken,) = settling.SETTLING.run_lines(summary, [slow], {})
