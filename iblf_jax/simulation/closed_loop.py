@@ -45,7 +45,6 @@ from iblf_jax.simulation.noise import normals
 from iblf_jax.simulation.sampling import Instant, SentCommand, nothing_sent
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import Sample
-from iblf_jax.world import plants
 from iblf_jax.world.bounds import Tube, bounds_at
 from iblf_jax.world.regions import margins
 
@@ -330,8 +329,8 @@ def sample_at(
     if not is_absent(signals.alpha_higher):
         errors += list(x[2:] - signals.alpha_higher)
     optional: dict[str, Any] = {}
-    if scenario.regions:
-        robot = plants.robot_of(scenario.plant)
+    robot = scenario.loop.plant.robot
+    if scenario.regions and robot is not None:
         optional["region_margin"] = margins(scenario.regions, robot, x[0])
     if not is_absent(signals.estimated):
         optional |= signals.estimated._asdict()

@@ -54,7 +54,6 @@ from iblf_jax.simulation.discontinuities import has_jump
 from iblf_jax.simulation.integrators import Tableau, tableau
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.stability import SLOWEST_RATE
-from iblf_jax.world import plants
 from iblf_jax.world.bounds import Tube
 
 TOLERANCE = 0.005
@@ -467,14 +466,13 @@ def _disturbance_error(
     """
 
     def torque(t: jax.Array, q: jax.Array, dq: jax.Array) -> jax.Array:
-        plant = scenario.plant.at(t)
-        robot = plants.robot_of(plant)
+        robot = loop.plant.at(t).robot
+        known: Any = loop.model.robot
         if robot is None:
             return jnp.zeros_like(q)
-        known = plants.robot_of(scenario.model)
         return scenario.disturbance.torque(t, q, dq, robot, known)
 
-    stages = len(table.c)
+    loop, stages = scenario.loop, len(table.c)
     own = np.asarray(table.b, times.dtype)[:, None]
     exact = np.asarray([weight for _, weight in GAUSS], times.dtype)[:, None]
     # The first stage of every method is at the start of the step.
@@ -487,8 +485,8 @@ def _disturbance_error(
 
 def with_acceleration(scenario: Scenario, found: UnresolvedSignals) -> UnresolvedSignals:
     """`found` with the error of the disturbance as an acceleration of the plant at the start."""
-    plant = scenario.plant.at(jnp.zeros_like(found.disturbance_error[0]))
-    robot = plants.robot_of(plant)
+    t = jnp.zeros_like(found.disturbance_error[0])
+    robot = scenario.loop.plant.at(t).robot
     if robot is None:
         return found
     M = robot.mass_matrix(scenario.initial.q)
