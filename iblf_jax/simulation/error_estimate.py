@@ -131,13 +131,6 @@ def response(jacobian: jax.Array, n: int) -> jax.Array:
     return jnp.where(jnp.isfinite(found), found, 0.0)
 
 
-def _of_levels(response: jax.Array, state: LoopState) -> jax.Array:
-    """The columns of the response of a sampled loop that belong to the plant's levels from the
-    second on.
-    """
-    return response[:, : state.x[1:].size]
-
-
 def _rate(accuracy: Accuracy, slope: LoopState) -> jax.Array:
     """The rate of the positions and of their final displacement, (2 n,)."""
     n = slope.x.shape[-1]
@@ -177,7 +170,7 @@ def begin(method: str, jacobian: jax.Array, state: LoopState) -> Accuracy:
     if not is_absent(state.sampled):
         # Only a method of one stage uses an earlier rate; only levels have a local error.
         pending = (none,) if len(tableau(method).c) == 1 else ()
-        R = _of_levels(R, state)
+        R = R[:, : state.x[1:].size]
     return Accuracy(pending, none, R, none[:n], none[0])
 
 
@@ -189,8 +182,8 @@ def update(
     pieces: StepSlopes,
     width: jax.Array,
     sampled: bool = False,
-    restarts: Any = None,
-    too_many_jumps: Any = None,
+    restarts: jax.Array | None = None,
+    too_many_jumps: jax.Array | None = None,
     absolute: bool = False,
 ) -> Accuracy:
     """The estimate after one more step.
@@ -229,7 +222,7 @@ def _update_by_differences(
     index: jax.Array,
     pieces: StepSlopes,
     width: jax.Array,
-    restarts: Any,
+    restarts: jax.Array | None,
     absolute: bool,
 ) -> Accuracy:
     """The estimate of a continuous loop: differences of rates over several steps.
@@ -267,7 +260,7 @@ def _update_by_stages(
     dt: jax.Array,
     pieces: StepSlopes,
     width: jax.Array,
-    restarts: Any,
+    restarts: jax.Array | None,
 ) -> Accuracy:
     """The estimate of a sampled loop: from the stages of one step. A method of one stage is
     compared with the step before.

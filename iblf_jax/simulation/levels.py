@@ -15,8 +15,8 @@ import jax.numpy as jnp
 from iblf_jax.control.controllers import Law
 from iblf_jax.control.observers import Observer
 from iblf_jax.control.sensors._base import Measurement, measurement_of
-from iblf_jax.core import taylor
-from iblf_jax.core.pytree import unwrapped
+from iblf_jax.core import checks, taylor
+from iblf_jax.core.pytree import Absent, Pytree, unwrapped
 from iblf_jax.world import plants
 from iblf_jax.world.plants import Plant
 from iblf_jax.world.robots import at_time, friction_torque, inverse_dynamics
@@ -98,7 +98,7 @@ def has_speed_limits(scenario: Scenario) -> bool:
 
 
 def estimate(
-    scenario: Scenario, observer: Observer, t: jax.Array, x: jax.Array, state: Any
+    scenario: Scenario, observer: Observer, t: jax.Array, x: jax.Array, state: Pytree
 ) -> jax.Array:
     """The estimate that the law receives: the torque f_hat, (n,) [N m], or d_hat, (r, n).
 
@@ -117,7 +117,7 @@ def estimate(
 
 
 def completed(
-    scenario: Scenario, observer: Observer, t: jax.Array, measured: Measurement, state: Any
+    scenario: Scenario, observer: Observer, t: jax.Array, measured: Measurement, state: Pytree
 ) -> Measurement:
     """The levels that the law receives: those of a measurement, with the estimates of an observer
     in the place of the levels that it does not read.
@@ -125,7 +125,7 @@ def completed(
     if not observer.completes:
         return measured
     model = scenario.loop.model
-    x: Any = observer.complete(t, measured.x[: model.order], model, state)
+    x = checks.given(observer.complete(t, measured.x[: model.order], model, state))
     if len(x) > 2:
         return measurement_of(x)
     # The plant may have more levels than the model; they remain those of the sensor.
@@ -139,7 +139,7 @@ class EstimatedLevels(NamedTuple):
     """The levels, measured or estimated, (r, n)."""
     level_error: jax.Array
     """x_hat less the levels of the plant at the same instant, (r, n)."""
-    limit_excess: Any
+    limit_excess: jax.Array | Absent
     """Of `Observer`, () [1]; `()` where the estimates have no limits."""
 
 
@@ -150,7 +150,7 @@ def estimated_levels(
     reading: Measurement,
     received: Measurement,
     true: jax.Array,
-    state: Any,
+    state: Pytree,
 ) -> EstimatedLevels | tuple[()]:
     """The levels that a law receives, with their error; `()` for an observer that estimates none.
 
