@@ -38,13 +38,13 @@ from iblf_jax.files.scenario import load_scenario as load_scenario
 from iblf_jax.files.scenario import save_scenario as save_scenario
 from iblf_jax.simulation import metrics as metrics
 from iblf_jax.simulation import paths as paths
+from iblf_jax.simulation.initial import Initial as Initial
 from iblf_jax.simulation.paths import parameters as parameters
 from iblf_jax.simulation.paths import with_parameters as with_parameters
 from iblf_jax.simulation.results import Metrics as Metrics
 from iblf_jax.simulation.results import Rollout as Rollout
 from iblf_jax.simulation.sampling import EventTrigger as EventTrigger
 from iblf_jax.simulation.sampling import Sampling as Sampling
-from iblf_jax.simulation.scenario import Initial as Initial
 from iblf_jax.simulation.scenario import Scenario as Scenario
 from iblf_jax.simulation.scenario import with_parts as with_parts
 from iblf_jax.simulation.vector_field import VectorField as VectorField

@@ -32,6 +32,7 @@ from iblf_jax.core.devices import default_devices, platform
 from iblf_jax.core.families import adopt, required_members
 
 F = TypeVar("F", bound=Callable)
+T = TypeVar("T")
 
 LARGEST_INTEGER = 2**63 - 1
 MAX_STEPS = 2**31 - 1
@@ -70,6 +71,12 @@ class Words(str):
 
     def __repr__(self) -> str:
         return str(self)
+
+
+def given(part: T | None) -> T:
+    """An optional part in code that runs only with it."""
+    assert part is not None
+    return part
 
 
 def is_concrete(value: Any) -> bool:

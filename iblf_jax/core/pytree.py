@@ -23,13 +23,16 @@ import functools
 import inspect
 import operator
 from collections.abc import Callable
-from typing import Any, TypeAlias, TypeVar, dataclass_transform
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar, dataclass_transform
 
 import jax
 
 from iblf_jax.core import checks, modules
 from iblf_jax.core.exact_keys import behaviour_of, key_of_fields
 from iblf_jax.core.families import Part, adopt, statements_of
+
+if TYPE_CHECKING:
+    from typing_extensions import TypeIs
 
 T = TypeVar("T")
 
@@ -246,8 +249,14 @@ def _getter(names: tuple[str, ...]) -> Callable[[Any], tuple]:
     return lambda obj: ()
 
 
-def is_absent(x: Any) -> bool:
-    """Whether an optional part of a pytree is absent: `()`, which has no leaves."""
+Pytree: TypeAlias = Any
+"""Arrays in containers whose structure a part of a loop defines, such as the state of a law."""
+Absent: TypeAlias = tuple[()]
+"""The type of an optional part of a pytree that is absent: `()`, which has no leaves."""
+
+
+def is_absent(x: Any) -> TypeIs[Absent]:
+    """Whether an optional part of a pytree is absent."""
     return isinstance(x, tuple) and not x
 
 

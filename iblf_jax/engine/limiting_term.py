@@ -27,9 +27,10 @@ from iblf_jax.core import programs
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.engine.step_size import largest_eigenvalue, start_and_along
 from iblf_jax.simulation.closed_loop import LoopState, initial_state, run_sampled_law
+from iblf_jax.simulation.initial import Initial
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.paths import get, parameters, with_parameters
-from iblf_jax.simulation.scenario import Initial, Scenario
+from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.stability import jacobian, period_map
 
 NUMBER_OF_SCALES = 14

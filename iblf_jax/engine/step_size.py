@@ -26,10 +26,11 @@ from iblf_jax.engine.single_run import run_one
 from iblf_jax.engine.thresholds import STEP_SIZE_CHUNK
 from iblf_jax.simulation import discontinuities, error_estimate, error_growth
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state
+from iblf_jax.simulation.initial import Initial
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.levels import levels_on_reference
 from iblf_jax.simulation.noise import check_method
-from iblf_jax.simulation.scenario import Initial, Scenario, canonical, with_history
+from iblf_jax.simulation.scenario import Scenario, canonical, with_history
 from iblf_jax.simulation.stability import SLOWEST_RATE, jacobian
 from iblf_jax.world import plants
 

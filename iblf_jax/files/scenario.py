@@ -72,7 +72,8 @@ from iblf_jax.files.values import (
 from iblf_jax.presets import PRESETS
 from iblf_jax.simulation.integrators import METHODS
 from iblf_jax.simulation.paths import full_path, parameters, parse, with_parameters
-from iblf_jax.simulation.scenario import Scenario, check_leaves
+from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.simulation.scenario_rules import check_leaves
 from iblf_jax.world import plants
 
 COMPONENTS = ("robot", *(field.name for field in dataclasses.fields(Scenario)))

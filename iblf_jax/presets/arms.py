@@ -45,7 +45,8 @@ from iblf_jax.control.observers import AsPublished, Momentum
 from iblf_jax.core import checks
 from iblf_jax.core.disk_cache import keep_programs
 from iblf_jax.core.progress import announced
-from iblf_jax.simulation.scenario import Initial, Scenario, fit_joints
+from iblf_jax.simulation.initial import Initial
+from iblf_jax.simulation.scenario import Scenario, fit_joints
 from iblf_jax.world import disturbances, references
 from iblf_jax.world.bounds import Bounds, from_limits, tube_at
 from iblf_jax.world.bounds import Sinusoid as SinusoidalBound

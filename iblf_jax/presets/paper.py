@@ -13,8 +13,9 @@ from iblf_jax.control.controllers.systems import observer_of
 from iblf_jax.control.observers import Momentum
 from iblf_jax.core import checks
 from iblf_jax.presets.arms import OBSERVERS
+from iblf_jax.simulation.initial import Initial
 from iblf_jax.simulation.paths import with_parameters
-from iblf_jax.simulation.scenario import Initial, Scenario
+from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.world import disturbances, references
 from iblf_jax.world.bounds import Bounds, Funnel
 from iblf_jax.world.bounds import Sinusoid as SinusoidalBound

@@ -18,7 +18,8 @@ from iblf_jax.control.controllers import BarrierBackstepping
 from iblf_jax.control.observers import LevelObserver, Momentum
 from iblf_jax.presets.arms import iiwa14
 from iblf_jax.presets.paper import customary_two_link, zhang_yan_2024
-from iblf_jax.simulation.scenario import Initial, Scenario
+from iblf_jax.simulation.initial import Initial
+from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.world.bounds import Bounds, Constant, Funnel, from_speed_limits
 from iblf_jax.world.bounds import Sinusoid as SinusoidalBound
 from iblf_jax.world.disturbances import Levels, Sinusoids, Sum

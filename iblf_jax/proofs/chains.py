@@ -52,7 +52,8 @@ from iblf_jax.proofs.support import (
 )
 from iblf_jax.proofs.uncertainty import Places
 from iblf_jax.proofs.users_parts import agreement_of_plant
-from iblf_jax.simulation.scenario import Initial, Scenario, canonical
+from iblf_jax.simulation.initial import Initial
+from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.world import plants
 from iblf_jax.world.disturbances import Disturbance

@@ -21,7 +21,8 @@ from iblf_jax.proofs.periods import shifted
 from iblf_jax.proofs.support import check_level
 from iblf_jax.proofs.uncertainty import Places
 from iblf_jax.simulation import paths
-from iblf_jax.simulation.scenario import Initial, Scenario
+from iblf_jax.simulation.initial import Initial
+from iblf_jax.simulation.scenario import Scenario
 
 PARTS_OF_TIME = 32
 """Parts of the time interval, each of which is searched on its own: over a long part a tube may

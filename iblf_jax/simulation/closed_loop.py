@@ -30,9 +30,11 @@ from iblf_jax.control.controllers import Command
 from iblf_jax.control.observers import Observer
 from iblf_jax.control.sensors import Measurement
 from iblf_jax.control.sensors._base import measurement_of
-from iblf_jax.core.pytree import is_absent, unwrapped
+from iblf_jax.core import checks
+from iblf_jax.core.pytree import Absent, Pytree, is_absent, unwrapped
 from iblf_jax.simulation.delays import initial_commands
 from iblf_jax.simulation.levels import (
+    EstimatedLevels,
     completed,
     estimate,
     estimated_levels,
@@ -45,7 +47,6 @@ from iblf_jax.simulation.noise import normals
 from iblf_jax.simulation.sampling import Instant, SentCommand, nothing_sent
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import Sample
-from iblf_jax.world import plants
 from iblf_jax.world.bounds import Tube, bounds_at
 from iblf_jax.world.regions import margins
 
@@ -63,20 +64,23 @@ class LawSignals(NamedTuple):
     """Estimate of the uncertain term that the law used [N m]."""
     guard_active: jax.Array
     saturated: jax.Array
-    slack: Any = ()
-    region_slack: Any = ()
-    alpha_higher: Any = ()
-    torque: Any = ()
+    slack: jax.Array | Absent = ()
+    region_slack: jax.Array | Absent = ()
+    alpha_higher: jax.Array | Absent = ()
+    torque: jax.Array | Absent = ()
     """The torque that a law of a robot commanded through another input, (n,) [N m]; `()` where the
     input is the torque."""
-    estimated: Any = ()
+    estimated: EstimatedLevels | Absent = ()
     """`EstimatedLevels` under an observer that completes a measurement; `()` under others."""
-    auxiliary: Any = ()
-    events: Any = ()
+    auxiliary: jax.Array | Absent = ()
+    events: jax.Array | Absent = ()
 
 
 def law_signals(
-    command: Command, f_hat: jax.Array, estimated: Any = (), sent: Any = ()
+    command: Command,
+    f_hat: jax.Array,
+    estimated: EstimatedLevels | Absent = (),
+    sent: SentCommand | Absent = (),
 ) -> LawSignals:
     """The signals of a law that answered with `command` to the estimate `f_hat`; `estimated` are
     the levels that it received from an observer, and `sent` is the `SentCommand` of an event
@@ -108,14 +112,14 @@ class SampledState(NamedTuple):
 
     commands: jax.Array
     """Commands in transit to the actuator, newest first, (queue + 1, n) [N m]."""
-    sensor: Any
+    sensor: Pytree
     """State of the sensor."""
     measured: Measurement
     """The last measurement."""
     signals: LawSignals
     """Signals of the law at its last run."""
-    sent: Any = ()
-    """The `SentCommand` of a loop with an event trigger."""
+    sent: SentCommand | Absent = ()
+    """Of a loop with an event trigger."""
 
 
 class LoopState(NamedTuple):
@@ -123,9 +127,9 @@ class LoopState(NamedTuple):
 
     x: jax.Array
     """State of the plant, (r, n): of a robot q and q'."""
-    controller: Any
-    observer: Any
-    actuator: Any = ()
+    controller: Pytree
+    observer: Pytree
+    actuator: Pytree = ()
     sampled: Any = ()
     """A `SampledState` where the law is sampled."""
     delayed: Any = ()
@@ -166,7 +170,7 @@ def initial_state(scenario: Scenario) -> LoopState:
 
 def _initial_sampled_state(scenario: Scenario, state: LoopState, tau: jax.Array) -> SampledState:
     """State of a sampled loop before its first sample: every command in transit is `tau`."""
-    sampling: Any = scenario.sampling
+    sampling = checks.given(scenario.sampling)
     loop, x = scenario.loop, state.x
     x_model, t = x[: loop.model.order], jnp.zeros_like(x[0, 0])
     f_hat = jax.eval_shape(partial(estimate, scenario, loop.observer), t, x_model, state.observer)
@@ -239,9 +243,9 @@ def evaluate(
     """
     loop, x = scenario.loop, state.x
     x_model = x[: loop.model.order]
-    controller_rate: Any = ()
-    observer_rate: Any = ()
-    undelayed: Any = ()
+    controller_rate: Pytree = ()
+    observer_rate: Pytree = ()
+    undelayed: jax.Array | Absent = ()
     if scenario.sampling is None:
         f_hat = estimate(scenario, loop.observer, t, x_model, state.observer)
         true = measurement_of(x)
@@ -280,7 +284,11 @@ def rate(scenario: Scenario, t: jax.Array, state: LoopState) -> LoopState:
 
 
 def with_process_noise(
-    scenario: Scenario, t: jax.Array, state: LoopState, rate: LoopState, noise_rate: Any
+    scenario: Scenario,
+    t: jax.Array,
+    state: LoopState,
+    rate: LoopState,
+    noise_rate: jax.Array | None,
 ) -> LoopState:
     """The rate of the state with sigma(t, x) dW/dt of (P.1) added.
 
@@ -293,7 +301,7 @@ def with_process_noise(
     """
     if noise_rate is None:
         return rate
-    noise: Any = scenario.process_noise
+    noise = checks.given(scenario.process_noise)
     added = noise.diffusion(t, state.x) * noise_rate
     rows = list(rate.x)
     for row, level in zip(added, noise.levels, strict=True):
@@ -330,8 +338,8 @@ def sample_at(
     if not is_absent(signals.alpha_higher):
         errors += list(x[2:] - signals.alpha_higher)
     optional: dict[str, Any] = {}
-    if scenario.regions:
-        robot = plants.robot_of(scenario.plant)
+    robot = scenario.loop.plant.robot
+    if scenario.regions and robot is not None:
         optional["region_margin"] = margins(scenario.regions, robot, x[0])
     if not is_absent(signals.estimated):
         optional |= signals.estimated._asdict()
@@ -436,14 +444,14 @@ class LawUpdate(NamedTuple):
     command: Command
     """That of the law; with an event trigger its torque and its input are those that were sent."""
     f_hat: jax.Array
-    controller: Any
+    controller: Pytree
     """State of the law at the next sample."""
-    observer: Any
+    observer: Pytree
     """State of the observer at the next sample."""
     reading: Measurement
     """The measurement without estimates."""
-    sent: Any = ()
-    """The `SentCommand` of a loop with an event trigger."""
+    sent: SentCommand | Absent = ()
+    """Of a loop with an event trigger."""
 
 
 def discrete_observer(scenario: Scenario) -> Observer:
@@ -462,9 +470,9 @@ def law_update(
     scenario: Scenario,
     t: jax.Array,
     measured: Measurement,
-    controller: Any,
-    observer: Any,
-    sent: Any = (),
+    controller: Pytree,
+    observer: Pytree,
+    sent: SentCommand | Absent = (),
     applied: jax.Array | None = None,
 ) -> LawUpdate:
     """Command and next states of law and observer for one measurement: the program that runs on
@@ -479,7 +487,7 @@ def law_update(
       applied: torque of the period that the observer receives, (n,) [N m]; that of the command if
         not given.
     """
-    sampling: Any = scenario.sampling
+    sampling = checks.given(scenario.sampling)
     running = discrete_observer(scenario)
     reading = measured
     measured = completed(scenario, running, t, reading, observer)
@@ -489,6 +497,7 @@ def law_update(
     f_hat = estimate(scenario, running, t, x, observer)
     command, controller_rate = law.command(t, x, f_hat, scenario.context, controller)
     if sampling.trigger is not None:
+        assert not is_absent(sent)
         sent = sampling.trigger.sent(plant_input(command), command.tau, sent)
         command = _with_sent_input(command, sent)
     torque = command.tau if applied is None else applied
@@ -508,7 +517,7 @@ def _with_sent_input(command: Command, sent: SentCommand) -> Command:
     return command._replace(tau=sent.torque, input=sent.input)
 
 
-def _euler(state: Any, rate: Any, period: jax.Array) -> Any:
+def _euler(state: Pytree, rate: Pytree, period: jax.Array) -> Pytree:
     """One step of Euler's method on a pytree."""
     return jax.tree.map(lambda x, dx: x + period * dx, state, rate)
 
@@ -576,11 +585,11 @@ class PerturbedState(NamedTuple):
     """The `integrated_part`."""
     torque: jax.Array
     """The newest command, (n,) [N m]."""
-    memory: Any
+    memory: tuple[Pytree, Pytree, Pytree]
     """States of law, observer and sensor."""
 
 
-def perturbed_state(state: LoopState) -> Any:
+def perturbed_state(state: LoopState) -> LoopState | PerturbedState:
     """The variables by which the loop is linearised: its state without past commands, or the
     `PerturbedState` of a sampled loop.
     """
@@ -593,9 +602,9 @@ def perturbed_state(state: LoopState) -> Any:
 def perturbed_rate(
     scenario: Scenario,
     t: jax.Array,
-    perturbed: Any,
+    perturbed: LoopState | PerturbedState,
     dt: jax.Array | None = None,
-) -> Any:
+) -> LoopState | PerturbedState:
     """The function whose derivative linearises the loop.
 
     For a continuous loop it is the rate of the state. For a sampled loop it is the rate of the
@@ -620,7 +629,7 @@ def perturbed_rate(
         if dt is not None:
             arguments.append(dt)
         return evaluate(*arguments)[0]
-    sampling: Any = scenario.sampling
+    sampling = checks.given(scenario.sampling)
     scenario = dataclasses.replace(
         scenario,
         sensor=scenario.sensor.unrounded,

@@ -25,6 +25,7 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.control.actuators.delay import WHOLE_TOLERANCE
+from iblf_jax.core.pytree import Absent
 from iblf_jax.simulation.integrators import TABLEAUS, tableau
 from iblf_jax.simulation.sampling import command_at
 from iblf_jax.simulation.scenario import Scenario
@@ -115,7 +116,7 @@ class ArrivingCommands(NamedTuple):
 
 def arriving(
     scenario: Scenario, method: str, dt: jax.Array, number: jax.Array, commands: Any
-) -> Any:
+) -> ArrivingCommands | Absent:
     """The commands that arrive within a step; `()` without a delay.
 
     The commands are NaN where the delay is shorter than a step or longer than the history, so that
@@ -157,7 +158,9 @@ def arriving(
     )
 
 
-def interpolated(method: str, commands: Any, position: Any) -> jax.Array:
+def interpolated(
+    method: str, commands: jax.Array | list[jax.Array], position: jax.Array | float
+) -> jax.Array:
     """The value of the Lagrange polynomial through the commands of a step, (n,).
 
     Args:
@@ -171,7 +174,7 @@ def interpolated(method: str, commands: Any, position: Any) -> jax.Array:
     for node in nodes:
         at_node = [commands[i] for i, each in enumerate(c) if each == node]
         mean = sum(at_node[1:], at_node[0]) / len(at_node)
-        weight = 1.0
+        weight: jax.Array | float = 1.0
         for other in nodes:
             if other != node:
                 weight = weight * (position - other) / (node - other)
@@ -186,7 +189,7 @@ class PieceCommands(NamedTuple):
     """Time at which the piece begins, () [s]."""
     length: jax.Array
     """Length of the piece, () [s]."""
-    exists: Any
+    exists: jax.Array | bool
     """Whether the step has this piece, () bool."""
     commands: list[jax.Array]
     """Commands at the stages, (n,) each."""

@@ -56,13 +56,13 @@ class Piece(NamedTuple):
     """() [s]."""
     exists: Any
     """Whether the step has this piece, () bool; True for the first."""
-    earliest: Any
+    earliest: jax.Array | None
     """Time before which no stage is evaluated, () [s]; None in scenarios without jump times."""
-    latest: Any
+    latest: jax.Array | None
     """Time after which no stage is evaluated, () [s]; None in scenarios without jump times."""
     command_arrived: Any
     """Whether the command that arrives within the step has arrived, () bool."""
-    noise_rate: Any = None
+    noise_rate: jax.Array | None = None
     """The increment of the Brownian motion over the piece as a rate, (m, n) [1/s^0.5]; None for
     plants without process noise."""
 
@@ -71,7 +71,7 @@ class Division(NamedTuple):
     """The pieces of a step."""
 
     pieces: tuple[Piece, ...]
-    too_many_jumps: Any
+    too_many_jumps: jax.Array | None
     """Whether jumps lie at more times than `MAX_CUTS`, () bool; None where this cannot happen."""
 
 
@@ -99,7 +99,7 @@ def stage_time(piece: Piece, t: jax.Array) -> jax.Array:
     """The time at which a stage is evaluated, () [s]: on the side of every jump on which the piece
     lies.
     """
-    if piece.earliest is None:
+    if piece.earliest is None or piece.latest is None:
         return t
     return _clipped(t, piece.earliest, piece.latest)
 
@@ -140,7 +140,7 @@ def divide_step(
     ends = [*(cut.offset for cut in cuts[1:]), span.length]
     for cut, end in zip(cuts, ends, strict=True):
         done = done | cut.events
-        command_arrived: Any = arrival is not None
+        command_arrived: jax.Array | bool = arrival is not None
         if command_arrived and jumps:
             command_arrived = done[0]
         begin, exists = span.start + cut.offset, jnp.any(cut.events)

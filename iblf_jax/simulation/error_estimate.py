@@ -54,7 +54,6 @@ from iblf_jax.simulation.discontinuities import has_jump
 from iblf_jax.simulation.integrators import Tableau, tableau
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.stability import SLOWEST_RATE
-from iblf_jax.world import plants
 from iblf_jax.world.bounds import Tube
 
 TOLERANCE = 0.005
@@ -132,13 +131,6 @@ def response(jacobian: jax.Array, n: int) -> jax.Array:
     return jnp.where(jnp.isfinite(found), found, 0.0)
 
 
-def _of_levels(response: jax.Array, state: LoopState) -> jax.Array:
-    """The columns of the response of a sampled loop that belong to the plant's levels from the
-    second on.
-    """
-    return response[:, : state.x[1:].size]
-
-
 def _rate(accuracy: Accuracy, slope: LoopState) -> jax.Array:
     """The rate of the positions and of their final displacement, (2 n,)."""
     n = slope.x.shape[-1]
@@ -178,7 +170,7 @@ def begin(method: str, jacobian: jax.Array, state: LoopState) -> Accuracy:
     if not is_absent(state.sampled):
         # Only a method of one stage uses an earlier rate; only levels have a local error.
         pending = (none,) if len(tableau(method).c) == 1 else ()
-        R = _of_levels(R, state)
+        R = R[:, : state.x[1:].size]
     return Accuracy(pending, none, R, none[:n], none[0])
 
 
@@ -190,8 +182,8 @@ def update(
     pieces: StepSlopes,
     width: jax.Array,
     sampled: bool = False,
-    restarts: Any = None,
-    too_many_jumps: Any = None,
+    restarts: jax.Array | None = None,
+    too_many_jumps: jax.Array | None = None,
     absolute: bool = False,
 ) -> Accuracy:
     """The estimate after one more step.
@@ -230,7 +222,7 @@ def _update_by_differences(
     index: jax.Array,
     pieces: StepSlopes,
     width: jax.Array,
-    restarts: Any,
+    restarts: jax.Array | None,
     absolute: bool,
 ) -> Accuracy:
     """The estimate of a continuous loop: differences of rates over several steps.
@@ -268,7 +260,7 @@ def _update_by_stages(
     dt: jax.Array,
     pieces: StepSlopes,
     width: jax.Array,
-    restarts: Any,
+    restarts: jax.Array | None,
 ) -> Accuracy:
     """The estimate of a sampled loop: from the stages of one step. A method of one stage is
     compared with the step before.
@@ -467,14 +459,13 @@ def _disturbance_error(
     """
 
     def torque(t: jax.Array, q: jax.Array, dq: jax.Array) -> jax.Array:
-        plant = scenario.plant.at(t)
-        robot = plants.robot_of(plant)
+        robot = loop.plant.at(t).robot
+        known: Any = loop.model.robot
         if robot is None:
             return jnp.zeros_like(q)
-        known = plants.robot_of(scenario.model)
         return scenario.disturbance.torque(t, q, dq, robot, known)
 
-    stages = len(table.c)
+    loop, stages = scenario.loop, len(table.c)
     own = np.asarray(table.b, times.dtype)[:, None]
     exact = np.asarray([weight for _, weight in GAUSS], times.dtype)[:, None]
     # The first stage of every method is at the start of the step.
@@ -487,8 +478,8 @@ def _disturbance_error(
 
 def with_acceleration(scenario: Scenario, found: UnresolvedSignals) -> UnresolvedSignals:
     """`found` with the error of the disturbance as an acceleration of the plant at the start."""
-    plant = scenario.plant.at(jnp.zeros_like(found.disturbance_error[0]))
-    robot = plants.robot_of(plant)
+    t = jnp.zeros_like(found.disturbance_error[0])
+    robot = scenario.loop.plant.at(t).robot
     if robot is None:
         return found
     M = robot.mass_matrix(scenario.initial.q)

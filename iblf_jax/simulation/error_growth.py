@@ -72,14 +72,18 @@ there: it was compared with runs at a sixteenth of the step.
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
+from iblf_jax.control.sensors import AnySensor
 from iblf_jax.control.sensors._base import sensor_of_x
+from iblf_jax.core import checks
 from iblf_jax.core.linalg import matmul_in_order
+from iblf_jax.core.pytree import Absent, is_absent
 from iblf_jax.simulation.closed_loop import (
     LoopState,
     evaluate,
@@ -92,6 +96,8 @@ from iblf_jax.simulation.noise import normals
 from iblf_jax.simulation.sampling import Instant, step_torques
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.stability import flow, period_map
+
+T = TypeVar("T")
 
 BOUND = "relative_rounding_error"
 """Name of the smaller one of the bounds (A.4) and (A.5), relative to the width of the tube, among
@@ -117,7 +123,7 @@ class ErrorGrowth(NamedTuple):
     """Largest position error before a jump, (n,) [rad]."""
     relative: jax.Array
     """The same relative to the width of the tube, () [1]."""
-    peak: Any
+    peak: jax.Array | Absent
     """Largest command so far, (n,) [N m], in a loop with an event trigger; `()` in others."""
 
 
@@ -164,7 +170,7 @@ def _variables(scenario: Scenario, state: LoopState) -> Any:
         return state
     if _rounds_readings(scenario):
         return (integrated_part(state),)
-    sampled: Any = state.sampled
+    sampled = state.sampled
     memory = (state.controller, state.observer, sampled.sensor)
     return integrated_part(state), memory, sampled.commands, sampled.sent
 
@@ -180,7 +186,7 @@ def begin(scenario: Scenario, state: LoopState, derivative: jax.Array) -> Any:
     if not is_interrupted(scenario):
         return ()
     zero = jnp.zeros(scenario.n, state.x.dtype)
-    peak: Any = ()
+    peak: jax.Array | Absent = ()
     jumped = zero[0]
     if scenario.sampling is not None and scenario.sampling.trigger is not None:
         peak = zero
@@ -222,7 +228,7 @@ def _rows_of_levels(state: LoopState) -> list[slice]:
 # --- a step --------------------------------------------------------------------------------------
 
 
-def _moved(x: Any, by: Any, factor: Any) -> Any:
+def _moved(x: T, by: Any, factor: jax.Array) -> T:
     """A pytree x + factor by; leaves that are no floats stay."""
 
     def one(a: jax.Array, b: jax.Array) -> jax.Array:
@@ -246,7 +252,7 @@ def update(
     dt: jax.Array,
     index: jax.Array,
     now: Instant | None,
-    noise: Any,
+    noise: jax.Array,
     before: LoopState,
     state: LoopState,
     local_error: jax.Array,
@@ -269,8 +275,8 @@ def update(
         (scenario, before, state, local_error, width)
     )
     t = index.astype(dt.dtype) * dt
-    torque_error: Any = None
-    torque: Any = None
+    torque_error: jax.Array | None = None
+    torque: jax.Array | None = None
     if now is not None:
         growth = jax.lax.cond(
             now.phase == 0,
@@ -286,7 +292,7 @@ def update(
     small, back = _scales(errors)
     base = integrated_part(state)
     rate = _rate(scenario, t, state, base, dt, torque)
-    if torque is not None:
+    if torque is not None and torque_error is not None:
         torque = torque + small * torque_error
     shifted = _rate(scenario, t, state, _moved(base, part, small), dt, torque)
     flat, unflatten = ravel_pytree(part)
@@ -312,7 +318,7 @@ def rate_at_end(
     """The rate at the end of a step of Euler's method from a state."""
     t, torque = index.astype(dt.dtype) * dt, None
     if now is not None:
-        sampling: Any = scenario.sampling
+        sampling = checks.given(scenario.sampling)
         torque = step_torques(sampling, dt, now, state.sampled.commands).torque
     part = integrated_part(state)
     end = _moved(part, _rate(scenario, t, state, part, dt, torque), dt)
@@ -325,7 +331,7 @@ def _rate(
     state: LoopState,
     part: LoopState,
     dt: jax.Array,
-    torque: Any,
+    torque: jax.Array | None,
 ) -> LoopState:
     """The rate of the `integrated_part` of a state."""
     arguments = () if torque is None else (torque,)
@@ -338,7 +344,7 @@ def _torques(
     """The command at the actuator at the start of a step, (n,), and its mean error over the
     step.
     """
-    sampling: Any = scenario.sampling
+    sampling = checks.given(scenario.sampling)
     torque = step_torques(sampling, dt, now, state.sampled.commands).torque
     is_cut = _rounds_readings(scenario) or _rounds_torque(scenario)
     if is_cut:
@@ -353,7 +359,7 @@ def _at_sample(
     scenario: Scenario,
     t: jax.Array,
     now: Instant,
-    noise: Any,
+    noise: jax.Array,
     before: LoopState,
     state: LoopState,
 ) -> ErrorGrowth:
@@ -390,14 +396,14 @@ def _after_law(
     """The errors of command and memory after a law that receives readings without rounding, and
     whether an event or a level of the torque may differ.
     """
-    sampling: Any = scenario.sampling
+    sampling = checks.given(scenario.sampling)
     always = dataclasses.replace(scenario, sampling=dataclasses.replace(sampling, trigger=None))
     part, memory, commands, sent = growth.error
     sampled = before.sampled
     states = (before.controller, before.observer, sampled.sensor)
     small, back = _scales((part.x, memory))
 
-    def law(scale: Any) -> tuple[jax.Array, Any]:
+    def law(scale: jax.Array) -> tuple[jax.Array, Any]:
         x = _moved(before.x, part.x, scale)
         controller, observer, sensor = _moved(states, memory, scale)
         at = before._replace(x=x, controller=controller, observer=observer)
@@ -413,7 +419,7 @@ def _after_law(
     )
     blur = ARITHMETIC * jnp.finfo(command.dtype).eps * jnp.abs(command)
     reaches, peak = jnp.zeros((), bool), growth.peak
-    if sampling.trigger is not None:
+    if sampling.trigger is not None and not is_absent(peak):
         peak = jnp.maximum(peak, jnp.abs(command))
         relative = sampling.trigger.relative
         size = jnp.abs(sampled.sent.input)
@@ -436,7 +442,7 @@ def _after_law(
     return growth._replace(error=(part, *after), jumped=jumped, peak=peak)
 
 
-def _difference(x: Any, y: Any) -> Any:
+def _difference(x: T, y: T) -> T:
     """The difference y - x of two pytrees; 0 for leaves that are no floats."""
 
     def one(a: jax.Array, b: jax.Array) -> jax.Array:
@@ -445,9 +451,11 @@ def _difference(x: Any, y: Any) -> Any:
     return jax.tree.map(one, x, y)
 
 
-def _reading(sensor: Any, scenario: Scenario, state: LoopState, normal: jax.Array) -> jax.Array:
+def _reading(
+    sensor: AnySensor, scenario: Scenario, state: LoopState, normal: jax.Array
+) -> jax.Array:
     """The measured levels, (r, n)."""
-    sampling: Any = scenario.sampling
+    sampling = checks.given(scenario.sampling)
     before = state.sampled.sensor
     return sensor_of_x(sensor).measure(state.x, normal, sampling.period, before)[0].x
 
@@ -565,7 +573,7 @@ def _inputs(
     """The effects G of the deviations of dead zone, backlash and event trigger, (m, n), and of
     those of rounding, (m, c), each times its largest value; `size` is m.
     """
-    sampling: Any = scenario.sampling
+    sampling = checks.given(scenario.sampling)
     n = scenario.n
     plant = ravel_pytree(integrated_part(state))[0].size
     memory = len(derivative) - plant - n
@@ -618,7 +626,7 @@ def with_growth(
     return found, {BOUND: jnp.where(jumped, of_codes, 0.0)}
 
 
-def errors_by_step(metrics: Any) -> Any:
+def errors_by_step(metrics: Mapping[str, jax.Array]) -> jax.Array:
     """The stated error of runs relative to the tube, as far as a smaller step makes it tolerable;
     `metrics` are by name.
 
@@ -645,7 +653,7 @@ def _torque_widths(scenario: Scenario, growth: ErrorGrowth) -> tuple[jax.Array, 
     """Largest difference of two deviations of the torque from that of the smooth loop, (n,)
     [N m], less that of rounding, and that of rounding; None for a torque that is not rounded.
     """
-    sampling: Any = scenario.sampling
+    sampling = checks.given(scenario.sampling)
     width = jnp.zeros((scenario.n,), growth.largest.dtype)
     deviation, step = scenario.actuator.deviation, scenario.actuator.resolution
     if deviation is not None:

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 from iblf_jax.core import checks
+from iblf_jax.core.pytree import Pytree
 
 
 class Tableau(NamedTuple):
@@ -77,7 +78,7 @@ def tableau(method: str) -> Tableau:
 class StepResult(NamedTuple):
     """Result of one step of the integrator."""
 
-    state: Any
+    state: Pytree
     """The state one step later."""
     slopes: list
     """The slopes of the stages."""

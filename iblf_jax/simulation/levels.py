@@ -14,9 +14,9 @@ import jax.numpy as jnp
 
 from iblf_jax.control.controllers import Law
 from iblf_jax.control.observers import Observer
-from iblf_jax.control.sensors._base import Measurement
-from iblf_jax.core import taylor
-from iblf_jax.core.pytree import unwrapped
+from iblf_jax.control.sensors._base import Measurement, measurement_of
+from iblf_jax.core import checks, taylor
+from iblf_jax.core.pytree import Absent, Pytree, unwrapped
 from iblf_jax.world import plants
 from iblf_jax.world.plants import Plant
 from iblf_jax.world.robots import at_time, friction_torque, inverse_dynamics
@@ -35,12 +35,10 @@ def start_levels(scenario: Scenario) -> jax.Array:
     flexible joint, the current that holds gravity.
     """
     initial, plant = scenario.initial, scenario.loop.plant
-    higher: Any = ()
-    if plant.order > 2:
-        higher = initial.higher
-    if higher is None:
-        higher = plant.steady_levels(initial.q, initial.dq)
-    return plants.state_of_levels(initial.q, initial.dq, higher)
+    if plant.order == 2 or initial.higher is not None:
+        return initial.x
+    steady = plant.steady_levels(initial.q, initial.dq)
+    return plants.state_of_levels(initial.q, initial.dq, steady)
 
 
 def levels_on_reference(scenario: Scenario, t: jax.Array) -> jax.Array:
@@ -84,7 +82,7 @@ def stated_steady_input(scenario: Scenario, q: jax.Array) -> jax.Array | None:
     plant that states none.
     """
     plant, model, *_ = scenario.loop
-    if isinstance(model, plants.RobotPlant) and not isinstance(plant, plants.RobotPlant):
+    if model.is_robot and not plant.is_robot:
         model = plant
     return model.steady_input(q)  # type: ignore[no-any-return]
 
@@ -100,7 +98,7 @@ def has_speed_limits(scenario: Scenario) -> bool:
 
 
 def estimate(
-    scenario: Scenario, observer: Observer, t: jax.Array, x: jax.Array, state: Any
+    scenario: Scenario, observer: Observer, t: jax.Array, x: jax.Array, state: Pytree
 ) -> jax.Array:
     """The estimate that the law receives: the torque f_hat, (n,) [N m], or d_hat, (r, n).
 
@@ -119,7 +117,7 @@ def estimate(
 
 
 def completed(
-    scenario: Scenario, observer: Observer, t: jax.Array, measured: Measurement, state: Any
+    scenario: Scenario, observer: Observer, t: jax.Array, measured: Measurement, state: Pytree
 ) -> Measurement:
     """The levels that the law receives: those of a measurement, with the estimates of an observer
     in the place of the levels that it does not read.
@@ -127,10 +125,11 @@ def completed(
     if not observer.completes:
         return measured
     model = scenario.loop.model
-    x: Any = observer.complete(t, measured.x[: model.order], model, state)
+    x = checks.given(observer.complete(t, measured.x[: model.order], model, state))
+    if len(x) > 2:
+        return measurement_of(x)
     # The plant may have more levels than the model; they remain those of the sensor.
-    higher = measured.higher if len(x) == 2 else x[2:]
-    return Measurement(x[0], x[1], higher)
+    return measured._replace(q=x[0], dq=x[1])
 
 
 class EstimatedLevels(NamedTuple):
@@ -140,7 +139,7 @@ class EstimatedLevels(NamedTuple):
     """The levels, measured or estimated, (r, n)."""
     level_error: jax.Array
     """x_hat less the levels of the plant at the same instant, (r, n)."""
-    limit_excess: Any
+    limit_excess: jax.Array | Absent
     """Of `Observer`, () [1]; `()` where the estimates have no limits."""
 
 
@@ -151,7 +150,7 @@ def estimated_levels(
     reading: Measurement,
     received: Measurement,
     true: jax.Array,
-    state: Any,
+    state: Pytree,
 ) -> EstimatedLevels | tuple[()]:
     """The levels that a law receives, with their error; `()` for an observer that estimates none.
 
@@ -186,8 +185,8 @@ def motion(scenario: Scenario, t: jax.Array, x: jax.Array, u: jax.Array) -> jax.
         torque: jax.Array | float = 0.0 if friction is None else friction
         u = u + disturbance.torque(t, q, dq, given, model)
     else:
-        robot_model = plants.robot_of(model)
-        torque = disturbance.torque(t, q, dq, robot, robot_model) + friction_torque(robot, dq)
+        known: Any = scenario.loop.model.robot
+        torque = disturbance.torque(t, q, dq, robot, known) + friction_torque(robot, dq)
     rate = plants.flow(plant, t, x, u, torque)
     added = disturbance.rates(t, x, given, model)
     return rate if added is None else rate + added

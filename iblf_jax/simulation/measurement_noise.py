@@ -11,7 +11,7 @@ state P = F P F^T + B W B^T, and the covariance of the measurement is H P H^T + 
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,9 +20,13 @@ from jax.flatten_util import ravel_pytree
 
 from iblf_jax.control.sensors import Sensor
 from iblf_jax.control.sensors._base import sensor_of_x
+from iblf_jax.core import checks
 from iblf_jax.core.units import of_component, per_second
 from iblf_jax.simulation.levels import start_levels
 from iblf_jax.world import plants
+
+if TYPE_CHECKING:
+    from iblf_jax.simulation.scenario import Scenario
 
 DOUBLINGS = 40
 """Steps of the doubling algorithm for P, which then contains 2^40 samples."""
@@ -41,7 +45,7 @@ class LinearSensor(NamedTuple):
     """y by w, (r n, p)."""
 
 
-def standard_deviations(scenario: Any) -> np.ndarray:
+def standard_deviations(scenario: Scenario) -> np.ndarray:
     """Standard deviations of the measured levels of the model, (r, n), each in the unit of its
     level; 0 for a level that is not measured.
 
@@ -58,9 +62,9 @@ def standard_deviations(scenario: Any) -> np.ndarray:
 
 
 @jax.jit
-def _linear_sensor(scenario: Any) -> LinearSensor:
+def _linear_sensor(scenario: Scenario) -> LinearSensor:
     """The matrices of the sensor at the start, for inputs of the standard deviation 1."""
-    sensor, period = scenario.sensor, scenario.sampling.period
+    sensor, period = scenario.sensor, checks.given(scenario.sampling).period
     smooth = sensor_of_x(sensor.unrounded)
     x = start_levels(scenario)
     read = x if isinstance(sensor, Sensor) else x[:1]
@@ -84,7 +88,7 @@ def _linear_sensor(scenario: Any) -> LinearSensor:
     return LinearSensor(by_z[:count], by_w[:count], by_z[count:], by_w[count:])
 
 
-def noise_advice(scenario: Any) -> list[str]:
+def noise_advice(scenario: Scenario) -> list[str]:
     """A warning about an observer that amplifies the noise of the sensor, with the numbers of each
     level; none for an observer without `noise_gain`, or a sensor without noise.
     """
@@ -110,7 +114,7 @@ def noise_advice(scenario: Any) -> list[str]:
     ]
 
 
-def _row(scenario: Any, level: int, noise: np.ndarray, kappa: np.ndarray) -> str:
+def _row(scenario: Scenario, level: int, noise: np.ndarray, kappa: np.ndarray) -> str:
     """The noise of a level and of its estimate in words, for its worst component."""
     worst = int(np.argmax(noise * kappa))
     unit = of_component(plants.units_of(scenario.model)[level], worst)

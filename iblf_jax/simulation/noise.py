@@ -20,6 +20,7 @@ from iblf_jax.simulation.discontinuities import Piece
 from iblf_jax.simulation.integrators import STOCHASTIC, TABLEAUS, tableau
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import Sample
+from iblf_jax.world.robots import Dynamics
 
 NOISE_NAME = "noise"
 """Name of the noise key among the replaced values of a run; no leaf of a scenario has this name."""
@@ -194,7 +195,9 @@ def _check_kind_of_method(scenario: Scenario, method: str) -> None:
         raise checks.fail("method", method, expected, remedy)
 
 
-def brownian_increment(scenario: Scenario, key: jax.Array, step: jax.Array, dt: Any) -> jax.Array:
+def brownian_increment(
+    scenario: Scenario, key: jax.Array, step: jax.Array, dt: jax.Array
+) -> jax.Array:
     """The increment of W over a step, (m, n) [s^0.5].
 
     Args:
@@ -203,7 +206,7 @@ def brownian_increment(scenario: Scenario, key: jax.Array, step: jax.Array, dt: 
       step: number of the step, () int.
       dt: its length, () [s].
     """
-    noise: Any = scenario.process_noise
+    noise = checks.given(scenario.process_noise)
     levels, parts = len(noise.levels), noise.substeps
     first = step.astype(jnp.int32) * parts
     total = normals(key, first, levels, scenario.n, PROCESS_STREAM)
@@ -227,7 +230,7 @@ def with_noise_rates(
       key, step, dt: as for `brownian_increment`.
       pieces: of the step.
     """
-    noise: Any = scenario.process_noise
+    noise = checks.given(scenario.process_noise)
     left, rest = dt, brownian_increment(scenario, key, step, dt)
     m, divisions = len(noise.levels), len(pieces) - 1
     z = normals(key, step, m * divisions, scenario.n, BRIDGE_STREAM)
@@ -301,8 +304,8 @@ def with_extremes(
     dt: jax.Array,
     sample: Sample,
     x: jax.Array,
-    before: Any,
-    now: Any,
+    before: jax.Array,
+    now: jax.Array,
 ) -> Sample:
     """A sample with the smallest distances since the instant before, on levels with process noise.
 
@@ -338,7 +341,7 @@ def with_extremes(
 # --- switching times ------------------------------------------------------------------------------
 
 
-def realised(scenario: Scenario, key: Any) -> Scenario:
+def realised(scenario: Scenario, key: jax.Array) -> Scenario:
     """The scenario with the switching times and modes of one run, where its plant draws them."""
     draws = scenario.plant.mode_draws
     if not draws:
@@ -347,11 +350,10 @@ def realised(scenario: Scenario, key: Any) -> Scenario:
     words = _words(key, MODES_STREAM)
     numbers = jnp.arange(draws, dtype=jnp.int32)
     pairs = jax.vmap(lambda k: jnp.stack(_uniforms(words, jnp.int32(0), k, dtype)))(numbers)
-    plant: Any = scenario.plant
-    return _with_plant(scenario, plant.with_path(pairs))
+    return _with_plant(scenario, scenario.plant.with_path(pairs))
 
 
-def _with_plant(scenario: Scenario, plant: Any) -> Scenario:
+def _with_plant(scenario: Scenario, plant: Dynamics) -> Scenario:
     """A copy with another plant, without checks: its numbers may be traced."""
     new = copy.copy(scenario)
     object.__setattr__(new, "plant", plant)

@@ -255,18 +255,13 @@ def _quoted(name: str) -> str:
     return name if needs_no_quotes else json.dumps(name)
 
 
-def _next_level(match: re.Match) -> str:
-    """The bounds of a level that earlier versions counted from the second one."""
-    return f"bounds[{int(match[1]) + 1}]"
-
-
 SHORT_PATHS: tuple[tuple[re.Pattern, Any], ...] = (
     (re.compile(r"^bounds(?=\.(lower|upper)\b)"), "bounds[0]"),
     (re.compile(r"^velocity_bounds\b"), "bounds[1]"),
-    (re.compile(r"^state_bounds\[(\d+)\]"), _next_level),
+    (re.compile(r"^state_bounds\[(\d+)\]"), lambda found: f"bounds[{int(found[1]) + 1}]"),
 )
-"""Beginnings of paths -> the full ones.  Files of earlier versions have `velocity_bounds` and
-`state_bounds`."""
+"""Beginnings of paths -> the full ones.  Files of earlier versions have `velocity_bounds`, and
+`state_bounds` from the second level on."""
 
 
 def full_path(path: str) -> str:

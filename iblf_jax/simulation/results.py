@@ -15,6 +15,7 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.core.presentation import Result, present
+from iblf_jax.core.pytree import Pytree
 from iblf_jax.core.status import Status, describe
 from iblf_jax.simulation.error_estimate import RELATIVE
 from iblf_jax.simulation.scenario import Scenario
@@ -87,9 +88,9 @@ class Rollout(Result, Signals):
 
     scenario: Scenario
     """The scenario of the run."""
-    controller_state: Any
+    controller_state: Pytree
     """State of the law, time axis first; `()` if it has none."""
-    observer_state: Any
+    observer_state: Pytree
     """State of the observer, time axis first; `()` if it has none."""
     metrics: Metrics
     """Results of the folds; and `numerical_error`, (n,) [rad], and `relative_numerical_error`, ()
@@ -108,7 +109,7 @@ class Rollout(Result, Signals):
     steps: int | None = dataclasses.field(default=None, metadata={"static": True})
     """Number of steps, recorded or not; None if it is unknown whether there were steps after the
     last sample."""
-    actuator_state: Any = ()
+    actuator_state: Pytree = ()
     """State of the actuator, time axis first; `()` if it has none."""
     measured: Any = ()
     """What the law received at the last sample, `measured.q` [rad] and `measured.dq` [rad/s],

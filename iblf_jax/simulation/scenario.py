@@ -10,9 +10,8 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
-from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,121 +20,40 @@ import numpy as np
 from iblf_jax.control.actuators import Actuator
 from iblf_jax.control.actuators import Ideal as IdealActuator
 from iblf_jax.control.controllers import Law, LawContext, TrackingLaw
-from iblf_jax.control.controllers._base import check_law, law_of_x
+from iblf_jax.control.controllers._base import law_of_x
 from iblf_jax.control.observers import DisturbanceObserver, NoObserver, Observer
-from iblf_jax.control.observers import _base as observers
 from iblf_jax.control.observers.none import observer_of_x
 from iblf_jax.control.sensors import AnySensor, Sensor
 from iblf_jax.control.sensors import Ideal as IdealSensor
-from iblf_jax.control.sensors import _base as sensors
 from iblf_jax.control.sensors._base import sensor_of_x
-from iblf_jax.core import checks, modules, notices, programs
+from iblf_jax.core import checks, modules, notices
 from iblf_jax.core.disk_cache import keep_programs
 from iblf_jax.core.families import is_default, statements_of
 from iblf_jax.core.modules import NUMBERS
 from iblf_jax.core.presentation import present
 from iblf_jax.core.pytree import (
-    Leaf,
     astype,
     component,
     field_values,
     is_leaf_field,
     layers,
-    leaf,
     note_code,
     rewrapped,
     unwrapped,
 )
 from iblf_jax.core.time import joined, jump_times_of
-from iblf_jax.core.units import HIGHER, POSITION, VELOCITY, as_text
-from iblf_jax.simulation.levels import has_speed_limits, start_levels
-from iblf_jax.simulation.measurement_noise import noise_advice
+from iblf_jax.simulation import scenario_rules as rules
+from iblf_jax.simulation.advice import advice_of
+from iblf_jax.simulation.initial import Initial
+from iblf_jax.simulation.levels import start_levels
 from iblf_jax.simulation.sampling import PERIOD_TOLERANCE, Sampling
-from iblf_jax.world import plants, process_noise, regions
-from iblf_jax.world.bounds import Bounds, Funnel, Side, bounds_at, speed_limits_at
+from iblf_jax.world import plants, regions
+from iblf_jax.world.bounds import Bounds
 from iblf_jax.world.disturbances import Disturbance, Nothing
 from iblf_jax.world.plants import Plant
 from iblf_jax.world.process_noise import ProcessNoise
 from iblf_jax.world.references import Reference
-from iblf_jax.world.robots import Robot, WithMotors
-from iblf_jax.world.robots._base import mass_matrix_at
-
-
-@component
-class Initial:
-    """The state of the plant at the start of a run: position and velocity, or all levels.
-
-    A plant in strict-feedback form with more than two levels takes x.  A flexible joint given by q
-    and q' alone starts at the static equilibrium of its springs, and a drive with the current that
-    holds gravity.
-
-    Args:
-      q: position, () or (n,) [rad].
-      dq: velocity, () or (n,) [rad/s]; 0 if not given.
-      higher: the levels from the third on, (r - 2, n) [1], in the units of the plant; the steady
-        state if not given.  `Initial(x=...)` takes all levels, (r, n), in the place of q, dq and
-        higher.
-    """
-
-    q: Leaf = leaf(POSITION)
-    dq: Leaf = leaf(VELOCITY, default=0.0)
-    higher: Leaf = leaf(HIGHER, shape="level", default=None)
-    stacked: ClassVar[dict[str, tuple[str, ...]]] = {"x": ("q", "dq", "higher")}
-
-    def __init__(self, q: Any = None, dq: Any = None, higher: Any = None, *, x: Any = None) -> None:
-        if x is not None:
-            if any(value is not None for value in (q, dq, higher)):
-                expected = "either x, or q and dq"
-                raise checks.fail("Initial.x", x, expected, "x is q, dq and the other levels.")
-            q, dq, higher = _split_levels(x)
-        for name, value in (("q", q), ("dq", 0.0 if dq is None else dq), ("higher", higher)):
-            object.__setattr__(self, name, value)
-
-    @property
-    def x(self) -> jax.Array:
-        """All given levels, (2, n) or (r, n)."""
-        first = jnp.stack(jnp.broadcast_arrays(self.q, self.dq))
-        return first if self.higher is None else jnp.concatenate([first, self.higher])
-
-
-def _split_levels(x: Any) -> tuple[Any, Any, Any]:
-    """The first two levels of a state (r, n), and the others; ValueError for another shape."""
-    array = checks.as_floats("Initial.x", x)
-    if array.ndim != 2 or len(array) < 2:
-        expected = "one row a level, shape (r, n)"
-        got = f"shape {array.shape}"
-        remedy = "Such as x=[[0.3], [0.0], [0.0]] for three levels of one number."
-        raise checks.fail("Initial.x", got, expected, remedy)
-    return array[0], array[1], array[2:] if len(array) > 2 else None
-
-
-ROBOTS = "iblf_jax.robots has them; write your own with from_energy."
-PLANTS = "iblf_jax.plants has them; iblf_jax.testing.check_plant checks your own."
-CONTRACTS: dict[str, tuple[Any, str]] = {
-    "reference": (Reference, "iblf_jax.references has them."),
-    "observer": (observers.contract_of, "iblf_jax.observers has them; NoObserver() for none."),
-    "disturbance": (Disturbance, "iblf_jax.disturbances has them; Nothing() for none."),
-    "sensor": (sensors.contract_of, "iblf_jax.sensors has them; Ideal() for none."),
-    "actuator": (Actuator, "iblf_jax.actuators has them; Ideal() for none."),
-}
-"""Part of a scenario that a user may write -> its contract, or a function of the part that returns
-it, and the remedy of an error message.
-"""
-LAWS = "iblf_jax.controllers has them; iblf_jax.testing.check_law checks your own."
-CLASSES: dict[str, tuple[Any, str]] = {
-    "initial": (Initial, "an Initial, such as Initial(q=[0.8, 0.8])"),
-    "bounds": (
-        Bounds | tuple | list,
-        "a Bounds, such as Bounds(lower=Constant(0.1), upper=Constant(0.9)), or a tuple of one for"
-        " each level",
-    ),
-    "sampling": (Sampling | None, "a Sampling, or None, such as ij.Sampling(period=2e-3)"),
-    "regions": (
-        tuple | list,
-        "a tuple of regions, such as (ij.regions.HalfSpace(normal=[0, 1], offset=0.1),)",
-    ),
-}
-"""Class of each other part, and its description in an error message."""
+from iblf_jax.world.robots import Robot
 
 HOW_TO_MAKE = "Make one with ij.presets or ij.Scenario."
 
@@ -230,20 +148,16 @@ class Scenario:
         """
         if self.model is None:
             object.__setattr__(self, "model", plants.nominal_of(self.plant))
-        for name in ("plant", "model"):
-            check_plant_or_robot(f"Scenario.{name}", vars(self)[name])
-        parts = field_values(self)
-        check_law("Scenario.controller", self.controller, LAWS)
-        for name, (contract, remedy) in CONTRACTS.items():
-            base = contract if isinstance(contract, type) else contract(parts[name])
-            checks.conforms(f"Scenario.{name}", parts[name], base, remedy)
-        self._check_classes()
+        rules.check_parts(self)
         self._fit_bounds()
-        self._check_combination()
-        check_levels(self)
-        self._check_regions()
-        _check_process_noise(self)
-        _check_modes(self.plant)
+        rules.check_combination(self)
+        object.__setattr__(self, "regions", tuple(self.regions))
+        rules.check_regions(self)
+        noise, order = self.process_noise, plants.order_of(self.plant)
+        if noise is not None:
+            rules.check_process_noise(noise, order)
+            rules.check_diffusion(fit_joints(noise, self.n, "process_noise"), order, self.n)
+        rules.check_modes(self.plant)
         for name, part in field_values(self).items():
             object.__setattr__(self, name, fit_joints(part, self.plant.n, name))
         self._complete_law()
@@ -272,50 +186,6 @@ class Scenario:
         if not given or given[0] is None:
             raise checks.fail("Scenario.bounds[0]", None, "the bounds of the first level")
         object.__setattr__(self, "bounds", given[:order] + (None,) * (order - len(given)))
-
-    def _check_classes(self) -> None:
-        """Raises ValueError for a part of the wrong class."""
-        parts = field_values(self)
-        for name, (kind, expected) in CLASSES.items():
-            if not isinstance(parts[name], kind):
-                raise checks.fail(f"Scenario.{name}", parts[name], expected)
-
-    def _check_combination(self) -> None:
-        """Raises ValueError for parts that do not fit together."""
-        if self.model.n != self.plant.n:
-            got = plants.counted_components(self.plant, self.model.n)
-            expected = f"{plants.counted_components(self.plant, self.plant.n)}, as the plant has"
-            raise checks.fail("Scenario.model", got, expected)
-        law = unwrapped(self.controller)
-        if self.bounds[1] is None and law.needs_velocity_bounds:
-            expected = f"the bounds that {type(law).__name__} keeps"
-            remedy = (
-                "Such as bounds=(positions, Bounds(lower=Constant(-1.0), upper=Constant(1.0)))."
-            )
-            raise checks.fail("Scenario.bounds[1]", None, expected, remedy)
-        if self.sampling is None and not isinstance(self.sensor, IdealSensor):
-            got, expected = type(self.sensor).__name__, "an Ideal sensor where no law is sampled"
-            remedy = "Add sampling=ij.Sampling(period=...): a sensor is read once a period."
-            raise checks.fail("Scenario.sensor", got, expected, remedy)
-        if self.sampling is not None and self.actuator.input_delay is not None:
-            expected = "no Delay where the law is sampled"
-            remedy = "Give ij.Sampling(period=..., delay=...) instead."
-            raise checks.fail("Scenario.actuator", self.actuator, expected, remedy)
-
-    def _check_regions(self) -> None:
-        """Makes a tuple of the regions; raises ValueError for one that is no region, or does not
-        fit plant and model.
-        """
-        object.__setattr__(self, "regions", tuple(self.regions))
-        for i, region in enumerate(self.regions):
-            name = f"Scenario.regions[{i}]"
-            checks.conforms(name, region, regions.Region, "iblf_jax.regions has them.")
-            for part in (self.plant, self.model):
-                robot = plants.robot_of(part)
-                if robot is None:
-                    expected = "no regions, as this plant has no points in space"
-                    raise checks.fail(name, region, expected, "Use bounds.")
-                _check_region(name, region, robot)
 
     def symbols_of_part(self, field: str, index: int, symbols: Any) -> Any:
         """The units of the symbols in a part: bounds have the unit of their level."""
@@ -363,172 +233,6 @@ class Scenario:
 
     def _repr_html_(self) -> str:
         return present("card", self)
-
-
-def _check_process_noise(scenario: Scenario) -> None:
-    """Raises ValueError for something that is no process noise, or does not fit the plant."""
-    noise, name = scenario.process_noise, "Scenario.process_noise"
-    if noise is None:
-        return
-    checks.conforms(name, noise, ProcessNoise, "iblf_jax.process_noise has them.")
-    process_noise.check_structure(noise)
-    order = plants.order_of(scenario.plant)
-    if noise.levels[-1] > order:
-        expected = f"levels up to {order}, as the plant has"
-        raise checks.fail(f"{name}.levels", noise.levels, expected)
-    fitted: Any = fit_joints(noise, scenario.n, "process_noise")
-    t, x = jnp.zeros(()), jnp.zeros((order, scenario.n))
-    shape = (len(noise.levels), scenario.n)
-    try:
-        found = jax.eval_shape(fitted.diffusion, t, x).shape
-    except Exception as error:
-        got = f"{type(error).__name__}: {checks.one_line(str(error))}"
-        raise checks.fail(f"{name}.diffusion(t, x)", got, f"shape {shape}") from error
-    if found != shape:
-        remedy = "One row for each of its levels."
-        raise checks.fail(f"{name}.diffusion(t, x)", f"shape {found}", f"shape {shape}", remedy)
-
-
-def _check_modes(plant: Any) -> None:
-    """Raises ValueError for a part of the plant whose modes are a Markov chain: only the plant
-    itself can be.
-    """
-
-    def draws_modes(part: Any) -> bool:
-        return isinstance(part, plants.MarkovSwitched) and part is not plant
-
-    inside = [part for part in jax.tree.leaves(plant, is_leaf=draws_modes) if draws_modes(part)]
-    if inside:
-        expected = "MarkovSwitched as the plant itself"
-        remedy = "Such as MarkovSwitched(plant=FlexibleJoint(...), ...)."
-        raise checks.fail("Scenario.plant", type(plant).__name__, expected, remedy)
-
-
-def check_plant_or_robot(name: str, part: Any) -> None:
-    """Raises ValueError for something that is neither a robot nor a plant in strict-feedback
-    form.
-    """
-    if plants.is_chain(part):
-        checks.conforms(name, part, Plant, PLANTS)
-        plants.check_dimensions(name, part)
-        return
-    checks.conforms(name, part, Robot, f"{ROBOTS} {PLANTS}")
-
-
-def check_levels(scenario: Scenario) -> None:
-    """Raises ValueError for a model, a law, an observer or a start that does not fit the levels of
-    the plant.
-    """
-    plant, model = scenario.plant, scenario.model
-    order, known = plants.order_of(plant), plants.order_of(model)
-    if known != order and known != 2:
-        expected = f"a robot, or a plant of order {order}, as the plant is"
-        raise checks.fail("Scenario.model", f"a plant of order {known}", expected)
-    law = unwrapped(scenario.controller)
-    kind = type(law).__name__
-    if plants.is_chain(model) and not isinstance(law, Law):
-        expected = f"a robot as the model of the law {kind}"
-        robot = plants.robot_of(model)
-        remedy = "Take controllers.BarrierBackstepping"
-        remedy += "." if robot is None else ", or model=plant.robot."
-        raise checks.fail("Scenario.model", type(model).__name__, expected, remedy)
-    _check_input(scenario)
-    _check_observer(scenario)
-    _check_measured_levels(scenario)
-    higher = scenario.initial.higher
-    if higher is not None and len(higher) != order - 2:
-        expected = f"{order} levels, as the plant has"
-        raise checks.fail("Scenario.initial.x", f"{len(higher) + 2} levels", expected)
-    if order > 2 and higher is None and not plants.has_steady_levels(plant):
-        remedy = f"Give all levels: Initial(x=...), shape ({order}, {plant.n})."
-        raise checks.fail("Scenario.initial", "q and dq", f"{order} levels", remedy)
-
-
-def _check_observer(scenario: Scenario) -> None:
-    """Raises ValueError for an observer of robots with a model that contains no robot, or one of
-    levels with a model that does not fit its fields.
-    """
-    observer, model = scenario.observer, scenario.model
-    if isinstance(observer, NoObserver):
-        return
-    if isinstance(observer, Observer):
-        observer.check_model(plants.as_plant(model))
-        return
-    if plants.is_chain(model) and is_default(model.joint_torque, Plant.joint_torque):
-        expected = "an observer of plants in strict-feedback form, such as LevelObserver"
-        remedy = f"{type(model).__name__} contains no robot."
-        raise checks.fail("Scenario.observer", type(observer).__name__, expected, remedy)
-
-
-def _check_input(scenario: Scenario) -> None:
-    """Raises ValueError for a law that commands another quantity than the plant's input: a torque
-    for a voltage, say.
-    """
-    outermost, *wrapped = layers(scenario.controller)
-    for law in wrapped:
-        if law.input_unit is not None:
-            kind = type(law).__name__
-            expected = f"{kind} as the outermost law"
-            remedy = f"Such as {kind}(law={type(outermost).__name__}(...), ...)."
-            raise checks.fail("Scenario.controller", type(outermost).__name__, expected, remedy)
-    needed = plants.units_of(scenario.plant)[-1]
-    given = outermost.input_unit or plants.units_of(scenario.model)[-1]
-    if given == needed or UNKNOWN_UNIT in (given, needed):
-        return
-    kind = type(scenario.plant).__name__
-    expected = f"a law that commands the input of {kind} [{needed}]"
-    remedy = "Take the plant as the model, with controllers.BarrierBackstepping."
-    if isinstance(scenario.plant, plants.ElectricDrive):
-        remedy = "Such as controllers.WithDrive(law, drive=plant), or model=plant."
-    got = f"{type(outermost).__name__}, which commands [{given}]"
-    raise checks.fail("Scenario.controller", got, expected, remedy)
-
-
-UNKNOWN_UNIT = "1"
-"""Unit of the levels and of the input of a plant that states none."""
-
-
-def _check_measured_levels(scenario: Scenario) -> None:
-    """Raises ValueError for levels that are neither measured nor estimated."""
-    order = plants.order_of(scenario.plant)
-    sensor, observer = sensor_of_x(scenario.sensor), observer_of_x(scenario.observer)
-    covered = sensor.order
-    if covered not in (None, order):
-        expected = f"sensors of {order} levels, as the plant has"
-        remedy = "None is for a level that is not measured."
-        raise checks.fail("Scenario.sensor", f"sensors of {covered} levels", expected, remedy)
-    every = tuple(range(1, plants.order_of(scenario.model) + 1))
-    measured = sensor.measured or every
-    needed = every
-    if observer.completes:
-        needed = observer.measured or every
-    missing = [str(level) for level in needed if level not in measured]
-    if not missing:
-        return
-    which = ", ".join(missing)
-    expected = f"level {which} measured, which {type(scenario.observer).__name__} reads"
-    if needed is every:
-        expected = "every level of the model measured, or estimated by an observer"
-    levels = tuple(level for level in every if level in measured)
-    remedy = f"Such as observers.StateObserver(bandwidth=..., measured={levels})."
-    if 1 not in levels:
-        remedy = "The levels below a measured one do not follow from it: measure level 1."
-    raise checks.fail("Scenario.sensor", f"no measurement of level {which}", expected, remedy)
-
-
-def _check_region(name: str, region: regions.Region, robot: Robot) -> None:
-    """Raises ValueError for a region whose point a robot does not have."""
-
-    def distance():
-        return region.distance(regions.position_of(robot, region.point, jnp.zeros(robot.n)))
-
-    try:
-        jax.eval_shape(distance)
-    except Exception as error:
-        kind = checks.with_article(type(robot).__name__)
-        expected = f"a region for a point of {kind} of {robot.n} joints"
-        reason = f"{type(error).__name__}: {checks.one_line(str(error))}"
-        raise checks.fail(name, region, expected, reason) from error
 
 
 def with_parts(scenario: Scenario, **parts: Any) -> Scenario:
@@ -582,7 +286,7 @@ def _with_both_robots(scenario: Scenario, parts: dict[str, Any]) -> dict[str, An
         others = {name: part for name, part in parts.items() if name != "robot"}
         return {**others, "plant": parts["robot"], "model": parts["robot"]}
     if "plant" in parts and "model" not in parts:
-        check_plant_or_robot("Scenario.plant", parts["plant"])
+        plants.check_part("Scenario.plant", parts["plant"])
         n, joints = scenario.model.n, parts["plant"].n
         if joints != n:
             expected = f"{n} joints, as the model has"
@@ -650,33 +354,6 @@ def _fit_rows(value: Any, n: int, name: str) -> Any:
     return value
 
 
-def check_leaves(part: Any, path: str = "") -> None:
-    """Raises ValueError for the first concrete leaf that is not finite or has the wrong sign, with
-    its path.
-    """
-    if modules.is_module(part):
-        for keys, leaf in jax.tree_util.tree_leaves_with_path(part):
-            if modules.is_float_array(leaf):
-                checks.check_values(path + jax.tree_util.keystr(keys), leaf, None)
-        return
-    if isinstance(part, tuple):
-        for i, x in enumerate(part):
-            check_leaves(x, f"{path}[{i}]")
-        return
-    if not dataclasses.is_dataclass(part) or isinstance(part, type):
-        return
-    values = field_values(part)
-    for field in dataclasses.fields(part):
-        if field.metadata.get("static"):
-            continue
-        name = f"{path}.{field.name}".lstrip(".")
-        value = values[field.name]
-        if isinstance(value, NUMBERS):
-            checks.check_values(name, value, field.metadata.get("sign"))
-        else:
-            check_leaves(value, name)
-
-
 def canonical(scenario: Scenario) -> Scenario:
     """The scenario with every leaf an array of one floating-point type, checked; every entry point
     calls this first.
@@ -689,14 +366,14 @@ def canonical(scenario: Scenario) -> Scenario:
     if not isinstance(scenario, Scenario):
         raise checks.fail("scenario", scenario, "a Scenario", HOW_TO_MAKE)
     keep_programs()
-    check_leaves(scenario)
+    rules.check_leaves(scenario)
     note_code(scenario)
     scenario = _with_sufficient_queue(scenario)
     dtype = _shared_dtype(scenario)
     scenario = jax.tree.map(lambda x: _typed(x, dtype), scenario)
     if not checks.is_concrete(scenario):
         return scenario
-    _check_start(scenario)
+    rules.check_start(scenario)
     for law in layers(scenario.controller):
         law.check_start(scenario.context)
     for text in advice_of(scenario):
@@ -713,45 +390,6 @@ def _with_sufficient_queue(scenario: Scenario) -> Scenario:
         return scenario
     sampling = dataclasses.replace(sampling, queue=sampling.needed)
     return dataclasses.replace(scenario, sampling=sampling)
-
-
-def advice_of(scenario: Scenario) -> list[str]:
-    """The warnings of the parts about their parameter values."""
-    advice = scenario.controller.advice()
-    if all(part.uses_observer for part in layers(scenario.controller)):
-        advice = advice + scenario.observer.advice()
-    advice = advice + motors_advice(scenario)
-    if scenario.sampling is not None:
-        advice = advice + scenario.sensor.advice(scenario.sampling.period)
-        advice = advice + noise_advice(scenario)
-    return advice
-
-
-def motors_advice(scenario: Scenario) -> list[str]:
-    """A warning about a robot as the model of a flexible joint whose inertia lacks that of the
-    motors.
-    """
-    plant, model = scenario.plant, scenario.model
-    if not isinstance(plant, plants.FlexibleJoint) or plants.is_chain(model):
-        return []
-    if isinstance(model, WithMotors):
-        return []
-    q = scenario.initial.q
-    links, known = (np.diag(mass_matrix_at(robot, q)) for robot in (plant.robot, model))
-    inertia = np.asarray(plant.motor_inertia)
-    share = float(np.min((known - links) / inertia))
-    if share > LEAST_SHARE_OF_MOTORS:
-        return []
-    return [
-        f"model: the inertia of this robot contains {max(share, 0.0):.0%} of that of the motors"
-        f" (plant.motor_inertia = {inertia} kg m^2), although a law of robots commands their"
-        " torque. Take model=plant.rigid(), whose inertia is M + diag(J)."
-    ]
-
-
-LEAST_SHARE_OF_MOTORS = 0.5
-"""Share of the inertia of a motor below which a model counts as one of the links alone.  A robot
-may contain that inertia in other ways than `WithMotors`, such as the armature of an `Arm`."""
 
 
 def _typed(x: Any, dtype) -> jax.Array:
@@ -824,230 +462,3 @@ def check_step(scenario: Scenario, dt: float) -> None:
         fitting = period / max(math.ceil(steps - 1e-9), 1)
         expected = f"a whole number of steps in sampling.period = {period:g} s"
         raise checks.fail("dt", dt, expected, f"Take dt={fitting:.6g}.")
-
-
-# --- checks of the start -------------------------------------------------------------------------
-
-
-class _InitialValues(NamedTuple):
-    """Reference, bounds and margins at t = 0."""
-
-    q_d: Any
-    lower: Any
-    upper: Any
-    speed_limits: Any
-    """Lower and upper, (n,) each [rad/s]; None if there are none."""
-    region_margins: Any
-
-
-@programs.jit
-def _initial_values(scenario: Scenario) -> _InitialValues:
-    """The values at the start. Their shapes are checked while this is traced, once per
-    structure.
-    """
-    n, q, dq = scenario.n, scenario.initial.q, scenario.initial.dq
-    t, plant, model = jnp.zeros((), q.dtype), scenario.plant, scenario.model
-    reference, (positions, velocities, *_) = scenario.reference, scenario.bounds
-    q_d = _shaped("reference.position(t)", partial(reference.position, t), n)
-
-    def limit(name: str, side: Side) -> jax.Array:
-        return _shaped(name, partial(side.at, t, q_d), n)
-
-    lower = limit("bounds[0].lower.at(t, q_d)", positions.lower)
-    upper = limit("bounds[0].upper.at(t, q_d)", positions.upper)
-    parts: dict[str, Any] = {"plant": plant, "model": model}
-    for name, part in parts.items():
-        robot = plants.robot_of(part)
-        if plants.is_chain(part):
-            x = start_levels(scenario)[: part.order]
-            _check_shapes_of_plant(name, part, t, x)
-        if robot is not None:
-            _shaped(f"{name}.mass_matrix(q)", partial(robot.mass_matrix, q), n, n)
-            _shaped(f"{name}.coriolis(q, v, u)", partial(robot.coriolis, q, dq, dq), n)
-            _shaped(f"{name}.gravity(q)", partial(robot.gravity, q), n)
-    disturbed = [part if (r := plants.robot_of(part)) is None else r for part in (plant, model)]
-    torque = partial(scenario.disturbance.torque, t, q, dq, *disturbed)
-    _shaped("disturbance.torque(t, q, dq, plant, model)", torque, n)
-    speed_limits = None
-    if velocities is not None and has_speed_limits(scenario):
-        limit("bounds[1].lower.at(t, dq_d)", velocities.lower)
-        limit("bounds[1].upper.at(t, dq_d)", velocities.upper)
-        speed_limits = speed_limits_at(reference, velocities, t)
-    margins = q[:0]
-    if scenario.regions:
-        margins = regions.margins(scenario.regions, plants.robot_of(plant), q)
-    return _InitialValues(q_d, lower, upper, speed_limits, margins)
-
-
-def _check_shapes_of_plant(name: str, plant: Plant, t: jax.Array, x: jax.Array) -> None:
-    """Raises ValueError where drift or gain of a plant has another shape than its state."""
-    order, n = x.shape
-    _shaped(f"{name}.drift(t, x)", partial(plant.drift, t, x), order, n)
-    diagonal = jnp.ndim(jax.eval_shape(plant.gain, t, x)) == 2
-    shape = (order, n) if diagonal else (order, n, n)
-    _shaped(f"{name}.gain(t, x)", partial(plant.gain, t, x), *shape)
-
-
-def _shaped(name: str, call: Callable[[], jax.Array], *shape: int) -> jax.Array:
-    """The value of `call()`, or a ValueError that names it if it raises or has another shape."""
-    try:
-        value = call()
-    except Exception as error:
-        got = f"{type(error).__name__}: {error}"
-        raise checks.fail(name, got, f"an array of shape {shape}") from error
-    if jnp.shape(value) != shape:
-        remedy = f"The plant has {shape[0]} joints."
-        raise checks.fail(name, f"shape {jnp.shape(value)}", f"shape {shape}", remedy)
-    return value
-
-
-def _check_start(scenario: Scenario) -> None:
-    """Raises ValueError for a start outside its bounds or too fast, or a mass matrix there that is
-    not positive definite.
-    """
-    start = jax.tree.map(np.asarray, _initial_values(scenario))
-    q, dq = np.asarray(scenario.initial.q), np.asarray(scenario.initial.dq)
-    finite = {"reference": start.q_d, "bounds[0].lower": start.lower}
-    finite["bounds[0].upper"] = start.upper
-    for name, values in finite.items():
-        if not np.all(np.isfinite(values)):
-            raise checks.fail(name, values, "finite values at t = 0")
-    noun = plants.component_noun(scenario.plant)
-    positions: Any = scenario.bounds[0]
-    _check_order(f"bounds of {noun}", start.lower, start.upper, positions)
-    remedy = _funnel_remedy(positions)
-    remedy = remedy or "Move the reference or widen the bounds (Assumption 2)."
-    _check_inside(
-        f"reference of {noun} {{}}", "bounds", start.q_d, start.lower, start.upper, remedy
-    )
-    remedy = "Move the start or widen the bounds."
-    _check_inside("initial.q[{}]", "bounds", q, start.lower, start.upper, remedy)
-    if start.speed_limits is not None:
-        slowest, fastest = start.speed_limits
-        _check_order("bounds[1] of joint", slowest, fastest, scenario.bounds[1])
-        _check_inside("initial.dq[{}]", "velocity bounds", dq, slowest, fastest, remedy)
-    for region, margin in zip(scenario.regions, start.region_margins, strict=True):
-        if not margin > 0:
-            point = regions.in_words(region, plants.robot_of(scenario.plant))
-            got = f"{point} {-margin:.4g} m beyond its boundary"
-            expected = "a start inside all regions"
-            raise checks.fail("initial.q", got, expected, "Move the start or the region.")
-    _check_levels_at_start(scenario)
-    limit = plants.speed_limit(scenario.plant)
-    if not np.all(np.abs(dq) < limit):
-        unit = as_text(plants.units_of(scenario.plant)[1])
-        expected = f"speeds below {limit:g} {unit}"
-        raise checks.fail("initial.dq", dq, expected, "A run that fast counts as diverged.")
-    for name, part in (("plant", scenario.plant), ("model", scenario.model)):
-        robot = plants.robot_of(part)
-        if robot is None:
-            continue
-        matrix = np.asarray(mass_matrix_at(robot, scenario.initial.q))
-        _check_mass_matrix(f"{name}.mass_matrix(initial.q)", matrix)
-
-
-def _check_levels_at_start(scenario: Scenario) -> None:
-    """Raises ValueError for a start outside the bounds of a level from the second on, or a gain
-    that is singular there.
-    """
-    if not plants.is_chain(scenario.plant):
-        return
-    x = start_levels(scenario)
-    t = jnp.zeros((), x.dtype)
-    if not np.all(np.isfinite(x)):
-        raise checks.fail("initial.x", x, "finite levels at the start")
-    for i, bounds in enumerate(scenario.bounds[1:], start=1):
-        if bounds is None:
-            continue
-        lower, upper = (np.asarray(side) for side in bounds_at(bounds, t, jnp.zeros_like(x[0])))
-        if isinstance(bounds.lower, Funnel) or isinstance(bounds.upper, Funnel):
-            continue  # around alpha, which the law computes
-        noun = plants.component_noun(scenario.plant)
-        _check_order(f"bounds[{i}] of {noun}", lower, upper, bounds)
-        remedy = "Move the start or widen the bounds."
-        if i == 1 and not np.any(x[1]):
-            remedy = f"{remedy} {WITHOUT_DQ}"
-        level = f"initial.x[{i}][{{}}]"
-        _check_inside(level, f"bounds of level {i + 1}", np.asarray(x[i]), lower, upper, remedy)
-    parts: dict[str, Any] = {"plant": scenario.plant, "model": scenario.model}
-    for name, plant in parts.items():
-        if plants.is_chain(plant):
-            levels = x[: plant.order]
-            _check_gains(name, np.asarray(plant.gain(t, levels)), np.asarray(levels))
-            filtered = name == "model" and plant.needs_filters
-            if not filtered and not isinstance(plant, plants.OF_KNOWN_STRUCTURE):
-                plants.check_dependence(name, _dependence_near(plant, t, levels))
-
-
-WITHOUT_DQ = "x_2 is 0 if Initial has no dq: Initial(x=...) takes all levels."
-"""The remedy for a start of a plant whose second level may have been left out."""
-
-
-@programs.jit
-def _dependence_near(plant: Plant, t: jax.Array, x: jax.Array) -> Any:
-    """The dependence of drift and gain on the levels at the start and at a state near it, where
-    even functions of a level that starts at 0 have a slope.
-    """
-    nearby = x + 0.1 * (1.0 + jnp.abs(x))
-    points = jnp.stack([x, nearby])
-    return jax.vmap(partial(plants.dependence_on_levels, plant, t))(points)
-
-
-def _check_gains(name: str, gains: np.ndarray, x: np.ndarray) -> None:
-    """Raises ValueError for a gain of a level that is singular or not finite at the start x."""
-    remedy = f"The start is x = {x.tolist()}, and every level must act on the level below it there."
-    if not x[1].any():
-        remedy += f" {WITHOUT_DQ}"
-    for i, gain in enumerate(gains):
-        matrix = np.diag(gain) if gain.ndim == 1 else gain
-        expected = f"an invertible gain of level {i + 1} at the start"
-        if not np.all(np.isfinite(matrix)) or np.linalg.matrix_rank(matrix) < len(matrix):
-            raise checks.fail(f"{name}.gain(t, x)[{i}]", matrix, expected, remedy)
-
-
-def _funnel_remedy(bounds: Any) -> str:
-    """The remedy for a Funnel with the sign of the other side; empty if none has it."""
-    lower, upper = bounds.lower, bounds.upper
-    if isinstance(lower, Funnel) and np.any(np.asarray(lower.initial) > 0):
-        return (
-            "A Funnel is a signed distance from the reference: as a lower side it takes negative"
-            " numbers, such as Funnel(-0.3, -0.1, 1.0)."
-        )
-    if isinstance(upper, Funnel) and np.any(np.asarray(upper.initial) < 0):
-        return (
-            "A Funnel is a signed distance from the reference: as an upper side it takes positive"
-            " numbers, such as Funnel(0.3, 0.1, 1.0)."
-        )
-    return ""
-
-
-def _check_order(name: str, lower: np.ndarray, upper: np.ndarray, bounds: Any) -> None:
-    """Raises ValueError where a lower bound is not below its upper bound at t = 0."""
-    remedy = _funnel_remedy(bounds) or "Exchange or widen them."
-    for i, (low, high) in enumerate(zip(lower, upper, strict=True)):
-        if not low < high:
-            expected = "finite lower < upper at t = 0"
-            raise checks.fail(f"{name} {i}", (low, high), expected, remedy)
-
-
-def _check_inside(
-    name: str, bounds: str, values: np.ndarray, lower: np.ndarray, upper: np.ndarray, remedy: str
-) -> None:
-    """Raises ValueError for a value that is not between its bounds; `{}` in the name is replaced by
-    the index of the joint.
-    """
-    for i, (value, low, high) in enumerate(zip(values, lower, upper, strict=True)):
-        if not low < value < high:
-            expected = f"a start inside the {bounds} ({low:.6g}, {high:.6g}) at t = 0"
-            raise checks.fail(name.format(i), value, expected, remedy)
-
-
-def _check_mass_matrix(name: str, matrix: np.ndarray) -> None:
-    """Raises ValueError for a mass matrix that is not finite, symmetric and positive definite."""
-    remedy = "Check the masses, lengths and inertias."
-    is_finite = np.all(np.isfinite(matrix))
-    if not is_finite or np.ptp(matrix - matrix.T) > 1e-4 * np.max(np.abs(matrix)):
-        raise checks.fail(name, matrix, "a finite symmetric matrix", remedy)
-    eigenvalues = np.linalg.eigvalsh(0.5 * (matrix + matrix.T))
-    if eigenvalues[0] <= len(matrix) * np.finfo(matrix.dtype).eps * eigenvalues[-1]:
-        raise checks.fail(name, matrix, "a positive definite matrix", remedy)

@@ -33,7 +33,7 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
-from iblf_jax.core import programs
+from iblf_jax.core import checks, programs
 from iblf_jax.core.linalg import matmul_in_order
 from iblf_jax.simulation.closed_loop import (
     LoopState,
@@ -42,6 +42,7 @@ from iblf_jax.simulation.closed_loop import (
     perturbed_state,
 )
 from iblf_jax.simulation.levels import has_speed_limits
+from iblf_jax.simulation.sampling import Sampling
 from iblf_jax.simulation.scenario import Scenario
 
 POWER_ITERATIONS, AVERAGED_STEPS = 48, 16
@@ -266,7 +267,7 @@ def period_map(scenario: Scenario, state: LoopState, derivative: jax.Array) -> j
       state: of the loop, for its structure.
       derivative: of `closed_loop.perturbed_rate` by `closed_loop.perturbed_state`, (M, M).
     """
-    sampling: Any = scenario.sampling
+    sampling = checks.given(scenario.sampling)
     n, queue, size = scenario.n, sampling.queue, len(derivative)
     plant = ravel_pytree(integrated_part(state))[0].size
     memory = size - plant - n
@@ -293,7 +294,7 @@ def period_map(scenario: Scenario, state: LoopState, derivative: jax.Array) -> j
 
 
 def _plant_over_period(
-    sampling: Any, A: jax.Array, B: jax.Array
+    sampling: Sampling, A: jax.Array, B: jax.Array
 ) -> tuple[jax.Array, list[jax.Array]]:
     """The derivative of the plant's state a period later by its state, (m, m), and by each command,
     (m, n): the new one first, then those in transit.
@@ -331,7 +332,7 @@ def continuous_map(scenario: Scenario, state: LoopState, derivative: jax.Array) 
     """
     if jax.tree.leaves((state.actuator, state.sampled.sensor)):
         return jnp.zeros((1, 1), derivative.dtype)
-    sampling: Any = scenario.sampling
+    sampling = checks.given(scenario.sampling)
     n, size = scenario.n, len(derivative)
     plant = ravel_pytree(integrated_part(state))[0].size
     x = jnp.concatenate([jnp.arange(plant), jnp.arange(plant + n, size)])
@@ -371,6 +372,6 @@ def period_map_as_rate(scenario: Scenario, state: LoopState, derivative: jax.Arr
     """The one-period map as a rate, (m, m) [1/s]: the rate at which errors of a sampled loop grow
     or decay.
     """
-    sampling: Any = scenario.sampling
+    sampling = checks.given(scenario.sampling)
     found = period_map(scenario, state, derivative)
     return (found - jnp.eye(len(found), dtype=found.dtype)) / sampling.period

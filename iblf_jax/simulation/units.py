@@ -46,16 +46,14 @@ def signal_unit(scenario: Scenario, name: str, component: int | None = None) -> 
 
 def status_words(scenario: Scenario) -> Mapping[Status, str]:
     """The text of each status flag for runs of a scenario."""
-    if plants.is_chain(scenario.plant):
-        return WORDS_OF_LEVELS
-    return WORDS
+    return WORDS if scenario.plant.is_robot else WORDS_OF_LEVELS
 
 
 def signal_meanings(scenario: Scenario) -> dict[str, str]:
     """What each recorded signal is in runs of a scenario: name -> words."""
     found = {name: signal.meaning for name, signal in SIGNALS.items()}
     plant = scenario.plant
-    if not plants.is_chain(plant):
+    if plant.is_robot:
         return found
     first, second, *_ = plants.level_names(plant)
     found |= {
@@ -72,7 +70,7 @@ def signal_meanings(scenario: Scenario) -> dict[str, str]:
         "dq_lower": f"lower bound of {second}",
         "dq_upper": f"upper bound of {second}",
     }
-    if plants.is_chain(scenario.model):
+    if not scenario.model.is_robot:
         found["disturbance"] = "disturbances d_1 ... d_r of the levels"
         found["disturbance_estimate"] = "estimates of the disturbances of the levels"
         found["V"] = "Lyapunov function, sum of w_i V_i"

@@ -17,7 +17,8 @@ from iblf_jax.core import checks
 from iblf_jax.core.modules import is_module
 from iblf_jax.core.pytree import field_values, is_leaf_field
 from iblf_jax.presets import customary_two_link, zhang_yan_2024
-from iblf_jax.simulation.scenario import Initial, Scenario, fit_joints
+from iblf_jax.simulation.initial import Initial
+from iblf_jax.simulation.scenario import Scenario, fit_joints
 from iblf_jax.testing._contract import Findings, examine, in_dtype
 from iblf_jax.world.bounds import Bounds, Sinusoid
 from iblf_jax.world.disturbances import Sinusoids

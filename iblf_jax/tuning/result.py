@@ -17,9 +17,10 @@ from iblf_jax.core.progress import announced
 from iblf_jax.core.status import UNTRUSTED
 from iblf_jax.engine import RunRequest, points_per_batch, run_batch, run_rollout
 from iblf_jax.simulation import paths
+from iblf_jax.simulation.advice import advice_of
 from iblf_jax.simulation.metrics import as_folds
 from iblf_jax.simulation.results import Rollout
-from iblf_jax.simulation.scenario import Scenario, advice_of, canonical
+from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.tuning.objectives import Objective, depends_on_torque
 from iblf_jax.tuning.options import Report, TuningRunOptions
 from iblf_jax.tuning.quantities import Quantities

@@ -39,7 +39,7 @@ from iblf_jax.engine.plan import ExecutionPlan
 from iblf_jax.files.components import decode_fields
 from iblf_jax.simulation import metrics, paths
 from iblf_jax.simulation.results import Metrics
-from iblf_jax.simulation.scenario import check_leaves
+from iblf_jax.simulation.scenario_rules import check_leaves
 from iblf_jax.studies.options import RunOptions
 from iblf_jax.studies.study_setup import prepare
 from iblf_jax.tuning.parameters import layout

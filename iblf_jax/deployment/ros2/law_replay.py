@@ -11,7 +11,8 @@ import jax.numpy as jnp
 
 from iblf_jax.control import sensors
 from iblf_jax.simulation.closed_loop import LoopState, initial_state, run_sampled_law
-from iblf_jax.simulation.scenario import Initial, Scenario
+from iblf_jax.simulation.initial import Initial
+from iblf_jax.simulation.scenario import Scenario
 
 
 def without_effects(sensor: Any) -> Any:

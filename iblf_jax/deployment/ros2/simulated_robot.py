@@ -15,8 +15,8 @@ from iblf_jax.deployment.cosimulate import own_step
 from iblf_jax.deployment.mujoco_plant import INTEGRATORS, MujocoPlant
 from iblf_jax.deployment.ros2.robot_motion import RobotMotion, recorded
 from iblf_jax.deployment.ros2.robot_simulation import Reading, RobotSimulation
+from iblf_jax.simulation.initial import Initial
 from iblf_jax.simulation.sampling import PERIOD_TOLERANCE
-from iblf_jax.simulation.scenario import Initial
 from iblf_jax.world.robots.payload import Payload
 
 REPUBLISH_INTERVAL = 0.1

@@ -8,10 +8,12 @@ A class of your own has the base class `Plant`, which is on this page.
 from typing import Any
 
 from iblf_jax.world.plants._base import MAX_ORDER as MAX_ORDER
+from iblf_jax.world.plants._base import Dependence as Dependence
 from iblf_jax.world.plants._base import Plant as Plant
 from iblf_jax.world.plants._base import Units as Units
 from iblf_jax.world.plants._base import check_dependence as check_dependence
 from iblf_jax.world.plants._base import check_dimensions as check_dimensions
+from iblf_jax.world.plants._base import check_part as check_part
 from iblf_jax.world.plants._base import component_names as component_names
 from iblf_jax.world.plants._base import component_noun as component_noun
 from iblf_jax.world.plants._base import counted_components as counted_components
@@ -71,9 +73,6 @@ MEMBERS = {
     "vessel": Vessel,
 }
 """Every plant by the name that a scenario file gives it."""
-
-OF_KNOWN_STRUCTURE = (Rigid, DrivenPendulum, ElectricDrive, FlexibleJoint, Vessel)
-"""Plants whose drift and gain have the structure of (S.1) for all numbers of their leaves."""
 
 __all__ = [
     "MEMBERS",

@@ -58,6 +58,8 @@ class Plant(Dynamics):
     reference_levels: ClassVar[int] = 1
     """Number of first levels whose bounds follow the reference or its derivative; those of the
     other levels follow the virtual controls."""
+    known_structure: ClassVar[bool] = False
+    """Whether drift and gain have the structure of (S.1) for all numbers of the leaves."""
     needs_filters: ClassVar[bool] = False
     """Whether the drift depends on a later level whose derivatives no law may form.  Such a plant
     is the model of a law with filters, and never the plant of a scenario."""
@@ -207,6 +209,21 @@ def is_chain(part: Any) -> TypeGuard[Plant]:
         return False
     adopt(type(part), Plant)
     return True
+
+
+ROBOTS = "iblf_jax.robots has them; write your own with from_energy."
+PLANTS = "iblf_jax.plants has them; iblf_jax.testing.check_plant checks your own."
+
+
+def check_part(name: str, part: Any) -> None:
+    """Raises ValueError for something that is neither a robot nor a plant in strict-feedback form;
+    adopts its class.
+    """
+    if is_chain(part):
+        checks.conforms(name, part, Plant, PLANTS)
+        check_dimensions(name, part)
+        return
+    checks.conforms(name, part, Robot, f"{ROBOTS} {PLANTS}")
 
 
 def order_of(part: Any) -> int:

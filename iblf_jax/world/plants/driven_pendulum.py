@@ -38,6 +38,7 @@ class DrivenPendulum(Plant):
     Km: Leaf = leaf("V s/rad", sign="nonnegative")
     n: ClassVar[int] = 1
     order: ClassVar[int] = 3
+    known_structure = True
     units: ClassVar[tuple[str, ...]] = ("rad", "rad/s", "N m", "V")
     level_names: ClassVar[tuple[str, ...]] = ("angle", "angular velocity", "motor torque")
     input_name: ClassVar[str] = "voltage"

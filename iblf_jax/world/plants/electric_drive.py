@@ -44,6 +44,7 @@ class ElectricDrive(Plant):
     resistance: Leaf = leaf("ohm", sign="positive")
     back_emf: Leaf = leaf("V s/rad", sign="nonnegative")
     order: ClassVar[int] = 3
+    known_structure = True
     units: ClassVar[tuple[str, ...]] = ("rad", "rad/s", "A", "V")
     level_names: ClassVar[tuple[str, ...]] = ("position", "velocity", "current")
     input_name: ClassVar[str] = "voltage"

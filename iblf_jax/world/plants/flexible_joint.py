@@ -46,6 +46,7 @@ class FlexibleJoint(Plant):
     motor_inertia: Leaf = leaf("kg m^2", sign="positive")
     motor_damping: Leaf = leaf("N m s/rad", sign="nonnegative", default=0.0)
     order: ClassVar[int] = 4
+    known_structure = True
     units: ClassVar[tuple[str, ...]] = ("rad", "rad/s", "rad", "rad/s", "N m")
     level_names: ClassVar[tuple[str, ...]] = (
         "position",

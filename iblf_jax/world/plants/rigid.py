@@ -30,6 +30,7 @@ class Rigid(Plant):
 
     robot: Robot
     order: ClassVar[int] = 2
+    known_structure = True
     units: ClassVar[tuple[str, ...]] = ("rad", "rad/s", "N m")
     level_names: ClassVar[tuple[str, ...]] = ("position", "velocity")
     input_name: ClassVar[str] = "torque"
@@ -109,6 +110,7 @@ class RobotPlant(Rigid):
     Source: Zhang & Yan 2024, (2.1), (3.12).
     """
 
+    is_robot = True
     reference_levels: ClassVar[int] = 2
 
     @property

@@ -95,6 +95,7 @@ class Vessel(Plant):
     beam: Leaf = leaf("m", sign="positive", shape="scalar", default=0.25)
     n: ClassVar[int] = 3
     order: ClassVar[int] = 2
+    known_structure = True
     units: ClassVar[tuple[Units, ...]] = (
         ("m", "m", "rad"),
         ("m/s", "m/s", "rad/s"),

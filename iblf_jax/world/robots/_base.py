@@ -45,6 +45,9 @@ class Dynamics(TimeVarying):
 
     mode_draws: ClassVar[int] = 0
     """How many pairs of random numbers give the modes of a run."""
+    is_robot: ClassVar[bool] = False
+    """Whether it is a robot, as a scenario takes it or as its `RobotPlant`: its levels are q and
+    q', and its uncertain term is a torque."""
 
     @attribute
     @abc.abstractmethod
@@ -81,6 +84,7 @@ class Robot(Dynamics):
     law and observer do not know them, and (2.1) has them in f.
     """
 
+    is_robot = True
     geometry_fields: ClassVar[tuple[str, ...]] = ()
     """Fields whose zeros, ones and equal numbers may be compiled in
     (`engine.structural_constants`)."""
