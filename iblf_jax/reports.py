@@ -130,10 +130,10 @@ def _scenario(scenario: Scenario) -> Shown:
         figures["Reference and bounds"] = lambda: plotting.tube(scenario)
     rows = [(p.path, p.unit, _short(p.value)) for p in parameters(scenario, named=False)]
     leaves = tables.as_html(("path", "unit", "value"), rows)
-    plant = scenario.plant
+    plant = scenario.loop.plant
     names = ", ".join(plants.component_names(plant))
     words = [f"{plants.counted_components(plant, scenario.n)}: {names}"]
-    if plants.is_chain(plant):
+    if plant.notation.levels:
         words.append(_levels_in_words(plant))
     content = {"Parts": _parts_of(scenario), "Parameters": leaves}
     return Shown("Scenario", words, content, figures, scenario)
@@ -141,12 +141,12 @@ def _scenario(scenario: Scenario) -> Shown:
 
 def _levels_in_words(plant: Any) -> str:
     """The levels and the input of a plant in strict-feedback form, with their units."""
-    names = [*plants.level_names(plant), plants.input_name(plant)]
+    names = [*plant.notation.levels, plants.input_name(plant)]
     texts = [
         f"{name} [{as_text(unit)}]"
         for name, unit in zip(names, plants.units_of(plant), strict=True)
     ]
-    return f"{plants.order_of(plant)} levels: {', '.join(texts[:-1])}; input: {texts[-1]}"
+    return f"{plant.order} levels: {', '.join(texts[:-1])}; input: {texts[-1]}"
 
 
 NUMBERED = tuple(f"violation_{what}" for what in ("joint", "region", "level", "component"))

@@ -1,6 +1,7 @@
 """Runs of known arrays, which no simulator made: for tests of what is drawn."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -10,15 +11,21 @@ import iblf_jax as ij
 from iblf_jax.simulation.signals import VIEWS, Signals
 
 
-class Arm3D:
+@ij.component
+class Arm3D(ij.robots.Robot):
     """A robot in space: the first joint turns it about z, the others lift it.  All that a drawing
     asks for."""
 
-    def __init__(self, n):
-        self.n = n
+    n: int = ij.static()
 
     def mass_matrix(self, q):
         return jnp.eye(self.n)
+
+    def potential(self, q):
+        return jnp.zeros(())
+
+    def tip(self, q):
+        return self.skeleton(q)[-1]
 
     def skeleton(self, q):
         lift = jnp.cumsum(q[1:])
@@ -56,9 +63,10 @@ class Holder:
     regions: tuple = ()
 
     @property
-    def model(self) -> object:
-        """The plant itself."""
-        return self.plant
+    def loop(self) -> SimpleNamespace:
+        """The plant itself is the model."""
+        plant = ij.plants.as_plant(self.plant)
+        return SimpleNamespace(plant=plant, model=plant)
 
 
 jax.tree_util.register_pytree_node(Holder, lambda holder: ((), holder), lambda holder, _: holder)

@@ -27,11 +27,12 @@ import numpy as np
 from iblf_jax.certificates.terms import terms_and_sample
 from iblf_jax.core import checks
 from iblf_jax.core.attributes import attributes
+from iblf_jax.core.families import is_default
 from iblf_jax.core.status import UNTRUSTED, Status, describe, has_flag
 from iblf_jax.engine import Step, step_states
 from iblf_jax.simulation import discontinuities
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state
-from iblf_jax.world import plants
+from iblf_jax.world.plants import Plant
 
 if TYPE_CHECKING:
     from iblf_jax.certificates.claims._base import Claim
@@ -298,8 +299,9 @@ def terms_along(
     found = step_states(scenario, dt, full, step=ObserveStep(claims))[1]
     terms, sample = jax.tree.map(lambda x: np.asarray(x)[:, 0], found)
     defect, defect_f = map(_defect, energies)
-    if "levels" in terms.claims and not plants.is_chain(scenario.model):
-        # V of a robot's sample includes |f_tilde|^2/2, which the sum of w_i V_i does not.
+    energy = scenario.loop.model.energy_of_errors
+    if "levels" in terms.claims and not is_default(energy, Plant.energy_of_errors):
+        # V of a sample then includes |f_tilde|^2/2, which the sum of w_i V_i does not.
         defect = defect + defect_f
     return terms, sample, defect, defect_f
 

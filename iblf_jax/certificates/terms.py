@@ -270,7 +270,7 @@ def _signals(scenario: Scenario, t: jax.Array, state: LoopState) -> tuple[dict[s
         barrier_slope = weight * barrier.slope(scenario.context.tube(t), state.q)
     # All of f where the plant is the model: the torques besides that of the law.
     external = jnp.zeros_like(state.q)
-    robot = plants.robot_of(scenario.plant.at(t))
+    robot = scenario.loop.plant.at(t).robot
     if robot is not None:
         external = scenario.disturbance.torque(t, state.q, state.dq, robot, scenario.model)
         external += friction_torque(robot, state.dq)
@@ -427,9 +427,9 @@ def _disturbance(
     scenario: Scenario, state: LoopState, state_rate: LoopState, sample: Sample
 ) -> jax.Array:
     """Rate x' minus the flow of the model, (r, n)."""
-    if plants.is_chain(scenario.model):
+    if sample.disturbance.ndim == 2:
         return sample.disturbance
-    # The sample of a robot has a torque.
+    # It is the torque on a robot.
     rates = solve_spd(scenario.model.mass_matrix(state.q), sample.disturbance)
     return jnp.stack([state_rate.q - state.dq, rates])
 

@@ -146,10 +146,11 @@ def _check_robots(scenario: Scenario) -> None:
     torques of its joints as inputs, and no levels beyond positions and velocities.
     """
     for name, part in (("plant", scenario.plant), ("model", scenario.model)):
-        if not plants.is_chain(part):
+        robot = plants.as_plant(part).robot
+        if robot is part:
             continue
         remedy = "MuJoCo simulates the joints only, without drives or springs."
-        if plants.robot_of(part) is not None:
+        if robot is not None:
             remedy += f" Take {name}=scenario.{name}.robot, and a law for robots."
         expected = "a robot, whose inputs are torques"
         raise checks.fail(f"scenario.{name}", type(part).__name__, expected, remedy)

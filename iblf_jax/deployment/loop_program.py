@@ -36,7 +36,7 @@ class LoopOutput(NamedTuple):
 
 def loop_outputs(scenario: Scenario) -> tuple[LoopOutput, ...]:
     """The outputs of a step, at its start, besides the status."""
-    plant, model = scenario.plant, scenario.model
+    plant, model, *_ = scenario.loop
     units = [one_unit(unit) for unit in plants.units_of(plant)]
     found = [
         LoopOutput("q", units[0], "q"),
@@ -48,7 +48,7 @@ def loop_outputs(scenario: Scenario) -> tuple[LoopOutput, ...]:
         LoopOutput("upper", units[0], "upper"),
     ]
     found += [LoopOutput(f"x_{i + 1}", units[i], "x", i) for i in range(2, len(units) - 1)]
-    if not plants.is_chain(model):
+    if not model.uncertain_levels:
         found.append(LoopOutput("f", "N m", "disturbance"))
         found.append(LoopOutput("f_hat", "N m", "disturbance_estimate"))
         return tuple(found)

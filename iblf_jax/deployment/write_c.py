@@ -332,11 +332,13 @@ def title_of(scenario: Scenario) -> str:
 
 def _output_meanings(scenario: Scenario) -> str:
     """The outputs of a law in words, with their units."""
-    if not plants.is_chain(scenario.model):
-        return "torque [N m], virtual velocity [rad/s], estimate of the uncertain term [N m]"
-    units = [comment(one_unit(x)) for x in plants.units_of(scenario.model)]
-    estimate = "estimate of the uncertain terms"
-    return f"input [{units[-1]}], virtual control of the second level [{units[1]}], {estimate}"
+    model = scenario.loop.model
+    units = [comment(one_unit(x)) for x in plants.units_of(model)]
+    estimate = "estimate of the uncertain term [N m]"
+    if model.uncertain_levels:
+        estimate = "estimate of the uncertain terms"
+    name = comment(plants.input_name(model))
+    return f"{name} [{units[-1]}], {model.notation.alpha} [{units[1]}], {estimate}"
 
 
 def _input_values(law: Law) -> dict[str, str]:

@@ -115,50 +115,41 @@ def _explanations(result: Rollout, status: Status, steps: int) -> list[str]:
     return [text for text in texts if text]
 
 
-def _joint_violation(
-    level: int, bounds: str, prefix: str, margin: str, unit: str, result: Rollout
-) -> str:
-    """Which joint violated the bounds of its first or second level first; `prefix` and `margin` are
-    names of metrics.
+def _violation(level: int, prefix: str, margin: str, result: Rollout) -> str:
+    """Which component violated the bounds of the first or second level first; `prefix` and `margin`
+    are names of metrics.
     """
-    metrics, scenario = result.metrics, result.scenario
+    metrics = result.metrics
     if f"{prefix}_time" not in metrics:
         return ""
     joint = int(metrics[f"{prefix}_joint"])
-    text = unit_text(scenario, unit, joint)
-    what = f"{_joint_in_words(result, joint)} left its {bounds} first"
-    if plants.is_chain(scenario.plant):
-        what = f"{_level_in_words(scenario, level, joint)} left its bounds first"
-    found = _first_violation(what, metrics[f"{prefix}_time"], metrics[margin][joint], text)
-    if plants.is_chain(scenario.plant) and level > 1:
-        return f"{found} {_level_remedy(scenario, level)}"
-    return found
+    return _first_violation_of(
+        result, level, joint, metrics[f"{prefix}_time"], metrics[margin][joint]
+    )
 
 
-def _higher_level_violation(result: Rollout) -> str:
+def _violation_above_second(result: Rollout) -> str:
     """Which level from the third on violated its bounds first."""
-    metrics, scenario = result.metrics, result.scenario
+    metrics = result.metrics
     if "first_level_violation_time" not in metrics:
         return ""
     level = int(metrics["first_level_violation_level"])
     joint = int(metrics["first_level_violation_component"])
-    what = f"{_level_in_words(scenario, level, joint)} left its bounds first"
     margin = metrics["level_margin"][level - 3, joint]
-    unit = unit_text(scenario, plants.units_of(scenario.plant)[level - 1], joint)
-    found = _first_violation(what, metrics["first_level_violation_time"], margin, unit)
+    return _first_violation_of(result, level, joint, metrics["first_level_violation_time"], margin)
+
+
+def _first_violation_of(
+    result: Rollout, level: int, joint: int, time: jax.Array, margin: jax.Array
+) -> str:
+    """That a component of a level left its bounds first, and how these can be kept."""
+    scenario, plant = result.scenario, result.scenario.loop.plant
+    unit = unit_text(scenario, plants.units_of(plant)[level - 1], joint)
+    what = f"{plant.notation.left_bounds(level, joint)} first"
+    found = _first_violation(what, time, margin, unit)
+    if level <= plant.reference_levels:
+        return found
     return f"{found} {_level_remedy(scenario, level)}"
-
-
-def _level_in_words(scenario: Scenario, level: int, joint: int) -> str:
-    """One component of a level, counted from 1, with their names."""
-    name = _level_name(scenario, level).capitalize()
-    return f"{name} of {plants.component_names(scenario.plant)[joint]}"
-
-
-def _level_name(scenario: Scenario, level: int) -> str:
-    """A level by its number, from 1, and by its name if it has one."""
-    name = plants.level_names(scenario.plant)[level - 1]
-    return name if name == f"level {level}" else f"level {level} ({name})"
 
 
 def _level_remedy(scenario: Scenario, level: int) -> str:
@@ -185,8 +176,8 @@ def _level_remedy(scenario: Scenario, level: int) -> str:
 def _singular_gain(result: Rollout) -> str:
     """Which gain is singular where a run ends, in words; empty if none is."""
     scenario = result.scenario
-    model: Any = scenario.model
-    if not plants.is_chain(model):
+    model = scenario.loop.model
+    if not model.loses_input:
         return ""
     x, t = np.asarray(result.x)[:, : model.order], np.asarray(result.t)
     at = _last_valid_sample(result)
@@ -198,7 +189,7 @@ def _singular_gain(result: Rollout) -> str:
     level = int(np.argmin(worst)) + 1
     if not worst[level - 1] < NEARLY_SINGULAR:
         return ""
-    name = _level_name(scenario, level)
+    name = scenario.loop.plant.notation.numbered(level)
     state = np.array2string(x[at].ravel(), precision=4, threshold=8)
     return (
         f"At t = {t[at]:.4g} s the gain of {name} is singular, or nearly so, at or"
@@ -239,7 +230,7 @@ def _region_violation(result: Rollout) -> str:
     if "first_region_violation_time" not in metrics:
         return ""
     i = int(metrics["first_region_violation_region"])
-    robot = plants.robot_of(result.scenario.plant)
+    robot = plants.robot_inside(result.scenario.loop.plant)
     region = in_words(result.scenario.regions[i], robot)
     return _first_violation(
         f"regions[{i}]: {region} crossed its boundary",
@@ -279,17 +270,10 @@ def _infinite_slope(result: Rollout) -> str:
         " infinite or nearly so, as that of a power |e2|^a sign(e2) with a < 1 with respect to e2"
         " at e2 = 0, of a square root at 0, or of sharp dry friction at a reversal. That is no"
         f" fast mode, so the time step is assessed by differences of {THIRD_SIZE:g}"
-        f" {_unit_of_differences(result.scenario)} there."
+        f" {result.scenario.loop.plant.notation.difference} there."
         " Derivatives of the run are not reliable. If the law has such a power, replace it by"
         " e2 (e2^2 + delta^2)^((a - 1)/2) with a small delta."
     )
-
-
-def _unit_of_differences(scenario: Scenario) -> str:
-    """The unit of a difference of the state, in words."""
-    if plants.is_chain(scenario.plant):
-        return "(in the unit of each level)"
-    return "rad/s"
 
 
 def _sampling_too_slow(result: Rollout) -> str:
@@ -321,7 +305,7 @@ def _filter_infeasible(result: Rollout) -> str:
 
 
 def _alpha_infeasible(result: Rollout) -> str:
-    if plants.is_chain(result.scenario.plant):
+    if result.scenario.loop.plant.reference_levels == 1:
         return _alphas_infeasible(result)
     worst = "at some time"
     if "alpha_margin" in result.metrics:
@@ -336,9 +320,9 @@ def _alpha_infeasible(result: Rollout) -> str:
 def _fast_reference(result: Rollout) -> str:
     """Which joint's reference touches or leaves its velocity bounds, in words; empty if none does.
 
-    Only the second level of a robot is the derivative of the first one.
+    A reference has a second level where this is the derivative of the first one.
     """
-    if plants.is_chain(result.scenario.plant) or not has(result, "dq_lower"):
+    if result.scenario.loop.plant.reference_levels == 1 or not has(result, "dq_lower"):
         return ""
     if not checks.is_concrete(result):
         return ""
@@ -377,18 +361,18 @@ def _torque_saturated(result: Rollout) -> str:
 
 def _alphas_infeasible(result: Rollout) -> str:
     """Which virtual controls left the bounds of the levels that they are for, and by how much."""
-    scenario = result.scenario
+    scenario, plant = result.scenario, result.scenario.loop.plant
     found = []
-    for level in range(2, plants.order_of(scenario.plant) + 1):
+    for level in range(2, plant.order + 1):
         margin = _alpha_margin(result, level)
         if margin is None or np.min(margin) > NARROWEST:
             continue
         joint = int(np.argmin(margin))
-        unit = unit_text(scenario, plants.units_of(scenario.plant)[level - 1], joint)
+        unit = unit_text(scenario, plants.units_of(plant)[level - 1], joint)
         found.append(
             f"Alpha_{level - 1}, the virtual control for level {level}, left the bounds by up to"
             f" {-margin[joint]:.3g} {unit}{_first_time_outside(result, level)}:"
-            f" {_level_in_words(scenario, level, joint)} cannot follow it inside them."
+            f" {plant.notation.numbered_component(level, joint)} cannot follow it inside them."
         )
     if not found:
         found.append("A virtual control left the bounds of the level that it is for.")
@@ -431,18 +415,9 @@ def _guard_stayed(result: Rollout) -> str:
 
 
 BOUND_EXPLANATIONS: dict[Status, Callable[[Rollout], str]] = {
-    Status.BOUND_VIOLATED: partial(
-        _joint_violation, 1, "bounds", "first_violation", "margin", POSITION
-    ),
-    Status.VELOCITY_VIOLATED: partial(
-        _joint_violation,
-        2,
-        "velocity bounds",
-        "first_velocity_violation",
-        "velocity_margin",
-        VELOCITY,
-    ),
-    Status.STATE_BOUND_VIOLATED: _higher_level_violation,
+    Status.BOUND_VIOLATED: partial(_violation, 1, "first_violation", "margin"),
+    Status.VELOCITY_VIOLATED: partial(_violation, 2, "first_velocity_violation", "velocity_margin"),
+    Status.STATE_BOUND_VIOLATED: _violation_above_second,
     Status.REGION_VIOLATED: _region_violation,
 }
 """The explanation of each flag of a violated bound."""
@@ -524,15 +499,6 @@ def _alternative_remedy(result: Rollout) -> str:
     if limit is None:
         return ""
     return f", or {limit.advice}: of all terms {limit.term.words} limits this loop"
-
-
-def _joint_in_words(result: Rollout, joint: int) -> str:
-    """A joint by its number, and by its name if it has one."""
-    plant = result.scenario.plant
-    name, noun = plants.component_names(plant)[joint], plants.component_noun(plant)
-    if name == f"{noun} {joint}":
-        return name.capitalize()
-    return f"{noun.capitalize()} {joint} ({name})"
 
 
 def _infeasible(result: Rollout, steps: int) -> ValueError:

@@ -63,7 +63,7 @@ def has_no_input(slope: LoopState) -> jax.Array:
 
 def is_valid(state: LoopState, limit: float) -> jax.Array:
     """Whether a state is finite, and its second level below a limit, () bool."""
-    first, second, *higher = state.x
+    first, second, *others = state.x
     slow = jnp.all(jnp.abs(second) < limit)
-    others = (first, *higher, *jax.tree.leaves(integrated_part(state)[1:]))
+    others = [first, *others, *jax.tree.leaves(integrated_part(state)[1:])]
     return jnp.all(jnp.stack([slow, *(jnp.all(jnp.isfinite(x)) for x in others)]))

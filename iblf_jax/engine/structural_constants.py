@@ -83,16 +83,13 @@ def _geometry_fields(scenario: Scenario) -> dict[tuple[str, ...], tuple[str, ...
 
     A robot is the plant or the model itself, or the field `robot` of either.
     """
-    parts: dict[str, Any] = {"plant": scenario.plant, "model": scenario.model}
-    robots: dict[tuple[str, ...], Any] = {}
-    for name, part in parts.items():
-        robots[name,] = part
-        if plants.is_chain(part):
-            robots[name, "robot"] = plants.robot_of(part)
-    return {
-        path: _field_names(robot.geometry_fields if isinstance(robot, Robot) else ())
-        for path, robot in robots.items()
-    }
+    found: dict[tuple[str, ...], tuple[str, ...]] = {}
+    for name, part in {"plant": scenario.plant, "model": scenario.model}.items():
+        robot = plants.as_plant(part).robot
+        if isinstance(robot, Robot):
+            path = (name,) if robot is part else (name, "robot")
+            found[path] = _field_names(robot.geometry_fields)
+    return found
 
 
 def robot_constants(scenario: Scenario) -> StructuralConstants | None:

@@ -245,10 +245,11 @@ def _concluded(
     status = carry.status | sample_status(sample)
     if raised is not None:
         status = status | raised
-    limit = plants.speed_limit(inputs.scenario.plant)
+    plant = inputs.scenario.loop.plant
+    limit = plants.speed_limit(plant)
     valid = is_valid(after, limit) & (status & int(Status.NOT_FINITE) == 0)
     status |= flag(~valid & in_run, Status.NOT_FINITE)
-    if plants.is_chain(inputs.scenario.plant):
+    if plant.loses_input:
         stages = [slope for _, slopes in parts for slope in slopes]
         lost = jnp.any(jnp.stack([has_no_input(slope) for slope in stages]))
         status |= flag(lost & in_run, Status.SINGULAR_GAIN)

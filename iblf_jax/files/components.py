@@ -164,25 +164,25 @@ def encode(part: Any, hint: Any, path: str) -> Any:
     if name is None:
         cls = type(part).__name__
         expected = f"a member of {words} that a file can name ({', '.join(members)})"
-        entry = _registration(family, "my_name", cls, is_chain=plants.is_chain(part))
+        entry = _registration(family, "my_name", cls, part)
         remedy = f"Name your class before saving and loading: {entry}."
         raise checks.fail(path, Words(f"an object of class {cls}"), expected, remedy)
     return {"kind": name, **encode_fields(part, path)}
 
 
-def _registration(hint: Any, name: str, cls: str, *, is_chain: bool = False) -> str:
+def _registration(hint: Any, name: str, cls: str, part: Any = None) -> str:
     """The statement that gives a class a name in files.
 
     Args:
       hint: annotation of the field that holds an object of the class.
       name, cls: the name and the class.
-      is_chain: whether the object is a plant in strict-feedback form.
+      part: the object; None if it is not known.
     """
     named = families_of(hint)
     if not named:
         return f'iblf_jax.<family>.MEMBERS["{name}"] = {cls}'
-    protocol = plants.Plant if is_chain and plants.Plant in named else named[0]
-    return FAMILIES[protocol].registration(name, cls)
+    base = next((base for base in named if isinstance(part, base)), named[0])
+    return FAMILIES[base].registration(name, cls)
 
 
 def encode_fields(part: Any, path: str) -> dict[str, Any]:

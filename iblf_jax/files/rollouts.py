@@ -311,14 +311,14 @@ def _index(name: str, size: int) -> tuple[str, np.ndarray, dict[str, str]]:
 
 
 def _components_and_levels(run: Rollout, variables: Mapping[str, Any]) -> dict[str, Any]:
-    """The coordinates of the components and, for plants in strict-feedback form, of the levels."""
-    plant = run.scenario.plant
+    """The coordinates of the components, and of the levels that the plant's notation lists."""
+    plant = run.scenario.loop.plant
     found: dict[str, Any] = {"joint": _index("joint", run.n)}
-    if not plants.is_chain(plant):
+    levels = plant.notation.levels
+    if not levels:
         return found
     names = ", ".join(plants.component_names(plant))
     found["joint"][2]["description"] = f"component of a level, from 0: {names}"
-    levels = plants.level_names(plant)
     sizes: dict[str, int] = {}
     for dims, values, *_ in variables.values():
         sizes |= dict(zip(dims, np.shape(values), strict=True))

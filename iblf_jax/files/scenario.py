@@ -74,7 +74,6 @@ from iblf_jax.simulation.integrators import METHODS
 from iblf_jax.simulation.paths import full_path, parameters, parse, with_parameters
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.scenario_rules import check_leaves
-from iblf_jax.world import plants
 
 COMPONENTS = ("robot", *(field.name for field in dataclasses.fields(Scenario)))
 RUN = ("duration", "dt", "method", "record_every")
@@ -190,7 +189,7 @@ def scenario_to_dict(scenario: Scenario) -> dict[str, Any]:
         [tables["bounds"]] = tables["bounds"]
     robots = {name: tables.pop(name) for name in ("plant", "model")}
     if _equal(scenario.plant, scenario.model):
-        name = "plant" if plants.is_chain(scenario.plant) else "robot"
+        name = "robot" if scenario.loop.plant.robot is scenario.plant else "plant"
         robots = {name: robots["plant"]}
     tables = robots | tables
     if dtype != jnp.result_type(float):

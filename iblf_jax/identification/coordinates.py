@@ -29,7 +29,6 @@ from iblf_jax.identification.replay import LeafSlice
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.scenario import Scenario, with_parts
 from iblf_jax.studies.draws import check_paths, paths_overlap
-from iblf_jax.world import plants
 
 MIN_POSITIVE_FACTOR = 1e-3
 """Default lower limit of a number that must be positive, by its start."""
@@ -128,10 +127,11 @@ def _check_robot(scenario: Scenario) -> None:
     """Raises ValueError for a plant in strict-feedback form: a log holds the positions of joints
     and the torques on them.
     """
-    if not plants.is_chain(scenario.plant):
+    robot = scenario.loop.plant.robot
+    if robot is scenario.plant:
         return
     remedy = "Its equation of motion gives the torques of a log."
-    if plants.robot_of(scenario.plant) is not None:
+    if robot is not None:
         remedy = (
             "Identify the robot inside from torques on its joints, in a scenario with"
             " plant=scenario.plant.robot."

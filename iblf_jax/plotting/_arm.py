@@ -83,19 +83,18 @@ def motions_of(curves: Sequence[Curve], t: np.ndarray) -> tuple[ReferenceMotion,
     motions: list[Motion] = []
     for curve in curves:
         q = curve.at("q", t)
-        plant = curve.run.scenario.plant
+        plant = curve.run.scenario.loop.plant
         motions.append(Motion(q, skeletons(plant, q), _motors(curve, t)))
         shape = motions[-1].skeleton.shape[1:]
         if shape != motions[0].skeleton.shape[1:]:
             expected = "points in the plane or in space, the same for all runs"
             raise checks.fail("plant.skeleton(q)", shape, expected)
-    plant = first.run.scenario.plant
+    plant = first.run.scenario.loop.plant
     q_d, lower, upper = (first.at(field, t) for field in ("q_d", "lower", "upper"))
     desired = skeletons(plant, q_d)
     if has_outline(plant):
         return ReferenceMotion(t, q_d, lower, upper, desired, np.zeros((len(t), 0))), motions
-    robot = plants.robot_of(plant)
-    fans = jax.jit(jax.vmap(lambda *args: _fans(robot, *args)))(motions[0].q, lower, upper)
+    fans = jax.jit(jax.vmap(lambda *args: _fans(plant.robot, *args)))(motions[0].q, lower, upper)
     return ReferenceMotion(t, q_d, lower, upper, desired, np.asarray(fans)), motions
 
 
@@ -139,13 +138,14 @@ class Scene:
         points = np.concatenate([target.desired, *(motion.skeleton for motion in motions)])
         scenario = curves[0].run.scenario
         limits = set_limits(self.arm, points, scenario.regions)
-        draw_boundaries(self.arm, plants.robot_of(scenario.plant), scenario.regions, limits)
+        plant = scenario.loop.plant
+        draw_boundaries(self.arm, plant.robot, scenario.regions, limits)
         self._add_fans()
         self._add_arms(curves)
         self._add_bars(curves)
         self.time = self._animated(self.bars.text(0.0, 1.03, "t = ", transform=self.bars.transAxes))
         title = "The arm within its joint limits"
-        if has_outline(scenario.plant):
+        if has_outline(plant):
             title = "The plant and its reference"
         notes = [note] if note else []
         _style.set_title(self.figure, title, curves, notes=notes)
@@ -186,7 +186,7 @@ class Scene:
         ]
         style = {"linewidth": 2.6, "marker": "o", "markersize": 5}
         name = "arm"
-        if has_outline(curves[0].run.scenario.plant):
+        if has_outline(curves[0].run.scenario.loop.plant):
             name, style["marker"] = "plant", ""
         self.arms = [
             self._line(self.arm, label=curve.name or name, **style, **_style.series(i))
@@ -203,7 +203,7 @@ class Scene:
             ylim=(len(rows) - 0.4, -0.6),
             xlabel=quantity_of(curves[0].run.scenario, "q").label,
         )
-        self.bars.set_yticks(rows, joint_labels(curves[0].run.scenario.plant, len(rows)))
+        self.bars.set_yticks(rows, joint_labels(curves[0].run.scenario.plant))
         self.bars.spines["left"].set_visible(False)
         self.bars.tick_params(axis="y", length=0)
         width = max(4.0, min(18.0, 90.0 / len(rows)))

@@ -30,7 +30,6 @@ from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.signals import has
 from iblf_jax.simulation.units import status_words
 from iblf_jax.world import plants
-from iblf_jax.world.robots import joint_names
 
 POINTS = 2400
 """Approximate number of points that a line of a figure can resolve."""
@@ -234,10 +233,9 @@ class Curve:
         """Whether the law received estimates of levels from an observer."""
         return has(self.run, "x_hat")
 
-    @property
-    def has_speed_limits(self) -> bool:
-        """Whether the velocities have bounds."""
-        return bool(np.isfinite(_row_if_any(self.run.level_lower, 1)).any())
+    def has_bounds(self, level: int) -> bool:
+        """Whether a level, counted from 1, has bounds."""
+        return bool(np.isfinite(_row_if_any(self.run.level_lower, level - 1)).any())
 
     @property
     def has_regions(self) -> bool:
@@ -263,11 +261,8 @@ class Curve:
         """The levels of a model in strict-feedback form, counted from 1, with a disturbance, or an
         estimate of one, that is more than the rounding of the levels' rates.
         """
-        scenario = self.run.scenario
-        if not plants.is_chain(scenario.model):
-            return []
         found = []
-        for level in range(1, plants.order_of(scenario.model) + 1):
+        for level in self.run.scenario.loop.model.uncertain_levels:
             sizes = [self[f"level_{level}_{part}"] for part in ("d", "estimate")]
             if np.nanmax(np.abs(sizes)) > NEGLIGIBLE * self.largest_rate(level):
                 found.append(level)
@@ -283,7 +278,7 @@ class Curve:
 
     def joint_label(self, joint: int) -> str:
         """The label of a joint in a figure."""
-        return joint_labels(self.run.scenario.plant, self.run.n)[joint]
+        return joint_labels(self.run.scenario.plant)[joint]
 
     def exit_index(self, field: str, entry: int) -> int | None:
         """The first sample at which the joint of a panel left the bounds that concern the panel;
@@ -311,7 +306,7 @@ class Curve:
     def _bounded_signals(self) -> list[str]:
         """The signals of the run that have bounds: levels, and distances to regions."""
         names = ["q"]
-        if self.has_speed_limits:
+        if self.has_bounds(2):
             names.append("dq")
         order = plants.order_of(self.run.scenario.plant)
         names += [f"level_{level}" for level in range(3, order + 1)]
@@ -402,13 +397,9 @@ def peak_of(curve: Curve, field: str, joints: Sequence[int]) -> Peak | None:
     return Peak(float(values[sample, column]), joints[column], float(curve.t[sample]))
 
 
-def joint_labels(robot: Any, n: int) -> list[str]:
-    """The labels of a robot's joints: the names in the robot's file, if it has names; or of the
-    components of a plant.
-    """
-    if plants.is_chain(robot):
-        return [escaped(name) for name in plants.component_names(robot)]
-    return [escaped(name) for name in joint_names(robot, n)]
+def joint_labels(plant: Any) -> list[str]:
+    """The labels of the joints of a robot, or of the components of a plant."""
+    return [escaped(name) for name in plants.component_names(plant)]
 
 
 def escaped(name: str) -> str:

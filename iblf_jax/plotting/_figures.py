@@ -357,7 +357,7 @@ def region_margins(runs: Runs, *, zoom: float | None = None) -> Figure:
         came = f"runs with {', '.join(map(str, counts))} regions"
         raise checks.fail("runs", came, "runs with the same number of regions, at least one")
     scenario = curves[0].run.scenario
-    robot = plants.robot_of(scenario.plant)
+    robot = plants.robot_inside(scenario.loop.plant)
     names = [escaped(in_words(region, robot)) for region in scenario.regions]
     quantities = [QUANTITIES["region_margin"]] * len(names)
     return _named_rows("Distance to the boundaries", curves, quantities, names, zoom)
@@ -403,7 +403,7 @@ def uncertain_terms(runs: Runs, *, zoom: float | None = None) -> Figure:
       ValueError: no run, a batch, or a zoom that is not a positive number.
     """
     curves = curves_of(runs)
-    if all(plants.is_chain(curve.run.scenario.model) for curve in curves):
+    if all(curve.run.scenario.loop.model.uncertain_levels for curve in curves):
         return _disturbances(curves, zoom)
     return _every_joint(
         r"Uncertain term $f$ and its estimate $\hat f$", runs, "disturbance_estimate", zoom
@@ -417,7 +417,7 @@ def _disturbances(curves: Sequence[Curve], zoom: float | None) -> Figure:
     scenario, n = curves[0].run.scenario, curves[0].run.n
     disturbed = {level for curve in curves for level in curve.disturbed_levels()}
     quantities, names, joints = [], [], []
-    for level in sorted(disturbed) or range(1, plants.order_of(scenario.model) + 1):
+    for level in sorted(disturbed) or scenario.loop.model.uncertain_levels:
         for joint in range(n):
             quantities.append(disturbance_quantity(scenario, level, joint))
             names.append(curves[0].joint_label(joint))
@@ -536,10 +536,7 @@ def phase_portrait(runs: Runs, joints: tuple[int | str, int | str] = (0, 1)) -> 
     first, second = (check_joint(curves, joint, "joints") for joint in joints)
     if first == second:
         raise checks.fail("joints", joints, expected)
-    title = "Phase portrait of the positions"
-    plant = curves[0].run.scenario.plant
-    if plants.is_chain(plant):
-        title = f"Phase portrait: {plants.level_names(plant)[0]}"
+    title = curves[0].run.scenario.loop.plant.notation.portrait
     return _portrait(curves, (first, second), title)
 
 
@@ -631,7 +628,7 @@ def _draw_box(axes: Axes, curve: Curve, joint: int) -> None:
         boxes.append((reached, ":", "_"))
     for (x0, x1, y0, y1), line, label in boxes:
         style: dict[str, Any] = {"color": _style.bound(), "linewidth": 1.0, "linestyle": line}
-        if curve.has_speed_limits:
+        if curve.has_bounds(2):
             axes.plot([x0, x1, x1, x0, x0], [y0, y0, y1, y1, y0], label=label, **style)
         else:
             axes.axvline(x0, label=label, **style)

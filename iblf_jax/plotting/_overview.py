@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.gridspec import SubplotSpec
 
 from iblf_jax.core import checks
+from iblf_jax.core.families import is_default
 from iblf_jax.plotting import _style
 from iblf_jax.plotting._curves import Curve, check_class, curves_of, escaped, thinned
 from iblf_jax.plotting._figures import draw_phase_portrait
@@ -31,7 +32,7 @@ from iblf_jax.plotting._panels import (
 )
 from iblf_jax.plotting._workspace import draw_paths
 from iblf_jax.simulation.results import Rollout
-from iblf_jax.world import plants
+from iblf_jax.world.plants import Plant, robot_inside
 from iblf_jax.world.regions import in_words
 
 WIDTH = 10.0
@@ -89,12 +90,13 @@ def overview(run: Rollout, *, title: str = "Overview of the run") -> Figure:
 
 def _shown_levels(curve: Curve) -> list[int]:
     """The levels that the first panels show, counted from 1."""
-    plant = curve.run.scenario.plant
-    if plants.is_chain(plant):
-        return list(range(1, plants.order_of(plant) + 1))
-    if curve.has_speed_limits or curve.is_measured:
-        return [1, 2]
-    return [1]
+    plant = curve.run.scenario.loop.plant
+    shown = [1]
+    for level in range(2, plant.order + 1):
+        follows_alpha = level > plant.reference_levels
+        if follows_alpha or curve.has_bounds(level) or curve.is_measured:
+            shown.append(level)
+    return shown
 
 
 def _level(figure: Figure, where: SubplotSpec, curve: Curve, level: int, window: Window) -> None:
@@ -136,7 +138,7 @@ def _together(figure: Figure, where: SubplotSpec, curve: Curve, window: Window) 
     grid = where.subgridspec(2, 3)
     scenario = curve.run.scenario
     places = {(0, 0): "e1", (0, 1): "xi", (1, 0): "tau", (1, 1): "disturbance_estimate"}
-    if plants.is_chain(scenario.model):
+    if scenario.loop.model.uncertain_levels:
         places[1, 1] = "e2"
     for place, field in places.items():
         _joints(figure.add_subplot(grid[place]), curve, quantity_of(scenario, field), window)
@@ -183,7 +185,7 @@ def _regions(figure: Figure, where: SubplotSpec, curve: Curve, window: Window) -
     axes = figure.add_subplot(grid[0])
     quantity = QUANTITIES["region_margin"]
     scenario = curve.run.scenario
-    robot = plants.robot_of(scenario.plant)
+    robot = robot_inside(scenario.loop.plant)
     names = []
     for i, region in enumerate(scenario.regions):
         draw(axes, curve, quantity.field, i, window, label="_", **_style.series(i))
@@ -201,7 +203,8 @@ def _lyapunov(axes: Axes, curve: Curve, window: Window) -> None:
     V = curve["V"]
     positive = np.where(np.isfinite(V) & (V > 0), V, np.nan)
     axes.plot(*thinned(curve.t[: len(V)], positive), color=_style.blend(0.733))
-    symbol = r"$\sum w_i V_i$" if plants.is_chain(curve.run.scenario.model) else "$V_2$"
+    energy = curve.run.scenario.loop.model.energy_of_errors
+    symbol = r"$\sum w_i V_i$" if is_default(energy, Plant.energy_of_errors) else "$V_2$"
     if np.isfinite(positive).any():
         axes.set_yscale("log")
     elif np.isfinite(V).any():

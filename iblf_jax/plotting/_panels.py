@@ -152,7 +152,7 @@ QUANTITIES = {
         ),
     )
 }
-"""Signal -> the panel that shows it, for robots."""
+"""Signal -> the panel that shows it; `quantity_of` has the names and units of a plant."""
 
 VIRTUAL_CONTROL = r"virtual control $\alpha_{i-1}$"
 """The label of the signal that a level above the first should follow."""
@@ -169,26 +169,25 @@ def quantity_of(scenario: Scenario, field: str, joint: int | None = None) -> Pan
       field: a key of `QUANTITIES`.
       joint: the component whose unit is shown; None for the units of all components.
     """
-    quantity, plant = QUANTITIES[field], scenario.plant
-    if not plants.is_chain(plant) or field in UNRELATED_TO_LEVELS:
+    quantity, plant = QUANTITIES[field], scenario.loop.plant
+    if field in UNRELATED_TO_LEVELS:
         return quantity
-    names = plants.level_names(plant)
-    of_plant: dict[str, dict[str, Any]] = {
-        "q": {"name": names[0], "symbol": "$x_1$", "guide_label": "reference $x_d$"},
-        "e1": {},
-        "e2": {},
-        "dq": {
-            "name": names[1],
-            "symbol": "$x_2$",
-            "guide": "alpha",
-            "guide_label": VIRTUAL_CONTROL,
-            "guide_sets_limits": True,
-        },
-        "tau": {"name": plants.input_name(plant), "symbol": "$u$"},
-        "disturbance_estimate": {},
-    }
-    changed = of_plant[field] | {"unit": signal_unit(scenario, field, joint)}
-    return dataclasses.replace(quantity, farthest_bound=np.inf, **changed)
+    changed: dict[str, Any] = {"unit": signal_unit(scenario, field, joint)}
+    notation, names = plant.notation, plants.level_names(plant)
+    first, second = notation.symbols
+    if field == "q":
+        guide_label = f"reference ${notation.reference}$"
+        changed |= {"name": names[0], "symbol": f"${first}$", "guide_label": guide_label}
+    if field == "dq":
+        changed |= {"name": names[1], "symbol": f"${second}$"}
+        if plant.reference_levels == 1:
+            alpha = {"guide": "alpha", "guide_label": VIRTUAL_CONTROL, "guide_sets_limits": True}
+            changed |= alpha
+    if field == "tau":
+        changed |= {"name": plants.input_name(plant), "symbol": f"${notation.input}$"}
+    if plant.robot is None:
+        changed["farthest_bound"] = np.inf
+    return dataclasses.replace(quantity, **changed)
 
 
 def level_quantity(scenario: Scenario, level: int, joint: int | None = None) -> PanelQuantity:

@@ -125,7 +125,7 @@ def _draw_bands(axes: Axes, data: xarray.Dataset, joint: int, study: Study) -> N
         axes.plot(t, q[middle], color=_style.colour(0), label=f"{100 * levels[middle]:g} %")
     quantity = quantity_of(study.scenario, "q", joint)
     axes.plot(t, data.q_d.values[:, joint], label=quantity.guide_label, **_style.reference())
-    axes.set_title(joint_labels(study.scenario.plant, study.scenario.n)[joint])
+    axes.set_title(joint_labels(study.scenario.plant)[joint])
     _style.time_axis(axes)
     axes.set_ylabel(quantity.label)
 

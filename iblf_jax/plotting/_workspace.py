@@ -22,7 +22,7 @@ from iblf_jax.plotting import _style
 from iblf_jax.plotting._curves import Curve, curves_of, escaped
 from iblf_jax.plotting._figures import Runs
 from iblf_jax.plotting._panels import run_style
-from iblf_jax.world import plants
+from iblf_jax.world.plants import Plant
 from iblf_jax.world.regions import HalfSpace, Region, Sphere, in_words, row_of
 
 GRID = 301
@@ -36,17 +36,17 @@ LINES = ("-", "--", ":", "-.")
 """Line styles of the boundaries, one per confined point."""
 
 
-def has_outline(plant: Any) -> bool:
+def has_outline(plant: Plant) -> bool:
     """Whether a plant is drawn by its outline in the plane."""
-    return plants.is_chain(plant) and not is_default(plant.outline, plants.Plant.outline)
+    return not is_default(plant.outline, Plant.outline)
 
 
-def skeletons(plant: Any, q: np.ndarray) -> np.ndarray:
+def skeletons(plant: Plant, q: np.ndarray) -> np.ndarray:
     """Base, joints and tip at the positions q of a run, (T, n + 1, d) [m]; of a plant with an
     outline its corners, (T, k + 1, 2) [m], of which the first one is repeated at the end.
 
     Args:
-      plant: a robot, a plant that contains one, or a plant with an outline.
+      plant: one that contains a robot, or has an outline.
       q: positions, the first level, (T, n).
 
     Raises:
@@ -56,11 +56,12 @@ def skeletons(plant: Any, q: np.ndarray) -> np.ndarray:
     if has_outline(plant):
         corners = np.asarray(jax.jit(jax.vmap(plant.outline))(q))
         return np.concatenate([corners, corners[:, :1]], axis=1)
-    robot = plants.robot_of(plant)
+    robot = plant.robot
     points = None if robot is None else jax.jit(jax.vmap(robot.skeleton))(q)
     if points is None:
         remedy = "A robot has a skeleton(q); another plant may have an outline(x1), (k, 2) [m]."
-        raise checks.fail("plant", type(plant).__name__, "a plant with a shape", remedy)
+        kind = type(plant if robot is None else robot).__name__
+        raise checks.fail("plant", kind, "a plant with a shape", remedy)
     found = np.asarray(points)
     if found.shape[1:] not in ((q.shape[1] + 1, 2), (q.shape[1] + 1, 3)):
         expected = "n + 1 points in the plane or in space, the same for all runs"
@@ -210,10 +211,12 @@ def workspace(runs: Runs) -> Figure:
 def draw_paths(figure: Figure, where: SubplotSpec, curves: Sequence[Curve]) -> Any:
     """Draws the paths of the runs and the boundaries of the first run; returns the panel."""
     first = curves[0]
-    plant = first.run.scenario.plant
-    robot = plants.robot_of(plant)
+    plant = first.run.scenario.loop.plant
+    robot: Any = plant.robot  # regions need one
     regions = first.run.scenario.regions
-    actual = [skeletons(curve.run.scenario.plant, curve.at("q", _times(curve))) for curve in curves]
+    actual = [
+        skeletons(curve.run.scenario.loop.plant, curve.at("q", _times(curve))) for curve in curves
+    ]
     desired = skeletons(plant, first.at("q_d", _times(first)))
     d = desired.shape[-1]
     if any(x.shape[-1] != d for x in actual):

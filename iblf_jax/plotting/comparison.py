@@ -26,7 +26,6 @@ from iblf_jax.plotting._curves import (
 from iblf_jax.plotting._figures import PanelRow, windows, zoom_reason
 from iblf_jax.plotting._panels import Window, draw, quantity_of, range_after, set_limits
 from iblf_jax.studies.comparison import Comparison
-from iblf_jax.world import plants
 
 SMALLEST = 1e-5
 """Errors below this, in the unit of the error, are drawn at the lower end of the logarithmic
@@ -65,9 +64,7 @@ def comparison(result: Comparison, joint: int = 0, *, zoom: float | None = None)
     start, end = windows(given, [error], zoom)[1]
     columns = {"gains as given": given}
     if result.factors:
-        effort = "torque above gravity"
-        if plants.is_chain(scenario.plant):
-            effort = f"{plants.input_name(scenario.plant)} above $u_0$"
+        effort = scenario.loop.plant.notation.effort
         columns[f"equal effort (RMS {effort})"] = curves_of(result.equal_effort)
     torque = PanelRow(quantity_of(scenario, "tau", joint), joint, "")
     shown = [curve for curves in columns.values() for curve in curves]

@@ -37,7 +37,6 @@ from iblf_jax.proofs.search import SearchResult, search
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.distributions import Perturbation
-from iblf_jax.world import plants
 
 EXAMPLE = '{"plant.mass": ij.factor(ij.interval(0.97, 1.03))}'
 POINTS = 2048
@@ -246,7 +245,7 @@ def problem_of(
     """
     if not isinstance(scenario, Scenario):
         raise checks.fail("scenario", scenario, "a Scenario", "Make one with ij.presets.")
-    if not plants.is_chain(scenario.plant):
+    if not scenario.loop.plant.uncertain_levels:
         return arm_problem(
             scenario, parameters, duration=duration, disturbance_rate=disturbance_rate
         )
@@ -260,7 +259,7 @@ def weights_of(scenario: Scenario, weight: float | None) -> list[float]:
     """The weights that are tried."""
     if weight is not None:
         return [float(weight)]
-    if plants.is_chain(scenario.plant):
+    if scenario.loop.plant.uncertain_levels:
         return _grid(LEAST_CHAIN_WEIGHT, GREATEST_CHAIN_WEIGHT)
     law: Any = scenario.controller
     observer: Any = scenario.observer

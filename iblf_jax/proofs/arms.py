@@ -265,7 +265,7 @@ def check_supported(scenario: Scenario) -> None:
 def _check_plant(scenario: Scenario) -> None:
     for name in ("plant", "model"):
         part = vars(scenario)[name]
-        if plants.is_chain(part):
+        if plants.as_plant(part).robot is not part:
             reason = "This bound is that of rigid arms."
             raise unsupported(name, type(part).__name__, "a robot", reason)
         reason = "A load that is picked up changes the plant during the run."

@@ -324,10 +324,11 @@ def _check_plant(scenario: Scenario) -> None:
     for name in ("plant", "model"):
         part = vars(scenario)[name]
         kind = type(part).__name__
-        if not plants.is_chain(part):
+        robot = plants.as_plant(part).robot
+        if robot is part:
             reason = "This bound is that of plants with drift and gain."
             raise unsupported(name, kind, "a plant in strict-feedback form", reason)
-        if plants.robot_of(part) is not None:
+        if robot is not None:
             reason = "Its disturbances are torques on a robot, which this bound does not contain."
             raise unsupported(name, kind, "a plant without a robot inside", reason)
         if part.n != 1:

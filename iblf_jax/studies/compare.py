@@ -207,9 +207,13 @@ def _with_law(scenario: Scenario, law: str | TrackingLaw) -> Scenario:
             observer = NoObserver()
     model: Any = scenario.model
     if isinstance(law, str) or not isinstance(unwrapped(law), Law):
-        model = _model_of_robots(model)
-    if isinstance(law, str) and plants.is_chain(model):
-        raise _no_robot(law, model)
+        known = plants.as_plant(model)
+        limit = known.rigid()
+        robot = known.robot if limit is None else limit
+        if robot is not None:
+            model = robot
+        elif isinstance(law, str):
+            raise _no_robot(law, model)
     return dataclasses.replace(scenario, controller=controller, observer=observer, model=model)
 
 
@@ -218,16 +222,6 @@ def _no_robot(name: str, model: Any) -> ValueError:
     expected = f"a law, as names are laws of robots and {type(model).__name__} contains none"
     remedy = f"Give {{{name!r}: controllers.BarrierBackstepping(...)}}, with a barrier a level."
     return checks.fail("laws", name, expected, remedy)
-
-
-def _model_of_robots(model: Any) -> Any:
-    """The model of laws of robots: the rigid limit of a plant, or the robot inside it."""
-    if not plants.is_chain(model):
-        return model
-    for robot in (model.rigid(), model.robot):
-        if robot is not None:
-            return robot
-    return model
 
 
 def _folds(scenario: Scenario, further: Sequence[Fold]) -> tuple[Fold, ...]:

@@ -80,12 +80,9 @@ OPTIONAL = ("velocity_margin", "region_margin")
 
 def headings(scenario: Scenario) -> tuple[str, ...]:
     """The heading of each column of `Row`, with the units of the plant."""
-    plant = scenario.plant
+    plant = scenario.loop.plant
+    notation, speed = plant.notation, plants.level_names(plant)[1]
     first, second, of_input = (unit_text(scenario, unit) for unit in (POSITION, VELOCITY, INPUT))
-    torque, speed, above = "tau", "velocity", "above gravity"
-    if plants.is_chain(plant):
-        torque, speed = plants.input_name(plant), plants.level_names(plant)[1]
-        above = f"{torque} above u_0"
     return (
         "law",
         "factor",
@@ -95,9 +92,9 @@ def headings(scenario: Scenario) -> tuple[str, ...]:
         "1-max|xi|",
         f"{speed} margin [{second}]",
         "region margin [m]",
-        f"peak {torque} [{of_input}]",
-        f"rms {torque} [{of_input}]",
-        f"{above} [{of_input}]",
+        f"peak {notation.input_column} [{of_input}]",
+        f"rms {notation.input_column} [{of_input}]",
+        f"{notation.effort_column} [{of_input}]",
         f"chatter [{of_input}]",
         "status",
     )
@@ -266,14 +263,11 @@ class Comparison(Result):
     @property
     def _input_in_words(self) -> str:
         """The input that is held equal at equal effort, with its formula."""
-        plant = self.scenario.plant
-        if not plants.is_chain(plant):
-            return "torque above gravity, sqrt(mean |tau - G0(q)|^2)"
-        name = plants.input_name(plant)
-        q = self.scenario.initial.q
+        plant, q = self.scenario.loop.plant, self.scenario.initial.q
         if jax.eval_shape(stated_steady_input, self.scenario, q) is None:
+            name = plants.input_name(plant)
             return f"{name}, sqrt(mean |u - u_0|^2) with u_0 = 0 (the plant has no steady_input),"
-        return f"{name} above its steady_input u_0(q), sqrt(mean |u - u_0(q)|^2)"
+        return plant.notation.effort_formula
 
     def _searches_in_words(self) -> list[str]:
         """Why a law has no factor, and for the others what was searched where that says more than

@@ -448,14 +448,12 @@ class Study(Result):
         margins = summaries.initial_margins(self.scenario, self.samples)
         first = {bounded: x[i] for bounded, x in margins.items()}
         bounded = next(bounded for bounded, x in first.items() if not np.min(x) > 0)
-        worst, plant = int(np.argmin(first[bounded])), self.scenario.plant
+        worst, plant = int(np.argmin(first[bounded])), self.scenario.loop.plant
         if bounded == summaries.REGIONS:
-            name, unit = in_words(self.scenario.regions[worst], plants.robot_of(plant)), "m"
+            name, unit = in_words(self.scenario.regions[worst], plants.robot_inside(plant)), "m"
         else:
             level = summaries.LEVELS.index(bounded)
-            name = plants.component_names(plant)[worst]
-            if plants.is_chain(plant):
-                name = f"{plants.level_names(plant)[level]} of {name}"
+            name = plant.notation.component(level + 1, worst)
             unit = unit_text(self.scenario, plants.units_of(plant)[level], worst)
         notices.warn(
             f"Run {i} started outside its bounds: {name} was drawn {-first[bounded][worst]:.3g}"

@@ -89,7 +89,8 @@ def _initial_margins(scenario: Scenario, samples: Mapping[str, Any]) -> dict[str
                 low, high = bounds_at(bounds, zero, jnp.zeros_like(x[i]))
             found[LEVELS[i]] = jnp.minimum(x[i] - low, high - x[i])
         if perturbed.regions:
-            found[REGIONS] = margins(perturbed.regions, plants.robot_of(perturbed.plant), q)
+            robot = plants.robot_inside(perturbed.loop.plant)
+            found[REGIONS] = margins(perturbed.regions, robot, q)
         return found
 
     if not samples:

@@ -59,8 +59,7 @@ def _command(
     context, t, model = scenario.context, jnp.asarray(TIME), scenario.loop.model
     of_x = law_of_x(law)
     state = of_x.init(start_levels(scenario)[: model.order], context)
-    higher = levels_on_reference(scenario, t)[2 : model.order]
-    x = jnp.stack([q, dq, *higher])
+    x = jnp.stack([q, dq, *levels_on_reference(scenario, t)[2 : model.order]])
     f_hat = jnp.zeros(model.estimate_shape, q.dtype)
     command = of_x.command(t, x, f_hat, context, state)[0]
     return command.tau, command.alpha, command.V1

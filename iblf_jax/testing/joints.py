@@ -148,7 +148,9 @@ def levels_of(member: Any) -> int:
     """The number of levels of a component for plants in strict-feedback form: that of the rows of
     its leaves, or `DEFAULT_LEVELS` if these are single numbers.
     """
-    values = field_values(member) if dataclasses.is_dataclass(member) else {}
+    if not dataclasses.is_dataclass(member):
+        return DEFAULT_LEVELS
+    values = field_values(member)
     rows = [
         np.shape(values[field.name])[0]
         for field in dataclasses.fields(member)

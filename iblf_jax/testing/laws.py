@@ -86,8 +86,8 @@ def check_law(
         t = jnp.asarray(0.7)
         tube = base.context.tube(t)
         model = base.loop.model
-        _, dq, *higher = levels_on_reference(base, t)
-        x = jnp.stack([tube.q_d + 0.3 * tube.k_u, dq - 0.2, *higher])[: model.order]
+        _, dq, *others = levels_on_reference(base, t)
+        x = jnp.stack([tube.q_d + 0.3 * tube.k_u, dq - 0.2, *others])[: model.order]
         f_hat = jnp.broadcast_to(jnp.linspace(0.1, 0.2, base.n), model.estimate_shape)
 
         def outputs(law, t, x, f_hat, context):

@@ -4,16 +4,17 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.control.observers import Observer
+from iblf_jax.control.observers import Observer, RobotObserver
 from iblf_jax.control.observers._base import contract_of
 from iblf_jax.control.observers.none import observer_of_x
 from iblf_jax.core import checks
+from iblf_jax.simulation.scenario import check_plant_or_robot
 from iblf_jax.testing._contract import (
     Findings,
     call_has_shape,
@@ -57,98 +58,75 @@ def check_observer(observer: Any, *, model: Any = None, n: int | None = None) ->
     """
     check_number(n)
     with examine(observer, "Observer", contract_of(observer)) as findings:
-        receives_x = isinstance(observer, Observer)
-        if model is not None:
-            check_model(model, receives_x)
-        else:
+        if model is None:
             joints = number_of_joints(findings, observer, n)
-            model = plant_of(levels_of(observer), joints) if receives_x else arm_of(joints)
+            model = arm_of(joints)
+            if isinstance(observer, Observer):
+                model = plant_of(levels_of(observer), joints)
+        elif isinstance(observer, Observer):
+            check_plant_or_robot("model", model)
+        else:
+            checks.conforms("model", model, Robot)
         check_joints_of(n, model, "model")
-        if receives_x:
-            model = plants.as_plant(model)
-        model = in_dtype(model, "float64")
-        n, t = model.n, jnp.asarray(0.7)
-        fitted = fitted_to(in_dtype(observer, "float64"), n, "observer")
-        case = _case(fitted, model, n)
-        in_both_types(findings, _structure, fitted, t, case, model)
+        plant = in_dtype(plants.as_plant(model), "float64")
+        t = jnp.asarray(0.7)
+        fitted = fitted_to(in_dtype(observer, "float64"), plant.n, "observer")
+        fitted.check_model(plant)
+        rng = np.random.default_rng(3)
+        x = jnp.asarray(rng.uniform(-1, 1, (plant.order, plant.n)))
+        u = jnp.asarray(rng.uniform(-1, 1, plant.n))
+        in_both_types(findings, _structure, fitted, t, x, u, plant)
 
-        def outputs(observer, t, case, model):
-            state = observer.init(*case.start, model)
-            rate = observer.derivative(t, *case.measured, case.tau, model, state)
-            estimate = observer.estimate(t, *case.measured, model, state)
+        def outputs(observer, t, x, u, plant):
+            of_x = observer_of_x(observer)
+            state = of_x.init(_slower(x), plant)
+            rate = of_x.derivative(t, x, u, plant, state)
+            estimate = of_x.estimate(t, x, plant, state)
             return {"estimate": estimate} | leaves_by_name("derivative", rate)
 
-        check_function(findings, outputs, fitted, (t, case, model))
-        in_both_types(findings, _scan, fitted, t, case, model)
+        check_function(findings, outputs, fitted, (t, x, u, plant))
+        in_both_types(findings, _scan, fitted, t, x, u, plant)
 
 
-def check_model(model: Any, receives_x: bool) -> None:
-    """Raises ValueError for a model that is no robot, or no robot and no plant in strict-feedback
-    form.
-    """
-    if receives_x and plants.is_chain(model):
-        checks.conforms("model", model, plants.Plant)
-        return
-    checks.conforms("model", model, Robot)
+def _slower(x: jax.Array) -> jax.Array:
+    """Another state, for the start."""
+    return x.at[1].multiply(0.5)
 
 
-class Case(NamedTuple):
-    """The arguments of an observer in a check."""
-
-    start: tuple[jax.Array, ...]
-    """At the start: (q, q'), or (x,)."""
-    measured: tuple[jax.Array, ...]
-    """At another time."""
-    tau: jax.Array
-    """The input, (n,)."""
-
-
-def _case(observer: Any, model: Any, n: int) -> Case:
-    """Random arguments for an observer of robots, or of plants in strict-feedback form."""
-    rng = np.random.default_rng(3)
-    if not isinstance(observer, Observer):
-        q, dq, tau = jnp.asarray(rng.uniform(-1, 1, (3, n)))
-        return Case((q, 0.5 * dq), (q, dq), tau)
-    observer.check_model(model)
-    x, tau = jnp.asarray(rng.uniform(-1, 1, (model.order, n))), jnp.asarray(rng.uniform(-1, 1, n))
-    return Case((x.at[1].multiply(0.5),), (x,), tau)
-
-
-def _structure(findings: Findings, observer, t, case: Case, model) -> None:
-    receives_x = isinstance(observer, Observer)
-    names = "x" if receives_x else "q, dq"
-    state = shape_of(findings, f"init({names}, model)", observer.init, *case.start, model)
+def _structure(findings: Findings, observer, t, x, u, plant) -> None:
+    arguments, start, model, names = (x,), (_slower(x),), plant, "x"
+    if isinstance(observer, RobotObserver):
+        arguments, start, model, names = tuple(x), tuple(_slower(x)), plant.robot, "q, dq"
+    state = shape_of(findings, f"init({names}, model)", observer.init, *start, model)
     label = f"estimate(t, {names}, model, state)"
     # The estimate has the shape of the torque of a robot, or of the state of a plant.
-    shape = case.measured[0].shape
-    call_has_shape(findings, label, observer.estimate, (t, *case.measured, model, state), shape)
+    shape = arguments[0].shape
+    call_has_shape(findings, label, observer.estimate, (t, *arguments, model, state), shape)
     label = f"derivative(t, {names}, tau, model, state)"
-    arguments = (t, *case.measured, case.tau, model, state)
-    rate = shape_of(findings, label, observer.derivative, *arguments)
+    rate = shape_of(findings, label, observer.derivative, t, *arguments, u, model, state)
     same_structure(findings, label, rate, state)
-    if receives_x and observer.completes:
+    of_x = observer_of_x(observer)
+    if of_x.completes:
         label = f"complete(t, {names}, model, state)"
-        arguments = (t, *case.measured, model, state)
-        call_has_shape(findings, label, observer.complete, arguments, shape)
-    if observer_of_x(observer).advances:
+        call_has_shape(findings, label, observer.complete, (t, *arguments, model, state), shape)
+    if of_x.advances:
         label = f"advance(t, {names}, tau, model, state, period)"
-        arguments = (t, *case.measured, case.tau, model, state, jnp.asarray(1e-3, t.dtype))
-        after = shape_of(findings, label, observer.advance, *arguments)
+        period = jnp.asarray(1e-3, t.dtype)
+        after = shape_of(findings, label, observer.advance, t, *arguments, u, model, state, period)
         same_structure(findings, label, after, state)
 
 
-def _scan(findings: Findings, observer, t, case: Case, model) -> None:
+def _scan(findings: Findings, observer, t, x, u, plant) -> None:
     """Requires that the state keeps its structure and stays finite at a standstill."""
+    of_x = observer_of_x(observer)
 
     def step(state, _):
-        rate = observer.derivative(t, *case.measured, case.tau, model, state)
-        state = jax.tree.map(lambda x, dx: x + 1e-3 * dx, state, rate)
-        return state, observer.estimate(t, *case.measured, model, state)
+        rate = of_x.derivative(t, x, u, plant, state)
+        state = jax.tree.map(lambda value, slope: value + 1e-3 * slope, state, rate)
+        return state, of_x.estimate(t, x, plant, state)
 
     try:
-        state, estimates = jax.jit(
-            lambda: jax.lax.scan(step, observer.init(*case.measured, model), length=100)
-        )()
+        state, estimates = jax.jit(lambda: jax.lax.scan(step, of_x.init(x, plant), length=100))()
     except TypeError as error:
         findings.add(f"its state does not keep its type in a scan ({first_line(error)})")
         return

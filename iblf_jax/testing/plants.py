@@ -226,7 +226,7 @@ def _identities(plant: Any, t: jax.Array, x: jax.Array, v: jax.Array, s: jax.Arr
         state = jnp.concatenate([jnp.stack([x[0], rest]), steady_levels])
         rate = plants.flow(plant, t, state, steady_input)
         found["steady_input"] = rate / (1.0 + jnp.abs(plants.flow(plant, t, x, v)))
-    if plants.robot_of(plant) is not None and "level_rate" in found:
+    if plant.robot is not None and "level_rate" in found:
         added = plant.level_rate(2, t, x, v, s) - plant.level_rate(2, t, x, v, 0.0)
         found["torque"] = _relative(added, plants.torque_as_rates(plant, x, s)[1])
     return found

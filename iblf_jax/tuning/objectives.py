@@ -346,8 +346,8 @@ def _in_units_of(scenario: Scenario, requirement: Requirement) -> Requirement:
     """
     _, unit = requirement.measure
     name = requirement.name.replace(f" {unit}", f" {unit_text(scenario, unit)}")
-    plant, quantity = scenario.plant, requirement.quantity
-    if plants.is_chain(plant) and isinstance(quantity, Peak):
+    plant, quantity = scenario.loop.plant, requirement.quantity
+    if isinstance(quantity, Peak):
         own = {
             "torque": f"peak {plants.input_name(plant)}",
             "velocity_deficit": f"{plants.level_names(plant)[1]} margin",

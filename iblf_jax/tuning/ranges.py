@@ -231,14 +231,15 @@ def _is_time(scenario: Scenario, path: str) -> bool:
 
 
 def _is_of_chain(scenario: Scenario, path: str) -> bool:
-    """Whether a leaf is a positive number of a plant or model in strict-feedback form itself, such
-    as a stiffness or an inductance: the fastest mode of the loop depends on it.
+    """Whether a leaf is a positive number of a plant or model outside of its robot, such as a
+    stiffness or an inductance: the fastest mode of the loop depends on it.
     """
     part, _, own = path.partition(".")
     if part not in ("plant", "model") or own.startswith("robot."):
         return False
-    is_chain = plants.is_chain(getattr(scenario, part))
-    return is_chain and paths.sign_at(scenario, path) == "positive"
+    owner = vars(scenario)[part]
+    is_robot = plants.as_plant(owner).robot is owner
+    return not is_robot and paths.sign_at(scenario, path) == "positive"
 
 
 def _bound_at_start(scenario: Scenario, path: str, start: np.ndarray) -> End:

@@ -64,7 +64,6 @@ from iblf_jax.core.linalg import solve_spd
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.status import Status
 from iblf_jax.simulation.scenario import Scenario
-from iblf_jax.world import plants
 from iblf_jax.world.bounds import NARROWEST, Tube
 
 LOWEST = {1: 0.0, 2: 0.5}
@@ -106,7 +105,7 @@ class Matched(Theorem):
         law: Any = unwrapped(scenario.controller)
         if not isinstance(law, BarrierBackstepping) or law.order != 2 or law.filter is not None:
             return "(F.3) is about BarrierBackstepping of order 2 with exact derivatives"
-        if plants.is_chain(scenario.model):
+        if scenario.loop.model.uncertain_levels:
             return "(F.3) is about the torque on a robot"
         if not (checks.is_concrete(law.c) and np.all(np.asarray(law.c)[-1] > 0)):
             return "(F.3) needs c > 0 on the last level"

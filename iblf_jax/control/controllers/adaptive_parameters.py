@@ -482,14 +482,14 @@ def _points(context: LawContext, dtype: Any) -> tuple[jax.Array, jax.Array]:
     times = jnp.asarray(rng.uniform(0.0, 5.0, POINTS), dtype)
     spread = jnp.asarray(rng.uniform(-0.5, 0.5, (POINTS, plant.order, plant.n)), dtype)
     states = []
-    for t, (q, dq, *higher) in zip(times, spread, strict=True):
+    for t, (q, dq, *above_second) in zip(times, spread, strict=True):
         tube = context.tube(t)
         q = tube.q_d + q * jnp.minimum(tube.k_l, tube.k_u)
         dq = tube.dq_d + dq
         steady = plant.steady_levels(q, dq)
-        if steady is not None and higher:
-            higher = [*(jnp.stack(higher) + steady)]
-        states.append(jnp.stack([q, dq, *higher]))
+        if steady is not None and above_second:
+            above_second = [*(jnp.stack(above_second) + steady)]
+        states.append(jnp.stack([q, dq, *above_second]))
     return times, jnp.stack(states)
 
 

@@ -224,11 +224,11 @@ def _with_shifted_control(command: Command, order: int, value: jax.Array) -> Com
     """A command with lambda added to its virtual control of the last level, if it has one."""
     if order == 2:
         return command._replace(alpha=command.alpha + value)
-    higher = command.alpha_higher
-    if is_absent(higher):
+    rows = command.alpha_higher
+    if is_absent(rows):
         return command
-    last = (higher[-1] + value)[None]
-    return command._replace(alpha_higher=jnp.concatenate([higher[:-1], last]))
+    last = (rows[-1] + value)[None]
+    return command._replace(alpha_higher=jnp.concatenate([rows[:-1], last]))
 
 
 UNLIMITED = 1e6

@@ -17,7 +17,7 @@ from iblf_jax.core import families
 from iblf_jax.core.families import attribute, is_default
 from iblf_jax.core.pytree import Leaf, component
 from iblf_jax.core.time import Timed
-from iblf_jax.world.plants import Plant
+from iblf_jax.world.plants import Plant, robot_inside
 from iblf_jax.world.robots import Robot
 
 State = Any
@@ -188,18 +188,18 @@ class ObserverOfRobot(Observer):
 
     def init(self, x: jax.Array, model: Plant) -> State:
         """State of the observer."""
-        return self.observer.init(x[0], x[1], _robot_in(model))
+        return self.observer.init(x[0], x[1], robot_inside(model))
 
     def estimate(self, t: jax.Array, x: jax.Array, model: Plant, state: State) -> jax.Array:
         """f_hat, (n,) [N m]."""
-        return self.observer.estimate(t, x[0], x[1], _robot_in(model), state)
+        return self.observer.estimate(t, x[0], x[1], robot_inside(model), state)
 
     def derivative(
         self, t: jax.Array, x: jax.Array, u: jax.Array, model: Plant, state: State
     ) -> State:
         """Rate of the observer's state under the torque on the joints."""
         q, dq, tau = x[0], x[1], _torque_on_joints(model, x, u)
-        return self.observer.derivative(t, q, dq, tau, _robot_in(model), state)
+        return self.observer.derivative(t, q, dq, tau, robot_inside(model), state)
 
     def advance(
         self,
@@ -212,13 +212,7 @@ class ObserverOfRobot(Observer):
     ) -> State | None:
         """The observer's state a period later under the torque on the joints."""
         q, dq, tau = x[0], x[1], _torque_on_joints(model, x, u)
-        return self.observer.advance(t, q, dq, tau, _robot_in(model), state, period)
-
-
-def _robot_in(model: Plant) -> Robot:
-    """The robot inside a plant; a scenario does not accept an observer of robots without one."""
-    assert model.robot is not None
-    return model.robot
+        return self.observer.advance(t, q, dq, tau, robot_inside(model), state, period)
 
 
 def _torque_on_joints(model: Plant, x: jax.Array, u: jax.Array) -> jax.Array:

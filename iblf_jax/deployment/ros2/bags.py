@@ -181,7 +181,7 @@ def _check_robots(scenario: Scenario) -> None:
     not have all levels.
     """
     for name, part in (("plant", scenario.plant), ("model", scenario.model)):
-        if plants.is_chain(part):
+        if plants.as_plant(part).robot is not part:
             expected = "a robot, as joint states have positions and velocities only"
             remedy = "ij.deployment.bag_log reads the log without the signals of the law."
             raise checks.fail(f"scenario.{name}", type(part).__name__, expected, remedy)

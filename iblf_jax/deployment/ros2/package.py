@@ -113,7 +113,7 @@ def ros_options(scenario: Scenario, gains: Any, torque_limits: Any, on_fault: st
       ValueError: an invalid option, or a model with levels that no joint state has.
     """
     checks.one_of("on_fault", on_fault, POLICIES)
-    if plants.is_chain(scenario.model):
+    if scenario.loop.model.robot is not scenario.model:
         expected = "a robot, whose state is q and q'"
         remedy = "sensor_msgs/JointState has no further levels; export to C instead."
         raise checks.fail("scenario.model", type(scenario.model).__name__, expected, remedy)

@@ -9,6 +9,7 @@ from typing import Any
 
 from iblf_jax.world.plants._base import MAX_ORDER as MAX_ORDER
 from iblf_jax.world.plants._base import Dependence as Dependence
+from iblf_jax.world.plants._base import Notation as Notation
 from iblf_jax.world.plants._base import Plant as Plant
 from iblf_jax.world.plants._base import Units as Units
 from iblf_jax.world.plants._base import check_dependence as check_dependence
@@ -30,6 +31,7 @@ from iblf_jax.world.plants._base import level_names as level_names
 from iblf_jax.world.plants._base import level_rate as level_rate
 from iblf_jax.world.plants._base import nominal_of as nominal_of
 from iblf_jax.world.plants._base import order_of as order_of
+from iblf_jax.world.plants._base import robot_inside as robot_inside
 from iblf_jax.world.plants._base import robot_of as robot_of
 from iblf_jax.world.plants._base import speed_limit as speed_limit
 from iblf_jax.world.plants._base import state_of_levels as state_of_levels

@@ -63,11 +63,20 @@ class Plant(Dynamics):
     needs_filters: ClassVar[bool] = False
     """Whether the drift depends on a later level whose derivatives no law may form.  Such a plant
     is the model of a law with filters, and never the plant of a scenario."""
+    loses_input: ClassVar[bool] = True
+    """Whether a gain may become singular, so that the law's input has no value."""
 
     @attribute
     @abc.abstractmethod
     def order(self) -> int:
         """Number of levels r, at least 2."""
+
+    @attribute
+    def uncertain_levels(self) -> tuple[int, ...]:
+        """The levels whose rates contain a row of the uncertain term, all of them; () where it is
+        one torque.
+        """
+        return tuple(range(1, self.order + 1))
 
     @attribute
     def estimate_shape(self) -> tuple[int, ...]:
@@ -93,6 +102,11 @@ class Plant(Dynamics):
     def component_names(self) -> tuple[str, ...]:
         """Names of the n components; () for those of the joints of `robot`, or for numbers."""
         return ()
+
+    @attribute
+    def notation(self) -> Notation:
+        """How figures, tables and messages write the quantities of the plant."""
+        return Notation(self)
 
     @abc.abstractmethod
     def drift(self, t: jax.Array, x: jax.Array) -> jax.Array:
@@ -195,10 +209,57 @@ class Plant(Dynamics):
         return None
 
 
-def state_of_levels(q: jax.Array, dq: jax.Array, higher: Any) -> jax.Array:
+class Notation:
+    """How figures, tables and messages write the quantities of a plant: by the names of its levels
+    and of its input.
+
+    The `effort` of a comparison is that in figures; it has a heading of columns and a formula, too.
+    `levels` are the names that tables and files list.
+
+    Args:
+      plant: any.
+    """
+
+    symbols: ClassVar[tuple[str, str]] = ("x_1", "x_2")
+    """Of the first two levels, in figures."""
+    reference: ClassVar[str] = "x_d"
+    input: ClassVar[str] = "u"
+    alpha: ClassVar[str] = "virtual control of the second level"
+    difference: ClassVar[str] = "(in the unit of each level)"
+    """The unit of a difference of the state."""
+
+    def __init__(self, plant: Plant) -> None:
+        name = input_name(plant)
+        self.plant = plant
+        self.levels = level_names(plant)
+        self.portrait = f"Phase portrait: {self.levels[0]}"
+        self.input_column = name
+        self.effort_column = f"{name} above u_0"
+        self.effort = f"{name} above $u_0$"
+        self.effort_formula = f"{name} above its steady_input u_0(q), sqrt(mean |u - u_0(q)|^2)"
+
+    def component(self, level: int, index: int) -> str:
+        """A component of a level, such as "speed of pendulum"."""
+        return f"{level_names(self.plant)[level - 1]} of {component_names(self.plant)[index]}"
+
+    def numbered(self, level: int) -> str:
+        """A level by its number, and by its name if it has one."""
+        name = level_names(self.plant)[level - 1]
+        return name if name == f"level {level}" else f"level {level} ({name})"
+
+    def numbered_component(self, level: int, index: int) -> str:
+        """A component of a level, such as "Level 2 (speed) of pendulum"."""
+        return f"{self.numbered(level).capitalize()} of {component_names(self.plant)[index]}"
+
+    def left_bounds(self, level: int, index: int) -> str:
+        """That a component of a level left its bounds."""
+        return f"{self.numbered_component(level, index)} left its bounds"
+
+
+def state_of_levels(q: jax.Array, dq: jax.Array, above_second: Any) -> jax.Array:
     """The state x of a plant, (r, n), from its first two levels and the others."""
     first = jnp.stack([q, dq])
-    return first if is_absent(higher) else jnp.concatenate([first, higher])
+    return first if is_absent(above_second) else jnp.concatenate([first, above_second])
 
 
 def is_chain(part: Any) -> TypeGuard[Plant]:
@@ -256,6 +317,14 @@ def robot_of(part: Any) -> Any:
     if is_chain(part):
         return part.robot
     return part
+
+
+def robot_inside(plant: Plant) -> Robot:
+    """The robot inside a plant, for what a scenario has only with one: regions, and observers of
+    robots.
+    """
+    assert plant.robot is not None
+    return plant.robot
 
 
 def declared_joints(part: Any) -> tuple[str, ...]:

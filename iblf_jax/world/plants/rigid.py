@@ -12,7 +12,7 @@ from iblf_jax.core import checks
 from iblf_jax.core.linalg import inner, solve_spd
 from iblf_jax.core.pytree import component
 from iblf_jax.core.time import jump_times_of
-from iblf_jax.world.plants._base import Plant
+from iblf_jax.world.plants._base import Notation, Plant, component_names
 from iblf_jax.world.robots import Robot, inverse_dynamics, momentum
 
 
@@ -112,6 +112,13 @@ class RobotPlant(Rigid):
 
     is_robot = True
     reference_levels: ClassVar[int] = 2
+    loses_input: ClassVar[bool] = False
+    uncertain_levels: ClassVar[tuple[int, ...]] = ()
+
+    @property
+    def notation(self) -> Notation:
+        """That of the paper."""
+        return RobotNotation(self)
 
     @property
     def estimate_shape(self) -> tuple[int, ...]:
@@ -134,6 +141,39 @@ class RobotPlant(Rigid):
         if e2 is None:
             return 0.5 * inner(error, error)
         return 0.5 * (inner(e2, momentum(self.robot, x[0], e2)) + inner(error, error))
+
+
+class RobotNotation(Notation):
+    """The notation of the paper: q and q' of joints, and tau.
+
+    Args:
+      plant: a `RobotPlant`.
+    """
+
+    symbols: ClassVar[tuple[str, str]] = ("q", r"\dot q")
+    reference: ClassVar[str] = "q_d"
+    input: ClassVar[str] = r"\tau"
+    alpha: ClassVar[str] = "virtual velocity"
+    difference: ClassVar[str] = "rad/s"
+
+    def __init__(self, plant: Plant) -> None:
+        super().__init__(plant)
+        self.levels = ()
+        self.portrait = "Phase portrait of the positions"
+        self.input_column = "tau"
+        self.effort_column = "above gravity"
+        self.effort = "torque above gravity"
+        self.effort_formula = "torque above gravity, sqrt(mean |tau - G0(q)|^2)"
+
+    def component(self, level: int, index: int) -> str:
+        """A joint, such as "elbow"."""
+        return component_names(self.plant)[index]
+
+    def left_bounds(self, level: int, index: int) -> str:
+        """That a joint left its bounds, by its number and its name."""
+        name = component_names(self.plant)[index]
+        joint = name.capitalize() if name == f"joint {index}" else f"Joint {index} ({name})"
+        return f"{joint} left its {('bounds', 'velocity bounds')[level - 1]}"
 
 
 def robot_acceleration(robot: Robot, q: jax.Array, dq: jax.Array, torque: jax.Array) -> jax.Array:
