@@ -54,16 +54,12 @@ class GivenReference(Reference):
         s = t - self.t
         acceleration = self.ddq_d
         if self.further_d is not None:
-            acceleration = acceleration + _further_terms(s, self.further_d)
+            # The sum of 2 s^k/(k + 2)! times the derivative k + 2, from k = 1 on.
+            further = jnp.zeros_like(self.further_d[0])
+            for k in range(len(self.further_d), 0, -1):
+                further = s * (1.0 / (k + 2)) * (self.further_d[k - 1] + further)
+            acceleration = acceleration + further
         return self.q_d + s * (self.dq_d + 0.5 * s * acceleration)
-
-
-def _further_terms(s: jax.Array, derivatives: jax.Array) -> jax.Array:
-    """The sum of 2 s^k/(k + 2)! times the derivative k + 2, from k = 1 on, (n,)."""
-    total = jnp.zeros_like(derivatives[0])
-    for k in range(len(derivatives), 0, -1):
-        total = s * (1.0 / (k + 2)) * (derivatives[k - 1] + total)
-    return total
 
 
 class LawState(NamedTuple):
@@ -155,7 +151,14 @@ def start(scenario: Scenario, inputs: SampleInputs) -> tuple[LawState, jax.Array
 def sample(scenario: Scenario, inputs: SampleInputs, state: LawState) -> tuple[LawState, Outputs]:
     """One sample: the state for the next sample, and the outputs."""
     scenario = _with_reference(scenario, inputs)
-    measured, filtered = _measurement(scenario, inputs, state.velocity)
+    period = scenario.sampling.period  # type: ignore[union-attr]
+    levels = list(_levels(inputs))
+    filtered = []
+    for (row, velocity), before in zip(velocity_filters(scenario), state.velocity, strict=True):
+        normal = jnp.zeros((velocity.draws, scenario.n), inputs.q.dtype)
+        levels[row], after = velocity.estimate(levels[row - 1], levels[row], normal, period, before)
+        filtered.append(after)
+    measured = measurement_of(jnp.stack(levels))
     update = law_update(scenario, inputs.t, measured, state.controller, state.observer, state.sent)
     command = update.command
     tube = scenario.context.tube(inputs.t)
@@ -171,29 +174,13 @@ def sample(scenario: Scenario, inputs: SampleInputs, state: LawState) -> tuple[L
         jnp.any(command.saturated),
         infeasible,
     )
-    return LawState(update.controller, update.observer, filtered, update.sent), outputs
+    return LawState(update.controller, update.observer, tuple(filtered), update.sent), outputs
 
 
 def bounds_at(scenario: Scenario, inputs: SampleInputs) -> tuple[jax.Array, jax.Array]:
     """The lower and the upper bounds of the positions at the time of a sample, (n,) each [rad]."""
     tube = _with_reference(scenario, inputs).context.tube(inputs.t)
     return tube.lower, tube.upper
-
-
-def _measurement(
-    scenario: Scenario, inputs: SampleInputs, states: tuple[Any, ...]
-) -> tuple[Measurement, tuple[Any, ...]]:
-    """The levels of the inputs with the velocities of the sensor's filters, and the next states of
-    these.
-    """
-    period = scenario.sampling.period  # type: ignore[union-attr]
-    rows = list(_levels(inputs))
-    after = []
-    for (row, velocity), state in zip(velocity_filters(scenario), states, strict=True):
-        normal = jnp.zeros((velocity.draws, scenario.n), inputs.q.dtype)
-        rows[row], found = velocity.estimate(rows[row - 1], rows[row], normal, period, state)
-        after.append(found)
-    return measurement_of(jnp.stack(rows)), tuple(after)
 
 
 class VelocityFilter(NamedTuple):

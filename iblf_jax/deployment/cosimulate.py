@@ -111,7 +111,11 @@ def cosimulate(
         checks.one_of("integrator", integrator, INTEGRATORS)
     check_single(scenario)
     _check_robots(scenario)
-    _check_no_process_noise(scenario)
+    if scenario.process_noise is not None:
+        came = type(scenario.process_noise).__name__
+        expected = "None, as MuJoCo integrates the motion without noise"
+        remedy = "Take ij.with_parts(scenario, process_noise=None), or ij.simulate with the noise."
+        raise checks.fail("scenario.process_noise", came, expected, remedy)
     scenario = canonical(with_period(scenario, period))
     seed, throw = checks.seed(seed), checks.boolean("throw", throw)
     names = scenario.plant.joints
@@ -153,16 +157,6 @@ def _check_robots(scenario: Scenario) -> None:
             remedy += f" Take {name}=scenario.{name}.robot, and a law for robots."
         expected = "a robot, whose inputs are torques"
         raise checks.fail(f"scenario.{name}", type(part).__name__, expected, remedy)
-
-
-def _check_no_process_noise(scenario: Scenario) -> None:
-    """Raises ValueError for process noise, which MuJoCo's integrators do not have."""
-    noise = scenario.process_noise
-    if noise is None:
-        return
-    expected = "None, as MuJoCo integrates the motion without noise"
-    remedy = "Take ij.with_parts(scenario, process_noise=None), or ij.simulate with the noise."
-    raise checks.fail("scenario.process_noise", type(noise).__name__, expected, remedy)
 
 
 def own_step(period: float, robot: MujocoPlant) -> float:

@@ -185,12 +185,25 @@ def export(
         check_ros_name(name)
     check_single(scenario)
     if not is_loop:
-        scenario = _without_parts_of_the_plant(scenario)
+        # The program of a law ends with its command: the noise acts on the plant, and the delay
+        # belongs to the computer that runs the law.
+        if scenario.actuator.input_delay is not None:
+            scenario = dataclasses.replace(scenario, actuator=Ideal())
+        scenario = dataclasses.replace(scenario, process_noise=None)
     if not is_loop or period is not None:
         scenario = with_period(scenario, period)
-    scenario = canonical(astype(scenario, _available(dtype)))
+    jax_type = TYPES[dtype]
+    if jax.dtypes.canonicalize_dtype(jax_type) != jax_type:
+        expected = '"float", as JAX computes in float32 here'
+        remedy = 'Call jax.config.update("jax_enable_x64", True) first.'
+        raise checks.fail("dtype", dtype, expected, remedy)
+    scenario = canonical(astype(scenario, jax_type))
     if not is_loop:
-        _check_period(float(scenario.sampling.period))  # type: ignore[union-attr]
+        period = float(scenario.sampling.period)  # type: ignore[union-attr]
+        if not SHORTEST_PERIOD <= period <= LONGEST_PERIOD:
+            expected = f"a period of the law from {SHORTEST_PERIOD:g} to {LONGEST_PERIOD:g} s"
+            remedy = "The self-test contains a simulated run with this period."
+            raise checks.fail("period", period, expected, remedy)
     ros = None
     if target == "ros2":
         ros = ros_options(scenario, gains, torque_limits, on_fault)
@@ -203,17 +216,6 @@ def export(
     except UnsupportedError as error:
         came = f"what has no C ({error})"
         raise checks.fail("scenario", came, "a scenario whose operations are lowered") from None
-
-
-def _without_parts_of_the_plant(scenario: Scenario) -> Scenario:
-    """The scenario without process noise and without a delay of the input.
-
-    The program of a law ends with its command; the noise acts on the plant, and the delay belongs
-    to the computer that runs the law.
-    """
-    if scenario.actuator.input_delay is not None:
-        scenario = dataclasses.replace(scenario, actuator=Ideal())
-    return dataclasses.replace(scenario, process_noise=None)
 
 
 def _check_options(target: str, dtype: str, reference: str, is_loop: bool) -> None:
@@ -260,7 +262,12 @@ def _export_law(
     external_reference: bool,
     ros: RosOptions | None,
 ) -> Exported:
-    scenario_toml, notes = _scenario_toml(scenario)
+    scenario_toml: str | None = None
+    notes: tuple[str, ...] = ()
+    try:
+        scenario_toml = scenario_to_toml(scenario)
+    except ValueError as error:
+        notes = (f"scenario.toml left out: {error}",)
     law = Law(
         scenario=scenario,
         programs=control_law(scenario, external_reference),
@@ -325,32 +332,6 @@ def checked_name(name: Any, default: str) -> str:
     expected = f"a C identifier of at most {LONGEST_IDENTIFIER} characters"
     expected += " that is not reserved by C, its headers or CMake"
     raise checks.fail("name", name, expected, 'Such as name="arm_law".')
-
-
-def _check_period(period: float) -> None:
-    """Raises ValueError for a period that makes the run of the self-test too long."""
-    if not SHORTEST_PERIOD <= period <= LONGEST_PERIOD:
-        expected = f"a period of the law from {SHORTEST_PERIOD:g} to {LONGEST_PERIOD:g} s"
-        remedy = "The self-test contains a simulated run with this period."
-        raise checks.fail("period", period, expected, remedy)
-
-
-def _available(dtype: str) -> str:
-    """JAX's name of a C type; ValueError if JAX does not compute with it."""
-    jax_type = TYPES[dtype]
-    if jax.dtypes.canonicalize_dtype(jax_type) != jax_type:
-        expected = '"float", as JAX computes in float32 here'
-        remedy = 'Call jax.config.update("jax_enable_x64", True) first.'
-        raise checks.fail("dtype", dtype, expected, remedy)
-    return jax_type
-
-
-def _scenario_toml(scenario: Scenario) -> tuple[str | None, tuple[str, ...]]:
-    """The scenario as TOML, or None and the reason if a file cannot hold it."""
-    try:
-        return scenario_to_toml(scenario), ()
-    except ValueError as error:
-        return None, (f"scenario.toml left out: {error}",)
 
 
 def vectors(scenario: Scenario, external_reference: bool) -> Vectors:

@@ -40,21 +40,13 @@ def film_run(
       dt: the step [s].
       path: the file, ".gif" or ".html".
     """
-    renderer = _renderer(robot)
-    if renderer is None:
+    if not has_shapes(robot.model) or not _can_draw():
         return animate(run, path, FPS)
     times = frame_times((len(positions) - 1) * dt, FPS)
     shown = positions[np.round(times / dt).astype(int)]
-    with renderer:
+    with robot.mujoco.Renderer(robot.model, *SIZE) as renderer:
         pictures = [Image.fromarray(x) for x in _pictures(renderer, robot, shown)]
     return write_film(pictures, path, FPS)
-
-
-def _renderer(robot: MujocoPlant) -> Any:
-    """MuJoCo's renderer; None if MuJoCo cannot draw, or if the arm has no visible shapes."""
-    if not has_shapes(robot.model) or not _can_draw():
-        return None
-    return robot.mujoco.Renderer(robot.model, *SIZE)
 
 
 def has_shapes(model: Any) -> bool:

@@ -19,7 +19,6 @@ from iblf_jax.simulation import error_estimate
 from iblf_jax.simulation.closed_loop import initial_state
 from iblf_jax.simulation.noise import has_noise
 from iblf_jax.simulation.scenario import Scenario
-from iblf_jax.simulation.signals import Sample
 from iblf_jax.world import plants
 
 
@@ -57,12 +56,6 @@ def loop_outputs(scenario: Scenario) -> tuple[LoopOutput, ...]:
         rates = rate_units(name, known)
         found += [LoopOutput(x, unit, signal, i) for i, (x, unit) in enumerate(rates.items())]
     return tuple(found)
-
-
-def _value_of(output: LoopOutput, sample: Sample) -> jax.Array:
-    """The n numbers of an output in a sample."""
-    value = attributes(sample, [output.signal])[output.signal]
-    return value if output.row is None else value[output.row]
 
 
 UNLIMITED_STEPS = 2.0**52
@@ -121,7 +114,10 @@ def loop_program(scenario: Scenario, method: str) -> Loop:
         before = start(inputs, method, jnp.zeros((size, size), dtype))
         before = before._replace(state=state, status=status)
         done = advance(inputs, before, index, method, StepOptions(scalar=True))
-        values = [_value_of(output, done.sample) for output in loop_outputs(scenario)]
+        values = []
+        for output in loop_outputs(scenario):
+            value = attributes(done.sample, [output.signal])[output.signal]
+            values.append(value if output.row is None else value[output.row])
         outputs = (*values, done.carry.status.astype(dtype))
         return as_floats((done.carry.state, done.carry.status), dtype), outputs
 

@@ -165,7 +165,11 @@ def _gains(scenario: Scenario, given: Any) -> tuple[GainOption, ...]:
         remedy = "The period of a node is fixed: export once for each period."
         raise checks.fail("gains", PERIOD, expected, remedy)
     for item in tunables:
-        _check_tied(scenario, item)
+        value = np.asarray(paths.get(scenario, item.path), float)
+        if item.tied and np.any(value != value.flat[0]):
+            # One number would replace different ones.
+            remedy = f'Such as ij.with_parameters(scenario, {{"{item.path}": {value.flat[0]:g}}}).'
+            raise checks.fail(f"gains: {item.path}", value, "equal numbers for a tied gain", remedy)
     period = float(scenario.sampling.period)  # type: ignore[union-attr]
     blocks, box = layout(scenario, tunables, period, "rk4")
     low, high = in_units(blocks, box.low), in_units(blocks, box.high)
@@ -188,15 +192,6 @@ def _warn_of_default_range(gain: GainOption) -> None:
         " elsewhere or with other gains. Give limits that you have simulated:"
         f' ij.tunable("{gain.path}", low, high).'
     )
-
-
-def _check_tied(scenario: Scenario, item: Tunable) -> None:
-    """Raises ValueError for one number that would replace different ones."""
-    value = np.asarray(paths.get(scenario, item.path), float)
-    if not item.tied or np.all(value == value.flat[0]):
-        return
-    remedy = f'Such as ij.with_parameters(scenario, {{"{item.path}": {value.flat[0]:g}}}).'
-    raise checks.fail(f"gains: {item.path}", value, "equal numbers for a tied gain", remedy)
 
 
 def _range_end(given: Any, numbers: np.ndarray) -> np.ndarray:
@@ -243,18 +238,21 @@ def _offsets(scenario: Scenario, parameters: Parameters, path: str) -> np.ndarra
 def _description(law: Law, generated: GeneratedLaw, options: RosOptions) -> dict[str, Any]:
     """The content of `law.json`."""
     scenario = law.scenario
-    stiffness, damping = _hold_gains(scenario)
+    period = float(scenario.sampling.period)  # type: ignore[union-attr]
+    # The hold has critical damping of each joint alone at the start, to two digits.
+    bandwidth = min(HOLD_BANDWIDTH, HOLD_BANDWIDTH_TIMES_PERIOD / period)
+    inertia = np.diag(np.asarray(mass_matrix_at(scenario.model, scenario.initial.q)))
     return {
         "name": law.name,
         "version": __version__,
         "joints": list(law.joints or (f"joint_{i + 1}" for i in range(law.scenario.n))),
         "has_joint_names": bool(law.joints),
-        "period": float(scenario.sampling.period),  # type: ignore[union-attr]
+        "period": period,
         "reads_velocity": "dq" not in law.unread_levels,
         "torque_limits": options.torque_limits.tolist(),
         "on_fault": options.on_fault,
-        "hold_stiffness": stiffness,
-        "hold_damping": damping,
+        "hold_stiffness": [float(f"{x:.2g}") for x in bandwidth**2 * inertia],
+        "hold_damping": [float(f"{x:.2g}") for x in 2 * bandwidth * inertia],
         "gains": [_gain_row(scenario, generated.parameters, gain) for gain in options.gains],
     }
 
@@ -273,17 +271,6 @@ def _gain_row(scenario: Scenario, parameters: Parameters, gain: GainOption) -> d
         "high": gain.high.reshape(-1).tolist(),
         "offsets": offsets,
     }
-
-
-def _hold_gains(scenario: Scenario) -> tuple[list[float], list[float]]:
-    """Stiffness [N m/rad] and damping [N m s/rad] of the hold: critical damping of each joint
-    alone at the start, two digits.
-    """
-    period = float(scenario.sampling.period)  # type: ignore[union-attr]
-    bandwidth = min(HOLD_BANDWIDTH, HOLD_BANDWIDTH_TIMES_PERIOD / period)
-    inertia = np.diag(np.asarray(mass_matrix_at(scenario.model, scenario.initial.q)))
-    stiffness, damping = bandwidth**2 * inertia, 2 * bandwidth * inertia
-    return [float(f"{x:.2g}") for x in stiffness], [float(f"{x:.2g}") for x in damping]
 
 
 def _gain_lines(options: RosOptions) -> str:
