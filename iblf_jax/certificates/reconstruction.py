@@ -121,7 +121,11 @@ def steps_of(run: Any, grid: TimeGrid, claims: tuple[Claim, ...]) -> Iterator[St
     valid, sizes = is_valid(run), tolerances(run)
     blocks = _integrated_again(run, grid) if valid else _as_recorded(run, grid)
     for index, states in blocks:
-        steps = _with_terms(run, index, states, grid, claims)
+        t, padded = index.astype(run.t.dtype) * run.dt, padded_index(index.size)
+        padded_states = _rows(jax.tree.map(np.asarray, states), padded)
+        found = terms_along(run, index[padded], padded_states, claims)
+        terms, sample, defect, defect_f = _rows(found, slice(0, index.size))
+        steps = Steps(t, sample, terms, index % grid.record_every == 0, defect, defect_f)
         if valid:
             _check_signals(run, steps, index[steps.recorded] // grid.record_every, sizes)
         yield steps
@@ -259,18 +263,6 @@ def padded_index(size: int) -> np.ndarray:
     one compiled program serves blocks of every size.
     """
     return np.minimum(np.arange(BLOCK_STEPS), size - 1)
-
-
-def _with_terms(
-    run: Any, index: np.ndarray, states: LoopState, grid: TimeGrid, claims: tuple[Claim, ...]
-) -> Steps:
-    """The steps with the terms of some claims."""
-    size, padded = index.size, padded_index(index.size)
-    t = index.astype(run.t.dtype) * run.dt
-    padded_states = _rows(jax.tree.map(np.asarray, states), padded)
-    found = terms_along(run, index[padded], padded_states, claims)
-    terms, sample, defect, defect_f = _rows(found, slice(0, size))
-    return Steps(t, sample, terms, index % grid.record_every == 0, defect, defect_f)
 
 
 def terms_along(

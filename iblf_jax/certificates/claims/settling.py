@@ -257,7 +257,11 @@ class Settling(Claim):
         law: Any = summary.law
         course = Course(*map(np.concatenate, zip(*data, strict=True)))
         why_not = self.why_not_in_run(summary) or _why_not_from_the_start(summary, course)
-        band, deadline = _band(law), _deadline(law)
+        band = _band(law)
+        # The latest time of the decays that state one.
+        stated = [decay.deadline() for decay in law.decays]
+        ends = [float(np.max(np.asarray(time))) for time in stated if time is not None]
+        deadline = max(ends, default=np.inf)
         statements = []
         if np.isfinite(band):
             statements.append(TIME)
@@ -312,13 +316,6 @@ def _band(law: Any) -> float:
         if stated is not None:
             found.append(float(np.min(np.asarray(stated))))
     return min(found)
-
-
-def _deadline(law: Any) -> float:
-    """The latest time of the decays that state one [s]; infinite if none does."""
-    stated = [decay.deadline() for decay in law.decays]
-    times = [float(np.max(np.asarray(time))) for time in stated if time is not None]
-    return max(times, default=np.inf)
 
 
 def _note(rho2: float) -> str:

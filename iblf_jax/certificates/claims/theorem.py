@@ -208,7 +208,14 @@ class Theorem(TwoCases, MainClaim):
             if isinstance(law, Backstepping):
                 entry = entry._replace(dissipation=_dissipation_of_backstepping(point, terms.e[1]))
         if covers_limit(scenario):
-            entry = entry._replace(auxiliary=_auxiliary_terms(point))
+            # The terms of (A.3), with w s of the barrier on e1.
+            sample = point.sample
+            is_left_out = jnp.any(sample.guard_active)
+            if has(sample, "dq_lower"):
+                margin = margin_of(sample, 2, sample.alpha - sample.auxiliary)
+                is_left_out |= jnp.any(margin <= NARROWEST)
+            product = jnp.sum(point.now["s"] * sample.auxiliary)
+            entry = entry._replace(auxiliary=AuxiliaryTerms(product, is_left_out))
         return terms._replace(
             size=size,
             sqrt_V_size=sqrt_V_size,
@@ -397,7 +404,19 @@ class Theorem(TwoCases, MainClaim):
         lines = self.decay_lines(segment)
         if segment.terms.claims[TORQUE].auxiliary:
             lines.append(self._limited_inequality(segment))
-        return [*lines, *self._dropped_lines(segment), self._joints_inside(segment)]
+        lines += self._dropped_lines(segment)
+        # Properties (I) and (II): every joint inside its bounds.
+        summary = segment.summary
+        statement = Statement("joints inside", "(I), (II)", "|xi_i| < 1: -k_l < e1 < k_u")
+        case, why_unclaimed = self.case_of(summary), ""
+        if case is None and WEIGHTED.replaces_theorem(summary):
+            case = WEIGHTED.case_of(summary)
+        if case is None:
+            why_unclaimed = self.why_not_in_case(summary, summary.case)
+        elif np.all(np.isnan(xi_bound_along(segment, segment.terms.V))):
+            why_unclaimed = NO_BOUND
+        margins, flag = 1.0 - np.abs(segment.sample.xi), Status.BOUND_VIOLATED
+        return [*lines, stays_inside(segment, statement, margins, flag, why_unclaimed)]
 
     def bound_statements(self, summary: Summary) -> dict[str, Statement]:
         """The bounds that follow from the envelope, by name."""
@@ -508,20 +527,6 @@ class Theorem(TwoCases, MainClaim):
 
     # --- inside the bounds, curves ----------------------------------------------------------------
 
-    def _joints_inside(self, segment: Segment) -> Line:
-        """Properties (I) and (II): every joint inside its bounds, at every step."""
-        summary = segment.summary
-        statement = Statement("joints inside", "(I), (II)", "|xi_i| < 1: -k_l < e1 < k_u")
-        case, why_unclaimed = self.case_of(summary), ""
-        if case is None and WEIGHTED.replaces_theorem(summary):
-            case = WEIGHTED.case_of(summary)
-        if case is None:
-            why_unclaimed = self.why_not_in_case(summary, summary.case)
-        elif np.all(np.isnan(xi_bound_along(segment, segment.terms.V))):
-            why_unclaimed = NO_BOUND
-        margins = 1.0 - np.abs(segment.sample.xi)
-        return stays_inside(segment, statement, margins, Status.BOUND_VIOLATED, why_unclaimed)
-
     def traces(self, segment: Segment) -> Traces:
         """The curves of the figure.  For a law that has only a claim about itself, V and the left
         side are those of that claim.
@@ -630,15 +635,6 @@ def _dropped_terms(point: TorquePoint, terms: Terms) -> tuple[jax.Array, jax.Arr
     if isinstance(scenario.observer, AsPublished):
         by_observer = -terms.d_tilde @ (scenario.observer.kf * (dM0 @ state.dq))
     return by_law, by_observer
-
-
-def _auxiliary_terms(point: TorquePoint) -> AuxiliaryTerms:
-    """The terms of (A.3), with w s of the barrier on e1."""
-    sample = point.sample
-    excluded = jnp.any(sample.guard_active)
-    if has(sample, "dq_lower"):
-        excluded |= jnp.any(margin_of(sample, 2, sample.alpha - sample.auxiliary) <= NARROWEST)
-    return AuxiliaryTerms(jnp.sum(point.now["s"] * sample.auxiliary), excluded)
 
 
 def _dissipation_of_backstepping(point: TorquePoint, e2: jax.Array) -> Any:

@@ -89,20 +89,19 @@ class TwoCases(Claim):
 
     def decay_lines(self, segment: Segment) -> list[Line]:
         """The lines about the claimed decay at every step of one segment."""
-        lines = [self._inequality(segment, case) for case in CASES]
+        summary, terms, lines = segment.summary, segment.terms, []
+        for case in CASES:
+            statement, reason = self.inequalities[case], self.why_not_in_case(summary, case)
+            if reason:
+                lines.append(not_applicable(statement, reason))
+                continue
+            decay = summary.decay_bounds[self.key, case]
+            V = weighted_lyapunov(terms, decay.w_f)
+            size = max(1.0, decay.w_f) * terms.size + decay.rho * V
+            margins, note = -self.left_side(segment, case), self.exclusion_note(summary)
+            lines.append(check_steps(segment, statement, margins, summary.eps * size, note=note))
         lines += [self._envelope(segment, case) for case in CASES]
         return lines + self._bounds(segment)
-
-    def _inequality(self, segment: Segment, case: int) -> Line:
-        """The differential inequality, at every step."""
-        summary, terms, statement = segment.summary, segment.terms, self.inequalities[case]
-        reason = self.why_not_in_case(summary, case)
-        if reason:
-            return not_applicable(statement, reason)
-        decay = summary.decay_bounds[self.key, case]
-        size = max(1.0, decay.w_f) * terms.size + decay.rho * weighted_lyapunov(terms, decay.w_f)
-        margins, note = -self.left_side(segment, case), self.exclusion_note(summary)
-        return check_steps(segment, statement, margins, summary.eps * size, note=note)
 
     def _envelope(self, segment: Segment, case: int) -> Line:
         """The envelope of the Lyapunov function, at every step."""
