@@ -249,7 +249,18 @@ def check_supported(scenario: Scenario) -> None:
     if type(observer) is not observers.Momentum:
         reason = "The error of this observer does not obey f_tilde' = f' - kf f_tilde."
         raise unsupported("observer", type(observer).__name__, "observers.Momentum", reason)
-    _check_absent(scenario)
+    reasons = {
+        "sampling": CONTINUOUS,
+        "process_noise": "V_w' of a stochastic loop has further terms.",
+    }
+    check_absent(scenario, reasons, input="torque", rate="f'")
+    if scenario.bounds[1] is not None:
+        reason = "The level set bounds positions only."
+        raise unsupported("bounds[1]", "Bounds", "None", reason)
+    if scenario.regions:
+        names = ", ".join(type(region).__name__ for region in scenario.regions)
+        reason = "The level set bounds positions of joints only."
+        raise unsupported("regions", names, "()", reason)
     if isinstance(scenario.reference, WaypointSpline):
         reason = "The piece of a spline depends on the time, which is an interval here."
         expected = "a reference without pieces, such as references.Quintic"
@@ -294,22 +305,6 @@ def _check_law(law: Any) -> None:
         reason = "The level set needs the error at which V1 has a value, in closed form."
         expected = "a barrier with error_at, xi_bound and decay_rate"
         raise unsupported("controller.barrier", type(barrier).__name__, expected, reason)
-
-
-def _check_absent(scenario: Scenario) -> None:
-    """Raises ValueError for parts that the bound does not contain."""
-    reasons = {
-        "sampling": CONTINUOUS,
-        "process_noise": "V_w' of a stochastic loop has further terms.",
-    }
-    check_absent(scenario, reasons, input="torque", rate="f'")
-    if scenario.bounds[1] is not None:
-        reason = "The level set bounds positions only."
-        raise unsupported("bounds[1]", "Bounds", "None", reason)
-    if scenario.regions:
-        names = ", ".join(type(region).__name__ for region in scenario.regions)
-        reason = "The level set bounds positions of joints only."
-        raise unsupported("regions", names, "()", reason)
 
 
 # --- time, tube and mass matrix ------------------------------------------------------------------

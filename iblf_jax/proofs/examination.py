@@ -190,7 +190,10 @@ def operations(
         if eqn.primitive is primitives.scan_p and seen:
             return _of_scan(eqn, operands, rule, constant)
         if eqn.primitive is primitives.cond_p and not operands[0]:
-            return _of_branches(eqn, operands, rule, constant)
+            # A result depends on what it depends on in one of the branches; the choice is fixed.
+            branches = eqn.params["branches"]
+            results = [interpreted(branch, operands[1:], rule, constant) for branch in branches]
+            return [frozenset().union(*each) for each in zip(*results, strict=True)]
         kind = _kind(eqn, operands) if seen else None
         if kind is not None:
             found[kind].add(eqn.primitive.name)
@@ -241,14 +244,6 @@ def _of_scan(
         if merged == values[carry]:
             return [*merged, *results[carried:]]
         values[carry] = merged
-
-
-def _of_branches(
-    eqn: Any, operands: list[frozenset], rule: Callable, constant: Callable
-) -> list[frozenset]:
-    """The inputs on which a result of one of the branches depends; what chooses does not vary."""
-    found = [interpreted(branch, operands[1:], rule, constant) for branch in eqn.params["branches"]]
-    return [frozenset().union(*results) for results in zip(*found, strict=True)]
 
 
 ADVICE = (

@@ -72,7 +72,10 @@ def uncertain_coordinates(
         for path in str(group).split(",")
     }
     for path in separate:
-        _check_part(path)
+        if path.split(".")[0].split("[")[0] not in SUPPORTED_PARTS:
+            expected = "a parameter of the plant or the disturbance, such as plant.mass"
+            remedy = "Law and observer know their model and gains exactly."
+            raise checks.fail("parameters: path", path, expected, remedy)
     targets_of(scenario, separate, "parameters", intervals=True)
     index = _places_of_entries(scenario)
     entries, bases, slopes, references, low, high, names = [], [], [], [], [], [], []
@@ -98,8 +101,7 @@ def uncertain_coordinates(
     labels = [" and ".join(x) for x in names]
     labels += [f"disturbance_rate[{i}]" for i in range(len(rates))]
     numbers = Numbers(tuple(bases), tuple(slopes), jnp.asarray(references, float))
-    at_reference = _values_at_reference(entries, numbers)
-    places = Places(tuple(entries), _differing(scenario, at_reference), len(rates))
+    places = Places(tuple(entries), _differing(scenario, entries, numbers), len(rates))
     return Uncertain(
         places, numbers, np.array(low, float), np.array(high, float), tuple(labels), tuple(names)
     )
@@ -112,16 +114,6 @@ def _disturbance_rates(given: Any, n: int) -> np.ndarray:
     if rates.shape not in ((), (n,)) or not np.all(np.isfinite(rates)) or np.any(rates < 0):
         raise checks.fail("disturbance_rate", given, f"one number >= 0, or {n}, in N m/s")
     return np.broadcast_to(rates, (n,))
-
-
-def _check_part(path: str) -> None:
-    """Raises ValueError unless a path is one of the plant or the disturbance."""
-    first = path.split(".")[0].split("[")[0]
-    if first in SUPPORTED_PARTS:
-        return
-    expected = "a parameter of the plant or the disturbance, such as plant.mass"
-    remedy = "Law and observer know their model and gains exactly."
-    raise checks.fail("parameters: path", path, expected, remedy)
 
 
 def _entries_of(scenario: Scenario, path: str) -> list[str]:
@@ -179,21 +171,18 @@ def _places_of_entries(scenario: Scenario) -> dict[str, Place]:
     return found
 
 
-def _values_at_reference(entries: list[tuple[Place, ...]], numbers: Numbers) -> dict[Place, float]:
-    """The entries at the reference value of their coordinate."""
-    found: dict[Place, float] = {}
-    for k, together in enumerate(entries):
-        values = numbers.base[k] + numbers.slope[k] * numbers.reference[k]
-        found |= dict(zip(together, np.asarray(values).tolist(), strict=True))
-    return found
-
-
-def _differing(scenario: Scenario, at_reference: dict[Place, float]) -> tuple[Place, ...]:
+def _differing(
+    scenario: Scenario, entries: list[tuple[Place, ...]], numbers: Numbers
+) -> tuple[Place, ...]:
     """The entries that differ from those that the law knows.
 
     An entry of a coordinate is compared at the coordinate's reference value: entries that a `value`
     sets together have one value there, although their nominal values may differ.
     """
+    at_reference: dict[Place, float] = {}
+    for k, together in enumerate(entries):
+        at = numbers.base[k] + numbers.slope[k] * numbers.reference[k]
+        at_reference |= dict(zip(together, np.asarray(at).tolist(), strict=True))
     actual = jax.tree.leaves((scenario.plant, scenario.disturbance))
     known = jax.tree.leaves((scenario.model, scenario.disturbance))
     found = []
