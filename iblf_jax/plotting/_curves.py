@@ -297,13 +297,19 @@ class Curve:
           field: the signal of the panel.
           entry: the joint, or the region, of the panel.
         """
+        own, bounded = SAME_BOUNDS.get(field, field), self._bounded_signals()
+        concerned = [name for name in bounded if name not in WITHOUT_JOINT]
+        if own in bounded:
+            concerned = [own]
+        elif own in WITHOUT_JOINT:
+            concerned = []
         exits = []
-        for name in self._bounded_by(field):
+        for name in concerned:
             outside = np.flatnonzero(self._outside(name)[:, entry])
             exits += outside[:1].tolist()
         if exits:
             return min(exits)
-        has_exit = any(self._outside(name).any() for name in self._bounded_signals())
+        has_exit = any(self._outside(name).any() for name in bounded)
         if self.diverged and not has_exit:
             return self.samples - 1
         return None
@@ -318,16 +324,6 @@ class Curve:
         if self.has_regions:
             names.append("region_margin")
         return names
-
-    def _bounded_by(self, field: str) -> list[str]:
-        """The bounded signals that concern the panel of a signal."""
-        own = SAME_BOUNDS.get(field, field)
-        bounded = self._bounded_signals()
-        if own in bounded:
-            return [own]
-        if own in WITHOUT_JOINT:
-            return []
-        return [name for name in bounded if name not in WITHOUT_JOINT]
 
     def _outside(self, field: str) -> np.ndarray:
         """Whether a bounded signal touches or leaves its bounds, (T, n) bool."""
@@ -366,21 +362,19 @@ def rounding_error(curves: Sequence[Curve], field: str) -> float:
       curves: the runs.
       field: the signal; "xi" is relative to the bounds, so that its scale is 1.
     """
+    level = LEVEL_SIGNAL.fullmatch(field)
     errors = []
     for curve in curves:
+        # The size of the numbers from which the signal is computed.
+        if field == "xi":
+            size = 1.0
+        elif level is not None and level[2] == "estimate":
+            size = curve.largest_rate(int(level[1]))
+        else:
+            size = max(curve.largest(name) for name in COMPUTED_FROM.get(field, (field,)))
         unit_in_last_place = float(np.finfo(curve[field].dtype).eps)
-        errors.append(ROUNDING * unit_in_last_place * _scale_of(curve, field))
+        errors.append(ROUNDING * unit_in_last_place * size)
     return max(errors)
-
-
-def _scale_of(curve: Curve, field: str) -> float:
-    """The size of the numbers from which a signal is computed."""
-    if field == "xi":
-        return 1.0
-    level = LEVEL_SIGNAL.fullmatch(field)
-    if level is not None and level[2] == "estimate":
-        return curve.largest_rate(int(level[1]))
-    return max(curve.largest(name) for name in COMPUTED_FROM.get(field, (field,)))
 
 
 class Peak(NamedTuple):

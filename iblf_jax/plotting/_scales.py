@@ -41,16 +41,6 @@ LINEAR = Scale("linear", {}, lambda x: x, lambda x: x)
 LOGARITHMIC = Scale("log", {}, np.log10, lambda y: 10.0**y)
 
 
-def _logarithmic_on_both_sides(linear_up_to: float) -> Scale:
-    """The scale of values of both signs that is linear up to a size."""
-    return Scale(
-        "symlog",
-        {"linthresh": linear_up_to},
-        lambda x: np.arcsinh(x / linear_up_to),
-        lambda y: linear_up_to * np.sinh(y),
-    )
-
-
 def varies(x: np.ndarray) -> bool:
     """Whether the finite ones of some numbers differ by more than rounding errors."""
     x = _finite(x)
@@ -79,7 +69,12 @@ def scale_of(x: Any) -> Scale:
         usual = float(np.quantile(np.abs(values), 0.75))
         if usual == 0.0:
             return LINEAR
-        other = _logarithmic_on_both_sides(usual)
+        other = Scale(
+            "symlog",
+            {"linthresh": usual},
+            lambda x: np.arcsinh(x / usual),
+            lambda y: usual * np.sinh(y),
+        )
     if _middle_share(other, values) > GAIN * _middle_share(LINEAR, values):
         return other
     if _is_in_corner(LINEAR, values) and not _is_in_corner(other, values):

@@ -143,7 +143,10 @@ def _draw_heat_map(
     image = axes.imshow(picture, origin="lower", aspect="auto", cmap=_style.colour_map(COLOURS))
     axes.grid(visible=False)
     for axis, name in ((axes.xaxis, x), (axes.yaxis, y)):
-        _ticks(axis, np.asarray(data[name].values))
+        numbers = np.asarray(data[name].values)
+        last = len(numbers) - 1
+        places = np.unique(np.linspace(0, last, min(last + 1, 12)).round().astype(int))
+        axis.set_ticks(places, labels=[f"{numbers[i]:.4g}" for i in places])
     axes.set_xlabel(_axis_label(data, x))
     axes.set_ylabel(_axis_label(data, y))
     figure.colorbar(image, ax=axes, label=label)
@@ -160,11 +163,6 @@ def _equality(metric: str, picture: np.ndarray) -> str:
     if metric in MARGINS:
         return "equal at all points, as margins of the start (t = 0) are"
     return "equal at all points"
-
-
-def _ticks(axis: Any, values: np.ndarray) -> None:
-    places = np.unique(np.linspace(0, len(values) - 1, min(len(values), 12)).round().astype(int))
-    axis.set_ticks(places, labels=[f"{values[i]:.4g}" for i in places])
 
 
 def _write_numbers(axes: Any, picture: np.ndarray, image: Any) -> None:

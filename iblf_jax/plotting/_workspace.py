@@ -132,31 +132,22 @@ def _draw_in_plane(axes: Any, region: Region, limits: np.ndarray, style: dict[st
 
 def _draw_in_space(axes: Any, region: Region, limits: np.ndarray, style: dict[str, Any]) -> None:
     if isinstance(region, HalfSpace):
-        _draw_plane(axes, region, limits, style)
+        corners = _plane_in_box(np.asarray(region.normal), float(region.offset), limits)
+        if len(corners):
+            edge = {"edgecolor": style["color"], "linestyle": style["linestyle"]}
+            polygon = Poly3DCollection([corners], facecolor=style["color"], alpha=0.13, **edge)
+            axes.add_collection3d(polygon)
     elif isinstance(region, Sphere):
-        _draw_sphere(axes, region, limits, style)
-
-
-def _draw_plane(axes: Any, region: HalfSpace, limits: np.ndarray, style: dict[str, Any]) -> None:
-    corners = _plane_in_box(np.asarray(region.normal), float(region.offset), limits)
-    if len(corners):
-        edge = {"edgecolor": style["color"], "linestyle": style["linestyle"]}
-        polygon = Poly3DCollection([corners], facecolor=style["color"], alpha=0.13, **edge)
-        axes.add_collection3d(polygon)
-
-
-def _draw_sphere(axes: Any, region: Sphere, limits: np.ndarray, style: dict[str, Any]) -> None:
-    theta, phi = np.meshgrid(
-        np.linspace(0.0, np.pi, SPHERE_CIRCLES[0]),
-        np.linspace(0.0, 2 * np.pi, SPHERE_CIRCLES[1]),
-        indexing="ij",
-    )
-    unit = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)])
-    points = np.asarray(region.centre)[:, None, None] + float(region.radius) * unit
-    inside = np.all((points >= limits[:, :1, None]) & (points <= limits[:, 1:, None]), axis=0)
-    visible = np.where(inside, points, np.nan)
-    for circles in (visible.transpose(1, 0, 2), visible.transpose(2, 0, 1)):
-        for circle in circles:
+        theta, phi = np.meshgrid(
+            np.linspace(0.0, np.pi, SPHERE_CIRCLES[0]),
+            np.linspace(0.0, 2 * np.pi, SPHERE_CIRCLES[1]),
+            indexing="ij",
+        )
+        unit = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)])
+        points = np.asarray(region.centre)[:, None, None] + float(region.radius) * unit
+        inside = np.all((points >= limits[:, :1, None]) & (points <= limits[:, 1:, None]), axis=0)
+        visible = np.where(inside, points, np.nan)
+        for circle in (*visible.transpose(1, 0, 2), *visible.transpose(2, 0, 1)):
             axes.plot(*circle, **style, linewidth=0.5, alpha=0.6, label="_")
 
 
