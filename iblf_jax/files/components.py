@@ -272,19 +272,17 @@ def decode_fields(cls: Any, table: Any, path: str) -> Any:
     for name, field in fields.items():
         key = dotted(path, name)
         if name in table:
-            values[name] = _decode_field(table[name], field, hints.get(name, Any), key)
+            hint = hints.get(name, Any)
+            if field.metadata.get("static"):
+                values[name] = decode_static(table[name], hint, key)
+            elif is_leaf_field(field):
+                values[name] = numbers(table[name], key, field.metadata["unit"])
+            else:
+                values[name] = decode(table[name], hint, key)
         elif field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
             remedy = f"Add {name} to [{path}]; {cls.__name__} has no default for it."
             raise missing(key, _expectation(field), remedy)
     return construct(cls, values, path)
-
-
-def _decode_field(value: Any, field: dataclasses.Field, hint: Any, key: str) -> Any:
-    if field.metadata.get("static"):
-        return decode_static(value, hint, key)
-    if not is_leaf_field(field):
-        return decode(value, hint, key)
-    return numbers(value, key, field.metadata["unit"])
 
 
 SHAPES = {

@@ -35,7 +35,10 @@ def dataset_digests(data: xarray.Dataset) -> dict[str, str]:
     """
     found = {}
     for name, variable in data.variables.items():
-        found[f"variable {name}"] = _variable_digest(str(name), variable)
+        values = np.asarray(variable.values)
+        dims, shape = list(map(str, variable.dims)), list(values.shape)
+        head = [str(name), dims, shape, _kind(values), _canonical(variable.attrs)]
+        found[f"variable {name}"] = _hexadecimal(head, _bytes(values))
     coordinates = sorted(str(name) for name in data.coords)
     found[ATTRIBUTES] = _hexadecimal([_canonical(data.attrs), coordinates])
     return found
@@ -82,13 +85,6 @@ def differences(stored: str, data: Mapping[str, xarray.Dataset]) -> list[str]:
             if before.get(part) != now.get(part):
                 words.append(f"{part} of run {name!r}")
     return words
-
-
-def _variable_digest(name: str, variable: Any) -> str:
-    values = np.asarray(variable.values)
-    dims, shape = list(map(str, variable.dims)), list(values.shape)
-    head = [name, dims, shape, _kind(values), _canonical(variable.attrs)]
-    return _hexadecimal(head, _bytes(values))
 
 
 def _kind(values: np.ndarray) -> str:

@@ -106,18 +106,13 @@ def _described(value: Any) -> Any:
     if type(value) in (list, tuple):
         return {type(value).__name__: [_described(x) for x in value]}
     if modules.is_module(value):
-        return _described_object(value)
+        if not dataclasses.is_dataclass(value) or modules.is_component(value):
+            raise _NoImportPathError(value)
+        fields = {f.name: _described(vars(value)[f.name]) for f in dataclasses.fields(value)}
+        return {"class": _import_path(type(value)), "fields": fields}
     if callable(value):
         return {"import": _import_path(value)}
     raise _NoImportPathError(value)
-
-
-def _described_object(value: Any) -> Any:
-    """The structure of an object of a registered dataclass."""
-    if not dataclasses.is_dataclass(value) or modules.is_component(value):
-        raise _NoImportPathError(value)
-    fields = {f.name: _described(vars(value)[f.name]) for f in dataclasses.fields(value)}
-    return {"class": _import_path(type(value)), "fields": fields}
 
 
 def _import_path(value: Any) -> str:

@@ -208,7 +208,11 @@ def load(path: str | os.PathLike, *, modules: Mapping[str, Any] | None = None) -
     try:
         with _opened(place) as archive:
             if ARRAY_OF_ATTRIBUTES not in archive.namelist():
-                return _loaded(archive, modules)
+                description = _described(archive)
+                reader = _Reader(archive, dict(modules or {}))
+                result = reader.value(description["result"], "result")
+                reader.check_modules()
+                return result
     except ValueError as error:
         raise checks.with_location(place, error) from error
     return load_rollouts(place, modules=modules)
@@ -384,15 +388,6 @@ def _opened(place: Path) -> zipfile.ZipFile:
     except Exception as error:  # A damaged directory raises errors of many kinds.
         found = f"{type(error).__name__}: {error}"
         raise checks.fail("file", Words("no archive"), EXPECTED, found) from error
-
-
-def _loaded(archive: zipfile.ZipFile, modules: Mapping[str, Any] | None) -> Any:
-    """The result in an archive."""
-    description = _described(archive)
-    reader = _Reader(archive, dict(modules or {}))
-    result = reader.value(description["result"], "result")
-    reader.check_modules()
-    return result
 
 
 def _described(archive: zipfile.ZipFile) -> dict[str, Any]:
