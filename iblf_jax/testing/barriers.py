@@ -206,7 +206,10 @@ def _grows_without_bound(
     V1 is evaluated at three distances from the bound, each a tenth of the one before. Where it has
     a limit, its increments fall with the distance or a power of it; those of a logarithm are equal.
     """
-    sharp = _with_guard(barrier, SMALL_GUARD)
+    try:
+        sharp = dataclasses.replace(barrier, guard=SMALL_GUARD)
+    except (TypeError, ValueError):  # Its class takes no guard.
+        sharp = barrier
     nearest = 2.0 * max(sharp.guard, SMALL_GUARD)
     if sharp.guard == -math.inf or 100.0 * nearest >= 1.0:
         return
@@ -220,14 +223,6 @@ def _grows_without_bound(
         "A barrier grows without bound as |xi| -> 1, or a disturbance carries the joint across; a"
         " V1 that does not states guard = -math.inf",
     )
-
-
-def _with_guard(barrier: Any, guard: float) -> Any:
-    """The barrier with another guard, or itself if its class does not take one."""
-    try:
-        return dataclasses.replace(barrier, guard=guard)
-    except (TypeError, ValueError):
-        return barrier
 
 
 SMALL_GUARD = 1e-7

@@ -55,7 +55,12 @@ def check_sensor(sensor: Any, *, n: int | None = None) -> None:
     """
     with examine_joints(sensor, contract_of(sensor), n, "sensor") as (findings, fitted, joints):
         rng = np.random.default_rng(3)
-        given = _state_for(fitted, rng, joints)
+        # A random state as the sensor receives it: (q, q'), or (x,).
+        if isinstance(fitted, Sensor):
+            order = fitted.order or DEFAULT_LEVELS
+            given = (jnp.asarray(rng.uniform(-1, 1, (order, joints))),)
+        else:
+            given = tuple(jnp.asarray(rng.uniform(-1, 1, (2, joints))))
         normal, period = jnp.asarray(rng.normal(size=(fitted.draws, joints))), jnp.asarray(1e-3)
         in_both_types(findings, _measures, fitted, given, normal, period)
 
@@ -66,14 +71,6 @@ def check_sensor(sensor: Any, *, n: int | None = None) -> None:
             return found | {"q": measured.q, "dq": measured.dq} | leaves_by_name("state", state)
 
         check_function(findings, outputs, fitted, (given, normal, period))
-
-
-def _state_for(sensor: Any, rng: np.random.Generator, joints: int) -> tuple[jax.Array, ...]:
-    """A random state as the sensor receives it: (q, q'), or (x,)."""
-    if not isinstance(sensor, Sensor):
-        return tuple(jnp.asarray(rng.uniform(-1, 1, (2, joints))))
-    order = sensor.order or DEFAULT_LEVELS
-    return (jnp.asarray(rng.uniform(-1, 1, (order, joints))),)
 
 
 def _measures(findings: Findings, sensor, given, normal, period) -> None:

@@ -35,18 +35,10 @@ DEFAULT_LEVELS = 4
 
 def joints_of(member: Any, default: int = DEFAULT_JOINTS) -> int:
     """The number of joints of a member's leaves; the default if they are scalars or disagree."""
-    sizes = _sizes(member)
+    sizes = set(_declared_sizes(member))
+    if not sizes:
+        sizes = {np.shape(leaf)[0] for leaf in _undeclared(member) if np.ndim(leaf) == 1}
     return sizes.pop() if len(sizes) == 1 else default
-
-
-def _sizes(member: Any) -> set[int]:
-    """Lengths of the leaves that are declared as one number per joint; of all vectors if there are
-    none.
-    """
-    declared = set(_declared_sizes(member))
-    if declared:
-        return declared
-    return {np.shape(leaf)[0] for leaf in _undeclared(member) if np.ndim(leaf) == 1}
 
 
 def _declared_sizes(member: Any) -> Iterator[int]:

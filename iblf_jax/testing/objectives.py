@@ -77,7 +77,11 @@ def check_objective(
             objective = Objective((), (Requirement(objective, limit, limit),))
     with examine(objective, "Objective", Objective) as findings:
         scenario = scenario_for(findings, objective, scenario, n)
-    objective = _with_joints(objective, scenario)
+    with examine(objective, "Objective", Objective) as findings:
+        try:
+            objective = for_scenario(objective, scenario)
+        except ValueError as error:  # It selects joints that the scenario does not have.
+            findings.add(str(error))
     for quantity in objective.quantities:
         selects = isinstance(quantity, TimeIntegral | Peak | MetricResult)
         joints = scenario.n if selects else joints_of(quantity)
@@ -91,16 +95,6 @@ def check_objective(
         )
         findings.stop_if_any()
         _on_a_run(findings, in_dtype(objective, "float64"), scenario, duration)
-
-
-def _with_joints(objective: Objective, scenario: Scenario) -> Objective:
-    """The objective for the joints of the scenario's robot; a finding if it selects others."""
-    with examine(objective, "Objective", Objective) as findings:
-        try:
-            return for_scenario(objective, scenario)
-        except ValueError as error:
-            findings.add(str(error))
-    return objective
 
 
 def _quantity(findings: Findings, quantity: Any, duration: float, n: int) -> None:

@@ -57,7 +57,10 @@ def check_plant(plant: Any, *, x: Any = None) -> None:
       ValueError: `x` is not an array of shape (m, order, n).
     """
     with examine(plant, "Plant", Plant) as findings:
-        _dimensions(findings, plant)
+        try:
+            plants.check_dimensions(type(plant).__name__, plant)
+        except ValueError as error:
+            findings.stop(str(error).removesuffix("."))
         plant = fit_joints(in_dtype(plant, "float64"), plant.n, "plant")
         points = _points(plant, x)
         t = jnp.asarray(0.7)
@@ -67,16 +70,11 @@ def check_plant(plant: Any, *, x: Any = None) -> None:
         vectors = jnp.asarray(rng.normal(size=(2, plant.n)))
         check_function(findings, _functions, plant, (t, points[0]))
         found = jax.jit(jax.vmap(_identities, in_axes=(None, None, 0, None, None)))
-        values = found(plant, t, points, *vectors)
-        _agreement(findings, {name: np.asarray(value) for name, value in values.items()})
-
-
-def _dimensions(findings: Findings, plant: Any) -> None:
-    """Requires whole numbers of components and levels, and names and units that fit them."""
-    try:
-        plants.check_dimensions(type(plant).__name__, plant)
-    except ValueError as error:
-        findings.stop(str(error).removesuffix("."))
+        # Optional members must agree with drift and gain.
+        for name, difference in found(plant, t, points, *vectors).items():
+            problem, remedy = REMEDIES[name]
+            off = float(np.max(np.abs(np.asarray(difference))))
+            findings.require(off <= TOLERANCE, f"{problem} (by {off:.2g})", remedy)
 
 
 def _points(plant: Any, x: Any) -> jax.Array:
@@ -151,7 +149,12 @@ def _structure(findings: Findings, plant: Any, t: jax.Array, points: jax.Array) 
     if not plant.needs_filters:
         _dependence(findings, plant, t, points)
     gains = np.asarray(jax.vmap(lambda x: plant.gain(t, x))(points))
-    _finite_gains(findings, gains, points)
+    finite = np.isfinite(gains).reshape(*gains.shape[:2], -1).all(axis=-1)
+    if not finite.all():
+        point, row = np.argwhere(~finite)[0]
+        state = np.array2string(np.asarray(points[point]).ravel(), precision=4, threshold=8)
+        problem = f"row {row} of gain(t, x) is not finite at x = {state}"
+        findings.stop(problem, f"Look at roots and divisions. {PART}")
     for i in range(plant.order):
         matrices = gains[:, i]
         if gains.ndim == 3:
@@ -165,17 +168,6 @@ def _structure(findings: Findings, plant: Any, t: jax.Array, points: jax.Array) 
     problem = f"a derivative of order up to {plant.order - 1} of drift or gain is not finite"
     remedy = f"Laws differentiate them that often: look at roots, norms and divisions. {PART}"
     findings.require(np.isfinite(np.asarray(slopes)).all(), problem, remedy)
-
-
-def _finite_gains(findings: Findings, gains: np.ndarray, points: jax.Array) -> None:
-    """Stops the check at the first row of a gain that is not finite, with its state."""
-    finite = np.isfinite(gains).reshape(*gains.shape[:2], -1).all(axis=-1)
-    if finite.all():
-        return
-    point, row = np.argwhere(~finite)[0]
-    state = np.array2string(np.asarray(points[point]).ravel(), precision=4, threshold=8)
-    problem = f"row {row} of gain(t, x) is not finite at x = {state}"
-    findings.stop(problem, f"Look at roots and divisions. {PART}")
 
 
 def _derivatives_along(plant: Any, t: jax.Array, x: jax.Array) -> jax.Array:
@@ -253,11 +245,3 @@ REMEDIES = {
     ),
 }
 """Optional member -> the problem where it does not agree with the others, and the remedy."""
-
-
-def _agreement(findings: Findings, differences: dict[str, np.ndarray]) -> None:
-    """Requires that optional members agree with drift and gain."""
-    for name, difference in differences.items():
-        problem, remedy = REMEDIES[name]
-        size = float(np.max(np.abs(difference)))
-        findings.require(size <= TOLERANCE, f"{problem} (by {size:.2g})", remedy)

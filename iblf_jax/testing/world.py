@@ -260,17 +260,12 @@ def check_disturbance(
         has_shape(findings, "jump_times()", jumps, one_axis)
         findings.stop_if_any()
         check_function(findings, lambda d, *args: {label: d.torque(*args)}, fitted, arguments)
-        known = _finite_jump_times(findings, fitted)
-        jump = find_jump(lambda t: fitted.torque(t, *arguments[1:]), 0.0, duration, known)
+        times = np.asarray(fitted.jump_times(), float)
+        remedy = "Return finite times, or an empty array"
+        findings.require(np.all(np.isfinite(times)), f"jump_times() has {times}", remedy)
+        findings.stop_if_any()
+        jump = find_jump(lambda t: fitted.torque(t, *arguments[1:]), 0.0, duration, tuple(times))
         if jump is not None:
             remedy = "Return that time in jump_times(): steps of a run are divided there"
             problem = f"the torque jumps at t = {jump:.6g} s, which is not one of jump_times()"
             findings.add(problem, remedy)
-
-
-def _finite_jump_times(findings: Findings, disturbance: Any) -> tuple[float, ...]:
-    times = np.asarray(disturbance.jump_times(), float)
-    remedy = "Return finite times, or an empty array"
-    findings.require(np.all(np.isfinite(times)), f"jump_times() has {times}", remedy)
-    findings.stop_if_any()
-    return tuple(times)
