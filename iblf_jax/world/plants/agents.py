@@ -91,23 +91,17 @@ class Agents(Plant):
             remedy = "An agent has no position relative to itself."
             raise checks.fail("Agents.adjacency", self.adjacency, "a zero diagonal", remedy)
         _check_reached(adjacency, leader)
-        self._check_equal()
-        check_dimensions("Agents", self)
-
-    def _check_equal(self) -> None:
-        """Raises ValueError for agents of different orders, sizes or units of the first level."""
-        first = self.agents[0]
-        for i, agent in enumerate(self.agents):
+        first = agents[0]
+        for i, agent in enumerate(agents):
             for name, got, expected in (
                 ("order", agent.order, first.order),
                 ("n", agent.n, first.n),
                 ("units[0]", units_of(agent)[0], units_of(first)[0]),
             ):
-                if got == expected:
-                    continue
-                raise checks.fail(
-                    f"Agents.agents[{i}].{name}", got, f"{expected!r}, as agents[0] has"
-                )
+                if got != expected:
+                    expected = f"{expected!r}, as agents[0] has"
+                    raise checks.fail(f"Agents.agents[{i}].{name}", got, expected)
+        check_dimensions("Agents", self)
 
     # --- the graph --------------------------------------------------------------------------------
 
@@ -243,7 +237,8 @@ class Agents(Plant):
     def transposed_gain(self, level: int, t: jax.Array, x: jax.Array, s: jax.Array) -> jax.Array:
         """G_i^T s, (n,)."""
         if level == 1:
-            s = jnp.concatenate(sparse.times(_transposed(self.matrix), self._parts(s)))
+            transposed = tuple(zip(*self.matrix, strict=True))
+            s = jnp.concatenate(sparse.times(transposed, self._parts(s)))
         return jnp.concatenate(self._each(transposed_gain, level, t, x, s))
 
     def _each(self, function: Callable, level: int, t: jax.Array, x: jax.Array, *vectors: Any):
@@ -473,10 +468,6 @@ def _check_reached(adjacency: np.ndarray, leader: np.ndarray) -> None:
 
 
 # --- small functions ------------------------------------------------------------------------------
-
-
-def _transposed(matrix: sparse.Rows) -> sparse.Rows:
-    return tuple(zip(*matrix, strict=True))
 
 
 def _joined(parts: list[jax.Array | None], axis: int) -> jax.Array | None:

@@ -131,10 +131,7 @@ class MarkovSwitched:
         # Written out, XLA repeats the earlier switches in the code of every later one.
         start = jnp.zeros((), Q.dtype), jnp.full((), self.start, Q.dtype)
         _, (times, sequence) = jax.lax.scan(switch, start, uniforms.astype(Q.dtype))
-        return self._with(times, sequence)
-
-    def _with(self, times: jax.Array, sequence: jax.Array) -> MarkovSwitched:
-        """A copy with another path, without checks: its numbers may be traced."""
+        # A copy without checks: its numbers may be traced.
         new = copy.copy(self)
         object.__setattr__(new, "times", times)
         object.__setattr__(new, "sequence", sequence)

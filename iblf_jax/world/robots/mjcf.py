@@ -197,17 +197,13 @@ def _copy(source: ET.Element, target: ET.Element, section: str) -> None:
             kept = COUPLING
         attributes = {name: text for name, text in element.items() if name in kept.split()}
         for name, text in attributes.items():
-            if name not in WORDS.split() and text not in SWITCHES:
-                _check_numbers(f"{label(element)}: {name}", name, text)
+            if name in WORDS.split() or text in SWITCHES:
+                continue
+            count = 1 if name in SCALAR_ATTRIBUTES.split() else None
+            most = MAX_RANGE if name in RANGE_ATTRIBUTES.split() else LARGEST_NUMBER
+            longest = MAX_BYTES if name in LONG_ATTRIBUTES.split() else MAX_NUMBERS
+            floats(f"{label(element)}: {name}", text, count, most=most, longest=longest)
         _copy(element, ET.SubElement(target, tag, attributes), section or tag)
-
-
-def _check_numbers(where: str, name: str, text: str) -> None:
-    """Raises ValueError unless an attribute holds numbers within its limits."""
-    count = 1 if name in SCALAR_ATTRIBUTES.split() else None
-    most = MAX_RANGE if name in RANGE_ATTRIBUTES.split() else LARGEST_NUMBER
-    longest = MAX_BYTES if name in LONG_ATTRIBUTES.split() else MAX_NUMBERS
-    floats(where, text, count, most=most, longest=longest)
 
 
 def _tendons(root: ET.Element) -> Tendons:
