@@ -8,7 +8,7 @@ import dataclasses
 import math
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -174,10 +174,9 @@ def export(
     """
     checks.one_of("target", target, (*LAW_TARGETS, *LOOP_TARGETS))
     is_loop = target in LOOP_TARGETS
-    _check_options(target, dtype, reference, is_loop)
     loop_options = {"dt": dt, "method": method, "seed": seed}
     ros_only = {"gains": gains, "torque_limits": torque_limits, "on_fault": on_fault}
-    _check_target_options(target, loop_options, ros_only)
+    _check_options(target, dtype, reference, loop_options, ros_only)
     tableau(method)
     dt, seed = checks.time_span("dt", dt), checks.seed(seed)
     name = checked_name(name, "iblf_loop" if is_loop else "iblf_law")
@@ -218,8 +217,16 @@ def export(
         raise checks.fail("scenario", came, "a scenario whose operations are lowered") from None
 
 
-def _check_options(target: str, dtype: str, reference: str, is_loop: bool) -> None:
-    """Raises ValueError for an unknown option, or for options that exclude each other."""
+def _check_options(
+    target: str,
+    dtype: str,
+    reference: str,
+    loop_options: Mapping[str, object],
+    ros_only: Mapping[str, object],
+) -> None:
+    """Raises ValueError for an unknown option, for options that exclude each other, and for those
+    of another target.
+    """
     checks.one_of("dtype", dtype, tuple(TYPES))
     checks.one_of("reference", reference, ("inside", "given"))
     if target.startswith("fmu") and dtype != "double":
@@ -231,16 +238,10 @@ def _check_options(target: str, dtype: str, reference: str, is_loop: bool) -> No
         expected = '"inside" for a ROS 2 package'
         remedy = "The node has no topic for a reference: give the scenario a reference."
         raise checks.fail("reference", reference, expected, remedy)
-    if is_loop and reference == "given":
+    if target in LOOP_TARGETS and reference == "given":
         expected = '"inside" for a closed loop'
         remedy = "Only a law alone receives its reference as an input."
         raise checks.fail("reference", reference, expected, remedy)
-
-
-def _check_target_options(
-    target: str, loop_options: dict[str, Any], ros_only: dict[str, Any]
-) -> None:
-    """Raises ValueError for options of another target."""
     if target == "ros2":
         for name, value in loop_options.items():
             if value != LOOP_DEFAULTS[name]:

@@ -337,7 +337,16 @@ class SimulatedRobot:
         self, periods: int, patience: float, on_release: Callable[[], object]
     ) -> None:
         simulation = self.simulation
-        self._wait_for_release(patience)
+        # The initial state is exchanged until an effort releases the brake; the stamps advance.
+        end = time.perf_counter() + patience
+        while not self._stops:
+            self._replace_first_state()
+            self._exchange(simulation.measure(), patience)
+            if simulation.is_released:
+                break
+            self.origin += round(simulation.period * NANOSECONDS)
+            if time.perf_counter() > end:
+                raise TimeoutError(self._no_release(patience))
         on_release()
         while not self._stops and not simulation.diverged and simulation.index < periods:
             simulation.advance()
@@ -346,19 +355,6 @@ class SimulatedRobot:
             self._begin_state(is_published=not is_lost, lateness=0.0)
             if not is_lost:
                 self._exchange(reading, patience)
-
-    def _wait_for_release(self, patience: float) -> None:
-        """Exchanges the initial state until an effort releases the brake; the stamps advance."""
-        simulation = self.simulation
-        end = time.perf_counter() + patience
-        while not self._stops:
-            self._replace_first_state()
-            self._exchange(simulation.measure(), patience)
-            if simulation.is_released:
-                return
-            self.origin += round(simulation.period * NANOSECONDS)
-            if time.perf_counter() > end:
-                raise TimeoutError(self._no_release(patience))
 
     def _exchange(self, reading: Reading, patience: float) -> None:
         """Publishes a state until an effort answers it."""
@@ -381,7 +377,21 @@ class SimulatedRobot:
         self, periods: int, patience: float, on_release: Callable[[], object]
     ) -> None:
         simulation = self.simulation
-        start = self._wait_for_release_in_real_time(patience)
+        # The initial state is published every period until an effort releases the brake.
+        end = time.perf_counter() + patience
+        while True:
+            self.origin = time.time_ns()
+            start = time.perf_counter()  # the clock of the process at t = 0 [s]
+            self._replace_first_state()
+            self._publish(simulation.measure())
+            due = start + simulation.period
+            while time.perf_counter() < due and not simulation.efforts.commands:
+                self._spin(due)
+                self._take_arrivals_of_clock(start)
+            if self._stops or simulation.is_released:
+                break
+            if time.perf_counter() > end:
+                raise TimeoutError(self._no_release(patience))
         on_release()
         while simulation.index < periods and not self._stops and not simulation.diverged:
             due = start + (simulation.index + 1) * simulation.period
@@ -399,26 +409,6 @@ class SimulatedRobot:
             self._begin_state(is_published=not is_lost, lateness=time.perf_counter() - nominal)
             if not is_lost:
                 self._publish(reading)
-
-    def _wait_for_release_in_real_time(self, patience: float) -> float:
-        """Publishes the initial state every period until an effort releases the brake; the clock of
-        the process at t = 0 [s].
-        """
-        simulation = self.simulation
-        end = time.perf_counter() + patience
-        while True:
-            self.origin = time.time_ns()
-            start = time.perf_counter()
-            self._replace_first_state()
-            self._publish(simulation.measure())
-            due = start + simulation.period
-            while time.perf_counter() < due and not simulation.efforts.commands:
-                self._spin(due)
-                self._take_arrivals_of_clock(start)
-            if self._stops or simulation.is_released:
-                return start
-            if time.perf_counter() > end:
-                raise TimeoutError(self._no_release(patience))
 
     def _take_arrivals_of_clock(self, start: float) -> None:
         """Passes the efforts on to the robot at the times at which they arrived."""

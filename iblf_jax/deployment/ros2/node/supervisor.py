@@ -471,22 +471,19 @@ class Supervisor:
             return torque
         if self._hold_position is None:
             self._hold_position = state.position
-        velocity = self._velocity(state)
+        # Without a measured velocity, the difference quotient of the last two states.
+        velocity: Sequence[float] | None = state.velocity
+        before = self._previous
+        if velocity is None:
+            velocity = self._zero
+            if before is not None and state.stamp > before.stamp:
+                duration = (state.stamp - before.stamp) / NANOSECONDS
+                pairs = zip(state.position, before.position, strict=True)
+                velocity = [(x - y) / duration for x, y in pairs]
         for i, q in enumerate(state.position):
             torque[i] += self.configuration.hold_stiffness[i] * (self._hold_position[i] - q)
             torque[i] -= self.configuration.hold_damping[i] * velocity[i]
         return torque
-
-    def _velocity(self, state: JointSample) -> Sequence[float]:
-        """The measured velocities, or the difference quotient of the last two states [rad/s]."""
-        if state.velocity is not None:
-            return state.velocity
-        before = self._previous
-        if before is None or state.stamp <= before.stamp:
-            return self._zero
-        duration = (state.stamp - before.stamp) / NANOSECONDS
-        pairs = zip(state.position, before.position, strict=True)
-        return [(x - y) / duration for x, y in pairs]
 
     def _limited(self, torque: list[float], status: int) -> Command:
         """The command with every torque within its limits; NaN becomes 0."""
