@@ -148,10 +148,16 @@ def prove(
         scenario = canonical(scenario)
         sampled = sample_weights(problem, level, weights_of(scenario, weight), options.seed)
         best = min(sampled, key=lambda found: found.largest)
-        result, worst = None, None
+        result, worst, growth_points = None, None, []
         if best.largest <= 0.0:
             best, result = _searched(problem, level, sampled, best, options)
             worst = result.worst
+        else:
+            # For each weight, V_w' > 0 at a point of the set.
+            for found in sampled:
+                constants = problem.constants(found.weight, level)
+                state = problem.state_of(found.points[0], constants)
+                growth_points.append(GrowthPoint(found.weight, found.largest, state))
         violation, verdict = None, Verdict.PROVED
         if result is None or not result.proved:
             violation = _refuted(problem, level, best, options.runs)
@@ -171,7 +177,7 @@ def prove(
             done=0.0 if result is None else result.done,
             seconds=time.monotonic() - start,
             rates={found.weight: found.largest for found in sampled},
-            growth_points=_growth_points(problem, level, sampled),
+            growth_points=tuple(growth_points),
             worst_box=None if worst is None else _worst_box(problem, level, best.weight, worst),
             violation=violation,
             assumptions=problem.assumptions,
@@ -321,19 +327,6 @@ def _best(points: np.ndarray, rates: np.ndarray) -> tuple[np.ndarray, np.ndarray
     """The points with the largest rates."""
     order = np.argsort(-np.nan_to_num(rates, nan=-np.inf), kind="stable")[:PARENTS]
     return points[order], rates[order]
-
-
-def _growth_points(
-    problem: LevelSetProblem, level: float, sampled: Sequence[_Sampled]
-) -> tuple[GrowthPoint, ...]:
-    """The point with the largest V_w' for each weight, in physical numbers; () unless all grow."""
-    if min(each.largest for each in sampled) <= 0.0:
-        return ()
-    found = []
-    for each in sampled:
-        state = problem.state_of(each.points[0], problem.constants(each.weight, level))
-        found.append(GrowthPoint(each.weight, each.largest, state))
-    return tuple(found)
 
 
 # --- branch and bound ----------------------------------------------------------------------------

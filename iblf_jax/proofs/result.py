@@ -271,7 +271,12 @@ class Proof(Result):
         rows = [("", name, f"{low:.6g} to {high:.6g}") for name, (low, high) in self.ranges.items()]
         lines = list(tables.as_text(rows, left=(0, 1)))
         if self.proved:
-            lines.append(self._guarantee())
+            xi = self.tube.xi.max(axis=0)
+            texts = ", ".join(f"{math.ceil(x * 1e4) / 1e4:.4g}" for x in xi)
+            names = ", ".join(plants.component_names(self.scenario.plant))
+            if np.any(np.ptp(self.tube.xi, axis=0) > CONSTANT * xi):
+                names += f", the largest of {INSTANTS} instants"
+            lines.append(f"Guaranteed for every start in the set: |xi| <= {texts} ({names}).")
         if self.verdict == Verdict.NOT_PROVED:
             tried = len(self.growth_points)
             lines.append(
@@ -297,15 +302,6 @@ class Proof(Result):
             lines.append(f"Tried: {levels}.")
         lines += [f"Assumed: {sentence}" for sentence in self.assumptions if self.proved]
         return lines
-
-    def _guarantee(self) -> str:
-        xi = self.tube.xi.max(axis=0)
-        texts = ", ".join(f"{math.ceil(x * 1e4) / 1e4:.4g}" for x in xi)
-        names = ", ".join(plants.component_names(self.scenario.plant))
-        instants = ""
-        if np.any(np.ptp(self.tube.xi, axis=0) > CONSTANT * xi):
-            instants = f", the largest of {INSTANTS} instants"
-        return f"Guaranteed for every start in the set: |xi| <= {texts} ({names}{instants})."
 
     def _why_undecided(self) -> list[str]:
         lines = [f"V_w' < 0 is proved on {100.0 * self.done:.3g} % of the volume."]
