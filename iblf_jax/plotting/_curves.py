@@ -297,7 +297,15 @@ class Curve:
           field: the signal of the panel.
           entry: the joint, or the region, of the panel.
         """
-        own, bounded = SAME_BOUNDS.get(field, field), self._bounded_signals()
+        # The signals of the run that have bounds: levels, and distances to regions.
+        bounded = ["q"]
+        if self.has_speed_limits:
+            bounded.append("dq")
+        order = plants.order_of(self.run.scenario.plant)
+        bounded += [f"level_{level}" for level in range(3, order + 1)]
+        if self.has_regions:
+            bounded.append("region_margin")
+        own = SAME_BOUNDS.get(field, field)
         concerned = [name for name in bounded if name not in WITHOUT_JOINT]
         if own in bounded:
             concerned = [own]
@@ -313,17 +321,6 @@ class Curve:
         if self.diverged and not has_exit:
             return self.samples - 1
         return None
-
-    def _bounded_signals(self) -> list[str]:
-        """The signals of the run that have bounds: levels, and distances to regions."""
-        names = ["q"]
-        if self.has_speed_limits:
-            names.append("dq")
-        order = plants.order_of(self.run.scenario.plant)
-        names += [f"level_{level}" for level in range(3, order + 1)]
-        if self.has_regions:
-            names.append("region_margin")
-        return names
 
     def _outside(self, field: str) -> np.ndarray:
         """Whether a bounded signal touches or leaves its bounds, (T, n) bool."""
@@ -414,19 +411,6 @@ def escaped(name: str) -> str:
     return name.replace("$", r"\$")
 
 
-def _valid_samples(run: Rollout) -> int:
-    """Number of samples before the state was frozen: all of them, unless the run diverged."""
-    q, dq = np.asarray(run.q), np.asarray(run.dq)
-    if not int(run.status) & Status.NOT_FINITE or len(q) < 2:
-        return len(q)
-    moved = np.any((np.diff(q, axis=0) != 0) | (np.diff(dq, axis=0) != 0), axis=1)
-    finite = np.isfinite(q).all(axis=1)
-    last = np.flatnonzero(moved & finite[1:])
-    if not last.size:
-        return len(q)
-    return int(last[-1]) + 2
-
-
 def check_class(argument: str, value: Any, cls: type, remedy: str) -> None:
     """Raises ValueError if the value is not an object of this class."""
     if not isinstance(value, cls):
@@ -441,7 +425,15 @@ def _checked(name: str, run: Any, argument: str) -> Curve:
     if run.is_batch:
         came = f"a batch of {len(run)} runs"
         raise checks.fail(argument, came, "one run", "Select a run: run[0].")
-    return Curve(name, run, _valid_samples(run))
+    q, dq = np.asarray(run.q), np.asarray(run.dq)
+    samples = len(q)
+    if int(run.status) & Status.NOT_FINITE and len(q) > 1:
+        # The run diverged: the samples before its state was frozen.
+        moved = np.any((np.diff(q, axis=0) != 0) | (np.diff(dq, axis=0) != 0), axis=1)
+        last = np.flatnonzero(moved & np.isfinite(q).all(axis=1)[1:])
+        if last.size:
+            samples = int(last[-1]) + 2
+    return Curve(name, run, samples)
 
 
 def curves_of(runs: Rollout | Mapping[str, Rollout]) -> list[Curve]:
