@@ -281,7 +281,12 @@ def decode_fields(cls: Any, table: Any, path: str) -> Any:
                 values[name] = decode(table[name], hint, key)
         elif field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
             remedy = f"Add {name} to [{path}]; {cls.__name__} has no default for it."
-            raise missing(key, _expectation(field), remedy)
+            expected = "a table with a kind"
+            if is_leaf_field(field):
+                expected = f"a number{SHAPES[field.metadata['shape']]} [{field.metadata['unit']}]"
+            elif field.metadata.get("static"):
+                expected = "a value"
+            raise missing(key, expected, remedy)
     return construct(cls, values, path)
 
 
@@ -292,13 +297,6 @@ SHAPES = {
     "scalar": "",
 }
 """Shape of a leaf -> the words of an error message."""
-
-
-def _expectation(field: dataclasses.Field) -> str:
-    """The value that a missing field should have, in words."""
-    if is_leaf_field(field):
-        return f"a number{SHAPES[field.metadata['shape']]} [{field.metadata['unit']}]"
-    return "a value" if field.metadata.get("static") else "a table with a kind"
 
 
 def construct(make: Any, values: dict[str, Any], path: str) -> Any:
