@@ -69,7 +69,18 @@ def check_barrier(barrier: Any, *, n: int | None = None) -> None:
       ValueError: `n` is not a number of joints, or not that of the leaves.
     """
     with examine_joints(barrier, Barrier, n, "barrier") as (findings, barrier, joints):
-        _class_members(findings, barrier)
+        guard = barrier.guard
+        findings.require(
+            isinstance(guard, float) and (0 < guard < 1 or guard == -math.inf),
+            f"guard is {guard!r}",
+            "It must be a static float between 0 and 1, or minus infinity if no guard is needed",
+        )
+        findings.require(
+            isinstance(barrier.uses_o, bool),
+            f"uses_o is {barrier.uses_o!r}",
+            "It must be a bool of the class, uses_o: ClassVar[bool]",
+        )
+        findings.stop_if_any()
         context = in_dtype(scenario_of(joints), "float64").context
         k1 = jnp.asarray(np.resize([2.0, 3.0], joints))
         o = jnp.asarray(np.resize([0.1, 0.2], joints)) if barrier.uses_o else None
@@ -87,7 +98,13 @@ def check_barrier(barrier: Any, *, n: int | None = None) -> None:
             return {FUNCTIONS[name]: x for name, x in _functions(*args).items()}
 
         check_function(findings, outputs, barrier, (tube, q, k1, o))
-        _joints_apart(findings, barrier, tube, q, k1, o)
+        jacobians = jax.jit(jax.jacfwd(lambda q: _functions(barrier, tube, q, k1, o)))(q)
+        for name, J in jacobians.items():
+            findings.require(
+                np.all(np.diag(np.diag(J)) == J),
+                f"{name} mixes joints",
+                "The law needs a barrier that acts on every joint separately",
+            )
         for t in TIMES:
             tube = context.tube(jnp.asarray(t))
             numbers = _numbers(barrier, context, jnp.asarray(t), k1, o, jnp.asarray(XI))
@@ -105,22 +122,6 @@ def _functions(
         "slope": barrier.slope(tube, q),
         "virtual_velocity": barrier.virtual_velocity(tube, q, k1, o),
     }
-
-
-def _class_members(findings: Findings, barrier: Any) -> None:
-    """Requires valid values of `guard` and `uses_o`."""
-    guard = barrier.guard
-    findings.require(
-        isinstance(guard, float) and (0 < guard < 1 or guard == -math.inf),
-        f"guard is {guard!r}",
-        "It must be a static float between 0 and 1, or minus infinity if no guard is needed",
-    )
-    findings.require(
-        isinstance(barrier.uses_o, bool),
-        f"uses_o is {barrier.uses_o!r}",
-        "It must be a bool of the class, uses_o: ClassVar[bool]",
-    )
-    findings.stop_if_any()
 
 
 @jax.jit
@@ -273,17 +274,4 @@ def _claims(
             np.all(kept),
             "|xi| is beyond xi_bound(V1, tube)",
             "It must hold wherever V1 <= V; return None for no claim",
-        )
-
-
-def _joints_apart(
-    findings: Findings, barrier: Any, tube: Tube, q: jax.Array, k1: jax.Array, o: Any
-) -> None:
-    """Requires that the barrier of a joint does not depend on other joints."""
-    jacobians = jax.jit(jax.jacfwd(lambda q: _functions(barrier, tube, q, k1, o)))(q)
-    for name, J in jacobians.items():
-        findings.require(
-            np.all(np.diag(np.diag(J)) == J),
-            f"{name} mixes joints",
-            "The law needs a barrier that acts on every joint separately",
         )

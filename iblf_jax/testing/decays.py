@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.control.decays import Decay
-from iblf_jax.testing._contract import Findings, call_has_shape, check_function, has_shape
+from iblf_jax.testing._contract import call_has_shape, check_function, has_shape
 from iblf_jax.testing.joints import examine_joints
 
 TIMES = (0.0, 0.3, 1.0, 3.0, 30.0)
@@ -43,7 +43,19 @@ def check_decay(decay: Any, *, n: int | None = None) -> None:
             f"{LABEL} mixes joints",
             "The gain of a joint is a function of the V of that joint",
         )
-        _gains_at_every_value(findings, decay, k)
+        grid = jnp.meshgrid(jnp.asarray(TIMES), jnp.asarray(VALUES))
+        for constant in (k, jnp.zeros_like(k)):
+
+            def at(t, V, constant=constant):
+                return _gain(decay, t, constant, jnp.full_like(constant, V))
+
+            found = np.asarray(jax.jit(jax.vmap(at))(*map(jnp.ravel, grid)))
+            findings.require(np.all(np.isfinite(found)), f"{LABEL} is not finite somewhere")
+            findings.require(
+                np.all(found >= np.asarray(constant) * (1.0 - 1e-12)),
+                f"{LABEL} is below k",
+                "Add a positive gain to k: the claims of a law for k must remain true",
+            )
         for name, stated in (("band", decay.band()), ("deadline", decay.deadline())):
             if stated is not None:
                 has_shape(findings, f"{name}()", stated, (joints,))
@@ -52,20 +64,3 @@ def check_decay(decay: Any, *, n: int | None = None) -> None:
 
 def _gain(decay: Any, t: jax.Array, k: jax.Array, V: jax.Array) -> jax.Array:
     return decay.effective_gain(t, k, V)  # type: ignore[no-any-return]
-
-
-def _gains_at_every_value(findings: Findings, decay: Any, k: jax.Array) -> None:
-    """Requires gains that are finite and not below k, for the constant gain k and for 0."""
-    times, values = (jnp.ravel(x) for x in jnp.meshgrid(jnp.asarray(TIMES), jnp.asarray(VALUES)))
-    for gain in (k, jnp.zeros_like(k)):
-
-        def at(t, V, gain=gain):
-            return _gain(decay, t, gain, jnp.full_like(gain, V))
-
-        found = np.asarray(jax.jit(jax.vmap(at))(times, values))
-        findings.require(np.all(np.isfinite(found)), f"{LABEL} is not finite somewhere")
-        findings.require(
-            np.all(found >= np.asarray(gain) * (1.0 - 1e-12)),
-            f"{LABEL} is below k",
-            "Add a positive gain to k: the claims of a law for k must remain true",
-        )

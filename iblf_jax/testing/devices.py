@@ -112,7 +112,15 @@ def check_actuator(
       ValueError: `n` is not a number of joints, or not that of the leaves, or `torques` is not an
         increasing pair.
     """
-    low, high = _range_of(torques)
+    ends = torques
+    if torques is None:
+        ends = (-SMALL_TORQUES[0], SMALL_TORQUES[0])
+    expected = "a pair (smallest, largest) of numbers"
+    if not isinstance(ends, tuple | list) or len(ends) != 2:
+        raise checks.fail("torques", ends, expected)
+    low, high = (np.asarray(checks.as_floats("torques", side), float) for side in ends)
+    if not np.all(low < high):
+        raise checks.fail("torques", ends, expected)
     with examine_joints(actuator, Actuator, n, "actuator") as (findings, fitted, joints):
         shares, dq = np.random.default_rng(3).uniform(-0.1, 0.1, (2, joints))
         # The shares of the range are between 0.1 and 0.9.
@@ -129,19 +137,6 @@ def check_actuator(
         if torques is None:
             tested = [size * command / jnp.max(jnp.abs(command)) for size in SMALL_TORQUES]
         _starts_at_its_torque(findings, fitted.smooth, tested)
-
-
-def _range_of(torques: Any) -> tuple[np.ndarray, np.ndarray]:
-    """The smallest and the largest tested torque; ValueError unless they are an increasing pair."""
-    if torques is None:
-        torques = (-SMALL_TORQUES[0], SMALL_TORQUES[0])
-    expected = "a pair (smallest, largest) of numbers"
-    if not isinstance(torques, tuple | list) or len(torques) != 2:
-        raise checks.fail("torques", torques, expected)
-    low, high = (np.asarray(checks.as_floats("torques", side), float) for side in torques)
-    if not np.all(low < high):
-        raise checks.fail("torques", torques, expected)
-    return low, high
 
 
 def _delivers(findings: Findings, actuator, command, dq) -> None:
