@@ -207,7 +207,12 @@ class Agents(Plant):
     def gain(self, t: jax.Array, x: jax.Array) -> jax.Array:
         """G, (order, n, n): (H kron I) diag(G_1 of the agents), and block-diagonal ones above."""
         states = self._states(x)
-        gains = [_full_gain(agent.gain(t, z)) for agent, z in zip(self.agents, states, strict=True)]
+        gains = []
+        for agent, z in zip(self.agents, states, strict=True):
+            gain = agent.gain(t, z)
+            if gain.ndim == 2:
+                gain = gain[:, :, None] * jnp.eye(gain.shape[1], dtype=gain.dtype)
+            gains.append(gain)
         first = []
         for row in self.matrix:
             blocks = [h * gain[0] for h, gain in zip(row, gains, strict=True)]
@@ -476,13 +481,6 @@ def _joined(parts: list[jax.Array | None], axis: int) -> jax.Array | None:
     if len(known) < len(parts):
         return None
     return jnp.concatenate(known, axis=axis)
-
-
-def _full_gain(gain: jax.Array) -> jax.Array:
-    """Gains as matrices, (order, m, m)."""
-    if gain.ndim == 3:
-        return gain
-    return gain[:, :, None] * jnp.eye(gain.shape[1], dtype=gain.dtype)
 
 
 def _units_by_component(agent: Plant) -> list[tuple[str, ...]]:
