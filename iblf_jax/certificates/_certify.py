@@ -68,7 +68,7 @@ AT_CHECKS = "measured; it holds at the instants at which the condition of the tr
 @takes_runs
 def certify(
     scenario: Scenario,
-    run: Any = None,
+    run: Rollout | Study | None = None,
     *,
     duration: float = 20.0,
     dt: float = 1e-3,
@@ -353,7 +353,7 @@ def _trigger_lines(run: Rollout) -> tuple[Line, ...]:
     sampling, law = scenario.sampling, scenario.controller
     if sampling is None or sampling.trigger is None:
         return ()
-    trigger: Any = sampling.trigger
+    trigger = sampling.trigger
     if isinstance(law, EventCompensated):
         return (measured(COMPENSATED, AT_CHECKS, value=float(excess(law))),)
     inner = unwrapped(law)

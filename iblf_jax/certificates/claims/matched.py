@@ -57,7 +57,7 @@ from iblf_jax.certificates.terms import (
     inner_context,
     relative_gap,
 )
-from iblf_jax.control.controllers import BarrierBackstepping
+from iblf_jax.control.controllers import BarrierBackstepping, TrackingLaw
 from iblf_jax.control.controllers._levels import Level
 from iblf_jax.core import checks
 from iblf_jax.core.linalg import solve_spd
@@ -103,7 +103,7 @@ class Matched(Theorem):
 
     def why_not(self, scenario: Scenario) -> str:
         """Why (F.3) claims nothing about a scenario, in words; "" if it does."""
-        law: Any = unwrapped(scenario.controller)
+        law: TrackingLaw = unwrapped(scenario.controller)
         if not isinstance(law, BarrierBackstepping) or law.order != 2 or law.filter is not None:
             return "(F.3) is about BarrierBackstepping of order 2 with exact derivatives"
         if plants.is_chain(scenario.model):
@@ -125,7 +125,7 @@ class Matched(Theorem):
 
     # --- the terms --------------------------------------------------------------------------------
 
-    def has_law(self, law: Any) -> bool:
+    def has_law(self, law: object) -> bool:
         """Whether it is about a law of this class."""
         return isinstance(law, BarrierBackstepping)
 

@@ -83,10 +83,11 @@ from iblf_jax.control.observers import AsPublished, Momentum
 from iblf_jax.core import programs
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.status import Status
+from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import has, margin_of
 from iblf_jax.world.bounds import NARROWEST
-from iblf_jax.world.robots import mass_matrix_rate
+from iblf_jax.world.robots import Robot, mass_matrix_rate
 
 LOWEST_KF = {1: 0.5, 2: 1.0}
 """Lower bound of kf: (3.17) in case 1, (3.25) in case 2."""
@@ -223,7 +224,7 @@ class Theorem(TwoCases, MainClaim):
             claims=terms.claims | {TORQUE: entry},
         )
 
-    def has_law(self, law: Any) -> bool:
+    def has_law(self, law: object) -> bool:
         """Whether it is about a law of this class."""
         return isinstance(law, Backstepping)
 
@@ -550,7 +551,7 @@ class Theorem(TwoCases, MainClaim):
             traces = OWN.on_traces(segment, traces)._replace(dropped=np.zeros_like(dropped))
         return at_recorded(segment, traces)  # type: ignore[no-any-return]
 
-    def unclaimed_traces(self, run: Any) -> Traces:
+    def unclaimed_traces(self, run: Rollout) -> Traces:
         """The curves of a run of which nothing is claimed."""
         f_tilde = run.disturbance - run.disturbance_estimate
         return _unclaimed_traces(run.t, run.V, run.xi, run.e2, f_tilde)
@@ -600,7 +601,9 @@ def _unless_replaced(summary: Summary, line: Line) -> Line:
     return dataclasses.replace(line, counts=counts, note=join_notes(NOT_NEEDED, line.note))
 
 
-def _unclaimed_traces(t: Any, V: Any, xi: Any, e2: Any, f_tilde: Any) -> Traces:
+def _unclaimed_traces(
+    t: jax.Array | np.ndarray, V: jax.Array, xi: jax.Array, e2: jax.Array, f_tilde: jax.Array
+) -> Traces:
     """The curves of samples of which nothing is claimed."""
     return unclaimed(  # type: ignore[no-any-return]
         Traces,
@@ -616,7 +619,7 @@ def _unclaimed_traces(t: Any, V: Any, xi: Any, e2: Any, f_tilde: Any) -> Traces:
 # --- the terms at a state -------------------------------------------------------------------------
 
 
-def _are_equal(one: Any, other: Any) -> jax.Array:
+def _are_equal(one: Robot, other: Robot) -> jax.Array:
     """Whether two robots are equal, leaf by leaf, () bool."""
     structure: Any = jax.tree.structure(one)
     if structure != jax.tree.structure(other):
@@ -665,7 +668,7 @@ class SignalSizes:
       guard: of the barrier on e1.
     """
 
-    def __init__(self, point: TorquePoint, K2: Any, guard: float) -> None:
+    def __init__(self, point: TorquePoint, K2: jax.Array | None, guard: float) -> None:
         now, rates = point.now, point.rates
         self.point = point
         self.K2 = jnp.zeros_like(point.state.q) if K2 is None else K2
@@ -680,7 +683,7 @@ class SignalSizes:
             + jnp.abs(now["s"]) / self.gap
         )
 
-    def of_V2(self, terms: Terms, weight: Any) -> tuple[jax.Array, jax.Array]:
+    def of_V2(self, terms: Terms, weight: jax.Array | None) -> tuple[jax.Array, jax.Array]:
         """`Terms.size` and `Terms.sqrt_V_size`; `weight` is that of V1, (n,), or None for 1."""
         point, e2, torque, gap = self.point, self.e2, self.torque, self.gap
         scenario, state, now, rates = point.scenario, point.state, point.now, point.rates
