@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from jax.typing import ArrayLike
 
 from iblf_jax.core import checks, notices
 from iblf_jax.core.progress import announced
@@ -34,6 +35,7 @@ from iblf_jax.proofs.periods import AperiodicError
 from iblf_jax.proofs.problem import LevelSetProblem
 from iblf_jax.proofs.result import GrowthPoint, Proof, Verdict, Violation, WorstBox
 from iblf_jax.proofs.search import SearchResult, search
+from iblf_jax.proofs.search import WorstBox as SearchedBox
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.distributions import Perturbation
@@ -92,7 +94,7 @@ def prove(
     parameters: Mapping[str, Perturbation] | None = None,
     weight: float | None = None,
     duration: float | None = None,
-    disturbance_rate: Any = None,
+    disturbance_rate: ArrayLike | None = None,
     max_boxes: int = 1_000_000_000,
     threads: int | None = None,
     progress: bool | None = None,
@@ -185,7 +187,9 @@ def prove(
         )
 
 
-def _chosen(level: Any, parameters: Any) -> tuple[float, Mapping[str, Perturbation]]:
+def _chosen(
+    level: float | None, parameters: Mapping[str, Perturbation] | None
+) -> tuple[float, Mapping[str, Perturbation]]:
     """Level and parameters; the error says how to choose what is missing."""
     if level is None:
         expected = "a level of V_w, such as level=0.5 [the unit of V_w]"
@@ -218,13 +222,13 @@ class _Options(NamedTuple):
     @classmethod
     def of(
         cls,
-        weight: Any,
-        max_boxes: Any,
-        threads: Any,
-        progress: Any,
-        checkpoint: Any,
-        runs: Any,
-        seed: Any,
+        weight: float | None,
+        max_boxes: int,
+        threads: int | None,
+        progress: bool | None,
+        checkpoint: str | PathLike | None,
+        runs: int,
+        seed: int,
     ) -> _Options:
         """Raises ValueError for an option that is not admissible."""
         if weight is not None:
@@ -243,7 +247,7 @@ def problem_of(
     scenario: Scenario,
     parameters: Mapping[str, Perturbation],
     duration: float | None,
-    disturbance_rate: Any,
+    disturbance_rate: ArrayLike | None,
 ) -> LevelSetProblem:
     """The proof problem of a scenario.
 
@@ -301,7 +305,11 @@ def sample_weights(
 
 
 def _largest_rates(
-    problem: LevelSetProblem, constants: Any, weight: float, points: np.ndarray, seed: int
+    problem: LevelSetProblem,
+    constants: Sequence[np.ndarray],
+    weight: float,
+    points: np.ndarray,
+    seed: int,
 ) -> _Sampled:
     """Increases V_w' from the best of some points.
 
@@ -386,7 +394,9 @@ def _search(
         raise checks.fail("prove: scenario", checks.Words(str(error)), expected) from error
 
 
-def _worst_box(problem: LevelSetProblem, level: float, weight: float, found: Any) -> WorstBox:
+def _worst_box(
+    problem: LevelSetProblem, level: float, weight: float, found: SearchedBox
+) -> WorstBox:
     """The worst box with the names of its coordinates, and its bounds with narrower intervals."""
     intervals = {
         name: (float(low), float(high))

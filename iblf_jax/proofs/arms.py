@@ -10,12 +10,13 @@ import dataclasses
 import functools
 import itertools
 import math
-from collections.abc import Mapping
-from typing import Any, ClassVar, NamedTuple, cast
+from collections.abc import Mapping, Sequence
+from typing import ClassVar, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from iblf_jax.control import controllers, observers
 from iblf_jax.core import checks
@@ -163,7 +164,7 @@ class ArmProblem(LevelSetProblem):
         numbers = jnp.asarray(weight), jnp.asarray(level)
         return Constants(self.parts, self.uncertain.numbers, *numbers)
 
-    def state_of(self, point: Any, constants: Any) -> LevelState:
+    def state_of(self, point: np.ndarray, constants: Sequence[np.ndarray]) -> LevelState:
         """A point in physical numbers."""
         with jax.enable_x64(True):
             numbers = _physical(self.bound, np.asarray(point, float), list(constants))
@@ -198,7 +199,7 @@ def arm_problem(
     parameters: Mapping[str, Perturbation],
     *,
     duration: float | None = None,
-    disturbance_rate: Any = None,
+    disturbance_rate: ArrayLike | None = None,
 ) -> ArmProblem:
     """The proof problem of a rigid arm under the corrected backstepping law.
 
@@ -284,7 +285,7 @@ def _check_plant(scenario: Scenario) -> None:
     check_same_structure(scenario, expected)
 
 
-def _check_law(law: Any) -> None:
+def _check_law(law: controllers.TrackingLaw) -> None:
     if type(law) is not controllers.Backstepping:
         reason = "V_w' is known for the paper's law with one of its barriers."
         if isinstance(law, controllers.Saturated):

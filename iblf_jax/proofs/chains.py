@@ -8,7 +8,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple, cast
 
 import jax
@@ -178,7 +178,7 @@ class ChainProblem(LevelSetProblem):
         )
 
     @jax.enable_x64(True)
-    def state_of(self, point: Any, constants: Any) -> ChainLevelState:
+    def state_of(self, point: np.ndarray, constants: Sequence[np.ndarray]) -> ChainLevelState:
         """A point in physical numbers."""
         numbers: Constants = jax.tree.unflatten(
             self.bound.structure, list(map(jnp.asarray, constants))
@@ -392,7 +392,7 @@ def _digests(scenario: Scenario, uncertain: Uncertain) -> list[str]:
 
 
 def _check_law(scenario: Scenario) -> None:
-    law: Any = scenario.controller
+    law = scenario.controller
     if type(law) is not controllers.BarrierBackstepping:
         reason = "V' is known for barrier backstepping with exact derivatives."
         raise unsupported(

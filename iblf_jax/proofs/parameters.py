@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from iblf_jax.core import checks
 from iblf_jax.proofs.uncertainty import Numbers, Place, Places
@@ -40,7 +41,7 @@ class Uncertain(NamedTuple):
         """Paths of all entries."""
         return [path for together in self.paths for path in together]
 
-    def values(self, z: Any) -> dict[str, float]:
+    def values(self, z: Sequence[float] | np.ndarray) -> dict[str, float]:
         """Path -> value of the entries at coordinates."""
         found = {}
         for k, names in enumerate(self.paths):
@@ -56,7 +57,7 @@ class Uncertain(NamedTuple):
 
 
 def uncertain_coordinates(
-    scenario: Scenario, parameters: Mapping[str, Perturbation], disturbance_rate: Any
+    scenario: Scenario, parameters: Mapping[str, Perturbation], disturbance_rate: ArrayLike | None
 ) -> Uncertain:
     """The coordinates of parameters that a user gives.
 
@@ -107,7 +108,7 @@ def uncertain_coordinates(
     )
 
 
-def _disturbance_rates(given: Any, n: int) -> np.ndarray:
+def _disturbance_rates(given: ArrayLike | None, n: int) -> np.ndarray:
     if given is None:
         return np.zeros(0)
     rates = np.asarray(checks.as_floats("disturbance_rate", given), float)

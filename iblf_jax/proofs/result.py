@@ -332,7 +332,7 @@ _STATEMENTS = {
 }
 
 
-def _numbers(value: Any) -> str:
+def _numbers(value: np.ndarray | float | Mapping[str, float]) -> str:
     """Numbers as text."""
     if isinstance(value, Mapping):
         return ", ".join(f"{path} {number:.5g}" for path, number in value.items())

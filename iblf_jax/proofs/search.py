@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from jax.typing import ArrayLike
 
 from iblf_jax.core import checks
 from iblf_jax.core.progress import bar
@@ -288,11 +289,11 @@ class _Results:
 
 def search(
     function: Callable,
-    lower: Any,
-    upper: Any,
+    lower: ArrayLike,
+    upper: ArrayLike,
     constants: Sequence[Any] = (),
     *,
-    patterns: Any = None,
+    patterns: ArrayLike | None = None,
     max_boxes: int = 1_000_000_000,
     threads: int | None = None,
     progress: bool | None = None,
