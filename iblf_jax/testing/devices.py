@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
+from numpy.typing import ArrayLike
 
 from iblf_jax.control.actuators import Actuator, Delivered
 from iblf_jax.control.sensors import Measurement, Sensor
@@ -40,7 +41,7 @@ UNSTABLE = 1e-6
 """Share of the largest eigenvalue above which a real part means an unstable state."""
 
 
-def check_sensor(sensor: Any, *, n: int | None = None) -> None:
+def check_sensor(sensor: object, *, n: int | None = None) -> None:
     """Checks a sensor: shapes, the state's structure, derivatives, float32.
 
     A `Sensor` of x is checked with its `order` levels, 4 if it has no such property.
@@ -91,7 +92,7 @@ def _measures(findings: Findings, sensor, given, normal, period) -> None:
 
 
 def check_actuator(
-    actuator: Any, *, n: int | None = None, torques: tuple[Any, Any] | None = None
+    actuator: object, *, n: int | None = None, torques: tuple[ArrayLike, ArrayLike] | None = None
 ) -> None:
     """Checks an actuator: shapes, the state's structure, derivatives, float32, and the initial
     torque.
@@ -150,7 +151,7 @@ def _delivers(findings: Findings, actuator, command, dq) -> None:
     same_structure(findings, label + ", rate", found.rate, state)
 
 
-def _starts_at_its_torque(findings: Findings, actuator: Any, torques: list[jax.Array]) -> None:
+def _starts_at_its_torque(findings: Findings, actuator: Actuator, torques: list[jax.Array]) -> None:
     """Requires that in the state `init(tau)` some input delivers tau at a standstill, for one of
     some torques, and that the state is stable at this input.
     """
@@ -173,7 +174,7 @@ def _starts_at_its_torque(findings: Findings, actuator: Any, torques: list[jax.A
     )
 
 
-def _input_that_delivers(actuator: Any, torque: jax.Array, state: Any) -> jax.Array | None:
+def _input_that_delivers(actuator: Actuator, torque: jax.Array, state: Any) -> jax.Array | None:
     """An input, in any unit, at which a state delivers a torque at a standstill, by Newton's
     method; None if no initial guess converges.
     """
@@ -205,7 +206,7 @@ def _input_that_delivers(actuator: Any, torque: jax.Array, state: Any) -> jax.Ar
     return None
 
 
-def _growth(actuator: Any, command: jax.Array, state: Any) -> float:
+def _growth(actuator: Actuator, command: jax.Array, state: Any) -> float:
     """Growth rate of the state at a constant input at a standstill [1/s]; 0 if it is stable."""
     flat, rebuild = ravel_pytree(state)
     if flat.size == 0:

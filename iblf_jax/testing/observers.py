@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.control.observers import Observer
+from iblf_jax.control.observers import Observer, RobotObserver
 from iblf_jax.control.observers._base import contract_of
 from iblf_jax.control.observers.none import observer_of_x
 from iblf_jax.core import checks
@@ -39,7 +39,9 @@ from iblf_jax.world import plants
 from iblf_jax.world.robots import Robot
 
 
-def check_observer(observer: Any, *, model: Any = None, n: int | None = None) -> None:
+def check_observer(
+    observer: Observer | RobotObserver, *, model: Any = None, n: int | None = None
+) -> None:
     """Checks an observer: shapes, the state's structure, derivatives, float32, and a hundred steps
     of a scan.
 

@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from iblf_jax.core import checks, taylor
 from iblf_jax.core.families import is_default
@@ -41,7 +42,7 @@ PART = (
 Numbers = dict[str, Any]
 
 
-def check_plant(plant: Any, *, x: Any = None) -> None:
+def check_plant(plant: Plant, *, x: ArrayLike | None = None) -> None:
     """Checks a plant in strict-feedback form: shapes, derivatives, float32, the dependence of drift
     and gain on the levels, invertible gains, units, and optional members that agree with both.
 
@@ -77,7 +78,7 @@ def check_plant(plant: Any, *, x: Any = None) -> None:
             findings.require(off <= TOLERANCE, f"{problem} (by {off:.2g})", remedy)
 
 
-def _points(plant: Any, x: Any) -> jax.Array:
+def _points(plant: Plant, x: ArrayLike | None) -> jax.Array:
     """The states of the test, (m, order, n)."""
     shape = (plant.order, plant.n)
     if x is None:
@@ -92,7 +93,7 @@ def _points(plant: Any, x: Any) -> jax.Array:
     return points
 
 
-def _shapes(findings: Findings, plant: Any, t: jax.Array, x: jax.Array) -> None:
+def _shapes(findings: Findings, plant: Plant, t: jax.Array, x: jax.Array) -> None:
     """Requires the shapes of drift, gain and the optional members."""
     order, n = x.shape
     call_has_shape(findings, "drift(t, x)", plant.drift, (t, x), (order, n))
@@ -133,7 +134,7 @@ def _own_by_level(plant: Plant) -> dict[str, Any]:
     return {name: own for name, (own, default) in pairs.items() if not is_default(own, default)}
 
 
-def _dependence(findings: Findings, plant: Any, t: jax.Array, points: jax.Array) -> None:
+def _dependence(findings: Findings, plant: Plant, t: jax.Array, points: jax.Array) -> None:
     """Requires rows of drift and gain that depend on no later level."""
     of_points = jax.vmap(lambda x: plants.dependence_on_levels(plant, t, x))
     try:
@@ -142,7 +143,7 @@ def _dependence(findings: Findings, plant: Any, t: jax.Array, points: jax.Array)
         findings.stop(str(error).removesuffix("."))
 
 
-def _structure(findings: Findings, plant: Any, t: jax.Array, points: jax.Array) -> None:
+def _structure(findings: Findings, plant: Plant, t: jax.Array, points: jax.Array) -> None:
     """Requires rows that depend on no later level, except for the model of a law with filters;
     invertible gains, and finite derivatives.
     """
@@ -170,7 +171,7 @@ def _structure(findings: Findings, plant: Any, t: jax.Array, points: jax.Array) 
     findings.require(np.isfinite(np.asarray(slopes)).all(), problem, remedy)
 
 
-def _derivatives_along(plant: Any, t: jax.Array, x: jax.Array) -> jax.Array:
+def _derivatives_along(plant: Plant, t: jax.Array, x: jax.Array) -> jax.Array:
     """The Taylor coefficients of drift and gain along a straight line, all in one vector."""
     constant = [(jnp.zeros_like(t), jnp.zeros_like(x))] * (plant.order - 2)
     curve = [(t, x), (jnp.ones_like(t), jnp.ones_like(x)), *constant]
@@ -178,7 +179,7 @@ def _derivatives_along(plant: Any, t: jax.Array, x: jax.Array) -> jax.Array:
     return jnp.concatenate([jnp.ravel(value) for value in jax.tree.leaves(found)])
 
 
-def _functions(plant: Any, t: jax.Array, x: jax.Array) -> Numbers:
+def _functions(plant: Plant, t: jax.Array, x: jax.Array) -> Numbers:
     """The functions of a plant whose derivatives are tested."""
     values = {"drift(t, x)": plant.drift(t, x), "gain(t, x)": plant.gain(t, x)}
     stated = {
@@ -191,7 +192,7 @@ def _functions(plant: Any, t: jax.Array, x: jax.Array) -> Numbers:
     return values | {name: value for name, value in stated.items() if value is not None}
 
 
-def _identities(plant: Any, t: jax.Array, x: jax.Array, v: jax.Array, s: jax.Array) -> Numbers:
+def _identities(plant: Plant, t: jax.Array, x: jax.Array, v: jax.Array, s: jax.Array) -> Numbers:
     """The differences between optional members and what follows from drift and gain, one array a
     member, relative to its size.
     """
