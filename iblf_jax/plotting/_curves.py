@@ -30,7 +30,7 @@ from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.signals import has
 from iblf_jax.simulation.units import status_words
 from iblf_jax.world import plants
-from iblf_jax.world.robots import joint_names
+from iblf_jax.world.robots import Robot, joint_names
 
 POINTS = 2400
 """Approximate number of points that a line of a figure can resolve."""
@@ -76,7 +76,7 @@ def adapting_law(run: Rollout) -> AdaptiveParameters:
     return _adapting(run)[0]
 
 
-def _repeated(run: Rollout, values: Any) -> np.ndarray:
+def _repeated(run: Rollout, values: np.ndarray) -> np.ndarray:
     """Constants, (p,), at every sample of a run, (T, p)."""
     return np.broadcast_to(values, (len(run.t), len(values)))
 
@@ -114,14 +114,14 @@ LEVEL_PARTS: dict[str | None, Callable[[Rollout, int], Any]] = {
 estimate that the law received, and its disturbance with estimate and error."""
 
 
-def _row_if_any(values: Any, i: int) -> np.ndarray:
+def _row_if_any(values: jax.Array, i: int) -> np.ndarray:
     """As `_row`; NaN for a level that the signal does not have."""
     if is_absent(values) or i < values.shape[1]:
         return _row(values, i)
     return np.full((1, 1), np.nan)
 
 
-def _row(values: Any, i: int) -> np.ndarray:
+def _row(values: jax.Array, i: int) -> np.ndarray:
     """One row of a signal (T, m, n) with infinite entries as NaN; NaN for a run without it."""
     if is_absent(values):
         return np.full((1, 1), np.nan)
@@ -393,7 +393,7 @@ def peak_of(curve: Curve, field: str, joints: Sequence[int]) -> Peak | None:
     return Peak(float(values[sample, column]), joints[column], float(curve.t[sample]))
 
 
-def joint_labels(robot: Any, n: int) -> list[str]:
+def joint_labels(robot: Robot, n: int) -> list[str]:
     """The labels of a robot's joints: the names in the robot's file, if it has names; or of the
     components of a plant.
     """
@@ -411,7 +411,7 @@ def escaped(name: str) -> str:
     return name.replace("$", r"\$")
 
 
-def check_class(argument: str, value: Any, cls: type, remedy: str) -> None:
+def check_class(argument: str, value: object, cls: type, remedy: str) -> None:
     """Raises ValueError if the value is not an object of this class."""
     if not isinstance(value, cls):
         raise checks.fail(argument, type(value).__name__, checks.with_article(cls.__name__), remedy)
@@ -459,7 +459,7 @@ def curves_of(runs: Rollout | Mapping[str, Rollout]) -> list[Curve]:
     return curves
 
 
-def check_joint(curves: Sequence[Curve], joint: Any, field: str = "joint") -> int:
+def check_joint(curves: Sequence[Curve], joint: object, field: str = "joint") -> int:
     """The index of a joint that is given by its index or its name.
 
     Raises:

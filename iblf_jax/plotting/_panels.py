@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.typing import ColorType
 
 from iblf_jax.core.units import per_second
 from iblf_jax.plotting import _style
@@ -502,7 +503,7 @@ MAX_MARKS = 200
 """More events than this in a window are not marked: the marks would cover the curve."""
 
 
-def _mark_events(axes: Axes, curve: Curve, joint: int, window: Window, color: Any) -> None:
+def _mark_events(axes: Axes, curve: Curve, joint: int, window: Window, color: ColorType) -> None:
     """Marks the instants at which an event trigger sent a command."""
     run = curve.run
     if not has(run, "events"):

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
+from numpy.typing import ArrayLike
 
 from iblf_jax.plotting._curves import ROUNDING
 
@@ -50,14 +51,14 @@ def varies(x: np.ndarray) -> bool:
     return bool(np.ptp(x) > ROUNDING * unit_in_last_place * np.max(np.abs(x)))
 
 
-def _finite(x: Any) -> np.ndarray:
+def _finite(x: ArrayLike) -> np.ndarray:
     values = np.ravel(np.asarray(x))
     if not np.issubdtype(values.dtype, np.floating):
         values = values.astype(float)
     return values[np.isfinite(values)]
 
 
-def scale_of(x: Any) -> Scale:
+def scale_of(x: ArrayLike) -> Scale:
     """The scale of an axis with these values: linear, unless a logarithmic one spreads their middle
     half (`GAIN`), or moves their median away from an end (`CORNER`).
     """
@@ -95,7 +96,7 @@ def _is_in_corner(scale: Scale, values: np.ndarray) -> bool:
     return bool(min(place, 1.0 - place) < CORNER)
 
 
-def follow(axes: Axes, direction: str, x: Any) -> None:
+def follow(axes: Axes, direction: str, x: ArrayLike) -> None:
     """Sets scale and limits of an axis so that it shows all finite ones of its values.
 
     Args:

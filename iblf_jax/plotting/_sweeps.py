@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import matplotlib
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 
 from iblf_jax.core import checks
 from iblf_jax.core.status import FAILED, VIOLATED
@@ -118,7 +120,7 @@ def heat_map(
 
 def _draw_heat_map(
     figure: Figure,
-    axes: Any,
+    axes: Axes,
     data: xarray.Dataset,
     metric: str,
     x: str | None,
@@ -165,7 +167,7 @@ def _equality(metric: str, picture: np.ndarray) -> str:
     return "equal at all points"
 
 
-def _write_numbers(axes: Any, picture: np.ndarray, image: Any) -> None:
+def _write_numbers(axes: Any, picture: np.ndarray, image: AxesImage) -> None:
     centred = {"ha": "center", "va": "center", "fontsize": _style.size(7.5)}
     for (row, column), value in np.ndenumerate(picture):
         cell: Any = _style.background()

@@ -284,7 +284,7 @@ def paths(
     return figure
 
 
-def _check_tuned(result: Any) -> None:
+def _check_tuned(result: object) -> None:
     """Raises ValueError for something that is no result of `tune`."""
     from iblf_jax.tuning import TuneResult  # a result exists only where its package is loaded
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.gridspec import SubplotSpec
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
@@ -24,6 +25,7 @@ from iblf_jax.plotting._figures import Runs
 from iblf_jax.plotting._panels import run_style
 from iblf_jax.world import plants
 from iblf_jax.world.regions import HalfSpace, Region, Sphere, in_words, row_of
+from iblf_jax.world.robots import Robot
 
 GRID = 301
 """Points per side of the grid on which a boundary in the plane is computed."""
@@ -36,7 +38,7 @@ LINES = ("-", "--", ":", "-.")
 """Line styles of the boundaries, one per confined point."""
 
 
-def has_outline(plant: Any) -> bool:
+def has_outline(plant: Robot | plants.Plant) -> bool:
     """Whether a plant is drawn by its outline in the plane."""
     return plants.is_chain(plant) and not is_default(plant.outline, plants.Plant.outline)
 
@@ -68,7 +70,7 @@ def skeletons(plant: Any, q: np.ndarray) -> np.ndarray:
     return found
 
 
-def set_limits(axes: Any, points: np.ndarray, regions: Sequence[Region]) -> np.ndarray:
+def set_limits(axes: Axes, points: np.ndarray, regions: Sequence[Region]) -> np.ndarray:
     """Sets the limits of a panel so that it shows all points and all spheres to stay out of.
 
     Args:
@@ -99,7 +101,7 @@ def set_limits(axes: Any, points: np.ndarray, regions: Sequence[Region]) -> np.n
     return limits
 
 
-def draw_boundaries(axes: Any, robot: Any, regions: Sequence[Region], limits: np.ndarray) -> None:
+def draw_boundaries(axes: Any, robot: Robot, regions: Sequence[Region], limits: np.ndarray) -> None:
     """Draws the boundaries of all regions within the limits (d, 2) of a panel [m].
 
     Boundaries for the same point of the robot have the same line style and one entry in the legend.
