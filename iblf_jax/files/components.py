@@ -106,7 +106,7 @@ def families_of(hint: Any) -> list[Any]:
     return [] if None in named else named
 
 
-def _base_of(option: Any) -> Any:
+def _base_of(option: object) -> Any:
     """The base class of the family that a contract belongs to, such as that of laws for a
     `RobotLaw`; None without one.
     """
@@ -170,7 +170,7 @@ def encode(part: Any, hint: Any, path: str) -> Any:
     return {"kind": name, **encode_fields(part, path)}
 
 
-def _registration(hint: Any, name: str, cls: str, *, is_chain: bool = False) -> str:
+def _registration(hint: object, name: str, cls: str, *, is_chain: bool = False) -> str:
     """The statement that gives a class a name in files.
 
     Args:
@@ -209,7 +209,7 @@ def encode_fields(part: Any, path: str) -> dict[str, Any]:
 # --- from tables
 
 
-def decode(value: Any, hint: Any, path: str) -> Any:
+def decode(value: object, hint: Any, path: str) -> Any:
     """The component, array or tuple of one non-static field; the inverse of `encode`.
 
     Args:

@@ -115,7 +115,7 @@ def _bytes(values: np.ndarray) -> bytes:
     return values.tobytes()
 
 
-def _text(value: Any) -> str:
+def _text(value: object) -> str:
     return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
 
 
@@ -133,5 +133,5 @@ def _canonical(attributes: Mapping[Any, Any]) -> list[Any]:
     return found
 
 
-def _hexadecimal(head: Any, data: bytes = b"") -> str:
+def _hexadecimal(head: object, data: bytes = b"") -> str:
     return hashlib.sha256(json.dumps(head).encode() + data).hexdigest()

@@ -140,7 +140,7 @@ RECORDS: dict[str, tuple[str, str]] = {
 """Name of a class in files, which never changes -> the module of the package and the class."""
 
 
-def save(result: Any, path: str | os.PathLike) -> Path:
+def save(result: object, path: str | os.PathLike) -> Path:
     """Writes a result to a file from which `load` returns an equal one.
 
     Args:
@@ -607,7 +607,7 @@ MAX_NODES_INSIDE = 64
 """Largest depth of nodes, so that a file cannot exhaust the stack."""
 
 
-def _class_of(name: Any, key: str) -> Any:
+def _class_of(name: object, key: str) -> Any:
     """The class of a name in RECORDS."""
     if not isinstance(name, str) or name not in RECORDS:
         raise checks.fail(key, name, "the name of a result", checks.nearest(name, RECORDS))
@@ -615,7 +615,7 @@ def _class_of(name: Any, key: str) -> Any:
     return getattr(importlib.import_module(f"iblf_jax.{module}"), own)
 
 
-def _listed(nodes: Any, key: str) -> list[Any]:
+def _listed(nodes: object, key: str) -> list[Any]:
     """`nodes` if they are a list, else a ValueError."""
     if isinstance(nodes, list):
         return nodes

@@ -30,6 +30,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from iblf_jax.core import checks
 from iblf_jax.core.attributes import attributes
@@ -331,7 +332,7 @@ def _trajectories(run: Rollout, batch: tuple[str, ...]) -> dict[str, Any]:
     """Variables of the signals and of the states of law, observer, actuator and sensor."""
     variables = {}
 
-    def add(name: str, value: Any, unit: str, description: str) -> None:
+    def add(name: str, value: ArrayLike, unit: str, description: str) -> None:
         dims = (*batch, "time", *dimension_names(name, np.shape(value)[len(batch) + 1 :], run.n))
         variables[name] = (dims, np.asarray(value), _attrs(unit, description))
 

@@ -39,6 +39,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import astype
@@ -281,7 +282,7 @@ def _path_of_table(names: list[str], counts: dict[str, int], *, is_entry: bool) 
     return path
 
 
-def _equal(a: Any, b: Any) -> bool:
+def _equal(a: object, b: object) -> bool:
     """Whether two pytrees have the same structure, shapes, precisions and bits."""
     leaves_a, structure_a = jax.tree.flatten(a)
     leaves_b, structure_b = jax.tree.flatten(b)
@@ -290,7 +291,7 @@ def _equal(a: Any, b: Any) -> bool:
     return all(map(_same_bits, leaves_a, leaves_b))
 
 
-def _same_bits(x: Any, y: Any) -> bool:
+def _same_bits(x: ArrayLike, y: ArrayLike) -> bool:
     x, y = np.asarray(x), np.asarray(y)
     return x.shape == y.shape and x.dtype == y.dtype and x.tobytes() == y.tobytes()
 
@@ -381,7 +382,7 @@ def _from_preset(data: dict[str, Any]) -> Scenario:
     return preset_scenario(data["preset"], as_table(data.get("arguments", {}), "arguments"))
 
 
-def preset_scenario(name: Any, arguments: dict[str, Any]) -> Scenario:
+def preset_scenario(name: object, arguments: dict[str, Any]) -> Scenario:
     """The scenario of a preset; validates the preset's name and arguments.
 
     Args:
