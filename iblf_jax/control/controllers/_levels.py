@@ -143,7 +143,7 @@ def _level(
     t: jax.Array,
     x: jax.Array,
     tube: Tube,
-    slope_below: Any,
+    slope_below: jax.Array | None,
     d_hat: jax.Array,
 ) -> Level:
     """The virtual control alpha and the weighted slope of level i + 1 of (S.2).

@@ -76,7 +76,7 @@ from iblf_jax.control.barriers._base import (
     guard_is_active,
     has_ratio,
 )
-from iblf_jax.control.controllers._base import Command, Law, LawContext, decay_of
+from iblf_jax.control.controllers._base import Command, Law, LawContext, State, decay_of
 from iblf_jax.control.controllers._levels import Design, Level, exact_levels, surface_levels
 from iblf_jax.control.controllers.backstepping import (
     check_barrier,
@@ -367,7 +367,7 @@ class BarrierBackstepping(Law):
         return jnp.stack([level.alpha for level in levels[:-1]])
 
     def command(
-        self, t: jax.Array, x: jax.Array, d_hat: jax.Array, context: LawContext, state: Any
+        self, t: jax.Array, x: jax.Array, d_hat: jax.Array, context: LawContext, state: State
     ) -> tuple[Command, Any]:
         """The input u, what belongs to it, and the rates of the filters.
 
@@ -407,7 +407,7 @@ class BarrierBackstepping(Law):
         return command, rates
 
     def levels(
-        self, t: jax.Array, x: jax.Array, d_hat: jax.Array, context: LawContext, state: Any
+        self, t: jax.Array, x: jax.Array, d_hat: jax.Array, context: LawContext, state: State
     ) -> tuple[list[Level], list[Tube]]:
         """What each level computes, and the tube of x_i around alpha_{i-1}, or around beta_{i-1}
         with filters; arguments as `command`.
@@ -440,7 +440,7 @@ class BarrierBackstepping(Law):
         return jnp.stack([w * value for w, value in zip(self.weights, values, strict=True)])
 
     def switching(
-        self, t: jax.Array, x: jax.Array, d_hat: jax.Array, context: LawContext, state: Any
+        self, t: jax.Array, x: jax.Array, d_hat: jax.Array, context: LawContext, state: State
     ) -> jax.Array | None:
         """e_r, (n,), where u jumps at e_r = 0; None for a last barrier without a jump."""
         if not self.barriers[-1].ratio_jumps:
