@@ -26,6 +26,7 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from iblf_jax.core import checks, sparse
 from iblf_jax.core.pytree import component, static
@@ -112,19 +113,19 @@ class Agents(Plant):
         H = np.diag(adjacency.sum(axis=1) + np.asarray(self.leader)) - adjacency
         return tuple(tuple(row) for row in H.tolist())
 
-    def relative_positions(self, positions: Any) -> jax.Array:
+    def relative_positions(self, positions: ArrayLike) -> jax.Array:
         """The relative positions y = (H kron I) p, (..., N m), of the agents at p, (..., N, m)."""
         p = jnp.asarray(positions)
         rows = sparse.times(self.matrix, [p[..., i, :] for i in range(len(self.agents))])
         return jnp.concatenate(rows, axis=-1)
 
-    def positions(self, relative: Any) -> jax.Array:
+    def positions(self, relative: ArrayLike) -> jax.Array:
         """The positions p = (H kron I)^-1 y, (..., N, m), of the first level y, (..., N m), such as
         `run.q`.
         """
         return jnp.stack(self._positions(jnp.asarray(relative)), axis=-2)
 
-    def reference(self, leader: Reference, offsets: Any = 0.0) -> Leader:
+    def reference(self, leader: Reference, offsets: ArrayLike = 0.0) -> Leader:
         """The reference of y with which each agent follows the leader, p_i -> x_0 + offset_i.
 
         Args:
@@ -246,7 +247,14 @@ class Agents(Plant):
             s = jnp.concatenate(sparse.times(transposed, self._parts(s)))
         return jnp.concatenate(self._each(transposed_gain, level, t, x, s))
 
-    def _each(self, function: Callable, level: int, t: jax.Array, x: jax.Array, *vectors: Any):
+    def _each(
+        self,
+        function: Callable,
+        level: int,
+        t: jax.Array,
+        x: jax.Array,
+        *vectors: Any,
+    ):
         """A function of a plant and a level for each agent, in its own coordinates."""
         split = zip(*map(self._parts, vectors), strict=True)
         return [
@@ -355,7 +363,7 @@ class NeighbourModel(Plant):
         """As `Agents`."""
         return self.stack.component_names
 
-    def positions(self, relative: Any) -> jax.Array:
+    def positions(self, relative: ArrayLike) -> jax.Array:
         """As `Agents.positions`."""
         return self.stack.positions(relative)
 
@@ -446,7 +454,7 @@ def _as_agent(i: int, part: Any) -> Any:
         raise checks.fail(f"Agents.agents[{i}]", part, "a plant or a robot") from error
 
 
-def _weights(name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
+def _weights(name: str, value: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
     """The weights of a graph as an array; ValueError for others than finite numbers >= 0."""
     expected = f"finite numbers >= 0, shape {shape}, one for each of {shape[0]} agents"
     try:

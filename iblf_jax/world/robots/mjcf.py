@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -28,6 +28,9 @@ from iblf_jax.world.robots.description import (
 )
 from iblf_jax.world.robots.meshes import Meshes
 from iblf_jax.world.robots.repair import Fault, Weight, checked_weight, symmetric
+
+if TYPE_CHECKING:
+    import mujoco
 
 PLACE = "pos quat axisangle xyaxes zaxis euler"
 ACTUATOR = "name class joint gear ctrlrange ctrllimited forcerange forcelimited inheritrange"
@@ -109,7 +112,7 @@ class Mjcf(NamedTuple):
     speeds: dict[str, float] = {}  # noqa: RUF012
     """Joint -> its largest speed, which an MJCF does not have."""
 
-    def separate_weights(self, spec: Any) -> list[tuple[Any, Weight]]:
+    def separate_weights(self, spec: mujoco.MjSpec) -> list[tuple[Any, Weight]]:
         """Replaces every weight that the library would reject or cannot know by a valid one, and
         returns the weights of the file.
 
@@ -219,7 +222,7 @@ def _tendons(root: ET.Element) -> Tendons:
     return ties
 
 
-def _explicit(body: Any, where: str, balanced: bool) -> Weight | None:
+def _explicit(body: mujoco.MjsBody, where: str, balanced: bool) -> Weight | None:
     """The weight in a body's <inertial>, zero if it has none; None if the library accepts it."""
     if not body.explicitinertial:
         return Weight()
