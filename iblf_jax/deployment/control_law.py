@@ -10,12 +10,14 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 
+from iblf_jax.control import controllers, observers
 from iblf_jax.control.sensors import Ideal, Levels, Measurement
 from iblf_jax.control.sensors._base import measurement_of
 from iblf_jax.core import checks
@@ -24,10 +26,12 @@ from iblf_jax.engine import LOWERING_LIMITS
 from iblf_jax.kernels import Program, Shapes, compile_step, written_out
 from iblf_jax.simulation.closed_loop import discrete_observer, law_update, plant_input
 from iblf_jax.simulation.levels import start_levels
-from iblf_jax.simulation.sampling import nothing_sent
+from iblf_jax.simulation.sampling import SentCommand, nothing_sent
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.world import plants
 from iblf_jax.world.references import Reference
+
+S = TypeVar("S")
 
 
 @component
@@ -65,11 +69,11 @@ class GivenReference(Reference):
 class LawState(NamedTuple):
     """The internal state of the law between samples; the generated C calls it `memory`."""
 
-    controller: Any
-    observer: Any
-    velocity: Any
+    controller: controllers.State
+    observer: observers.State
+    velocity: tuple[Any, ...]
     """The states of the sensor's velocity filters."""
-    sent: Any = ()
+    sent: SentCommand | tuple[()] = ()
     """The `SentCommand` of a law with an event trigger."""
 
 
@@ -81,12 +85,12 @@ class SampleInputs(NamedTuple):
     t: jax.Array
     q: jax.Array
     dq: jax.Array
-    higher: Any = ()
+    higher: jax.Array | tuple[()] = ()
     """Levels of the model from the third on, (r - 2, n); `()` for a model of two levels."""
-    q_d: Any = ()
-    dq_d: Any = ()
-    ddq_d: Any = ()
-    further_d: Any = ()
+    q_d: jax.Array | tuple[()] = ()
+    dq_d: jax.Array | tuple[()] = ()
+    ddq_d: jax.Array | tuple[()] = ()
+    further_d: jax.Array | tuple[()] = ()
     """Derivatives of the reference from the third to the r-th, (r - 2, n)."""
 
 
@@ -142,7 +146,7 @@ def start(scenario: Scenario, inputs: SampleInputs) -> tuple[LawState, jax.Array
     balance = loop.model.steady_input(x[0])
     if balance is None:
         balance = jnp.zeros_like(x[0])
-    sent: Any = ()
+    sent: SentCommand | tuple[()] = ()
     if scenario.sampling.trigger is not None:  # type: ignore[union-attr]
         sent = nothing_sent(balance)
     return LawState(controller, observer, filtered, sent), balance
@@ -280,12 +284,12 @@ def control_law(scenario: Scenario, external_reference: bool) -> ControlLaw:
     return ControlLaw(start_program, sample_program, names, unread, estimate.size, bounds_program)
 
 
-def as_floats(state: Any, dtype: Any) -> Any:
+def as_floats(state: S, dtype: DTypeLike) -> S:
     """The state as floats of one type; integers and flags become 0.0, 1.0, ..."""
     return jax.tree.map(lambda x: x.astype(dtype), state)
 
 
-def of_floats(state: Any, like: Any) -> Any:
+def of_floats(state: S, like: S) -> S:
     """The inverse of `as_floats`, with the types of `like`."""
 
     def converted(x: jax.Array, kind: jax.Array) -> jax.Array:
@@ -296,7 +300,7 @@ def of_floats(state: Any, like: Any) -> Any:
     return jax.tree.map(converted, state, like)
 
 
-def program_of(function: Callable, scenario: Scenario, given: Any, carry: Any) -> Program:
+def program_of(function: Callable, scenario: Scenario, given: object, carry: object) -> Program:
     """The scalar program of `function(scenario, given, carry, index) -> (carry, results)`.
 
     Args:
@@ -324,7 +328,7 @@ def program_of(function: Callable, scenario: Scenario, given: Any, carry: Any) -
     return written_out(step.program)
 
 
-def number_names(tree: Any) -> tuple[str, ...]:
+def number_names(tree: object) -> tuple[str, ...]:
     """Names of the numbers of a pytree of arrays, such as "observer.p[1]"."""
     names = list[str]()
     for path, x in jax.tree_util.tree_flatten_with_path(tree)[0]:

@@ -12,7 +12,7 @@ import math
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -45,12 +45,15 @@ from iblf_jax.world import plants
 from iblf_jax.world.disturbances import Nothing
 from iblf_jax.world.robots import at_time
 
+if TYPE_CHECKING:
+    import mujoco
+
 
 @notices.each_warning_once
 @announced("simulating the plant and the law side by side")
 def cosimulate(
     scenario: Scenario,
-    plant: Any,
+    plant: str | Path | mujoco.MjSpec | mujoco.MjModel,
     *,
     duration: float,
     period: float | None = None,
@@ -406,7 +409,7 @@ def _observed(scenario: Scenario, folds, dt, motion: RecordedMotion, is_gap):
 
 def rollout_of(
     scenario: Scenario,
-    folds: Any,
+    folds: tuple[Fold, ...],
     motion: RecordedMotion,
     dt: float,
     record_every: int,

@@ -16,6 +16,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
+from numpy.typing import ArrayLike
 
 from iblf_jax.control.actuators import Ideal
 from iblf_jax.core import checks, notices, taylor
@@ -120,7 +122,7 @@ def export(
     method: str = "rk4",
     seed: int = 0,
     gains: Sequence[Any] | None = None,
-    torque_limits: Any = None,
+    torque_limits: ArrayLike | None = None,
     on_fault: str = "hold",
 ) -> Exported:
     """Writes a scenario's law, or its complete closed loop, as code that runs without JAX.
@@ -321,7 +323,7 @@ def _export_loop(
     return Exported(folder, target, files, operations_of(loop.step), sizes, paths)
 
 
-def checked_name(name: Any, default: str) -> str:
+def checked_name(name: str | None, default: str) -> str:
     """The prefix of all names in the code; ValueError if it is invalid."""
     if name is None:
         return default
@@ -415,7 +417,7 @@ def _first_torque(scenario: Scenario) -> jax.Array:
     return jnp.where(jnp.isfinite(rate.dq), found.tau, rate.dq)[None]
 
 
-def _rounded(x: Any, samples: int, dtype: Any) -> jax.Array:
+def _rounded(x: jax.Array, samples: int, dtype: DTypeLike) -> jax.Array:
     """The first samples, rounded to DECIMALS so that the written inputs are short."""
     return jnp.asarray(np.round(np.asarray(x[:samples], float), DECIMALS), dtype)
 

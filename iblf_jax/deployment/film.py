@@ -9,7 +9,7 @@ import sys
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from PIL import Image
@@ -17,6 +17,9 @@ from PIL import Image
 from iblf_jax.deployment.mujoco_plant import MujocoPlant
 from iblf_jax.plotting.animation import animate, frame_times, write_film
 from iblf_jax.simulation.results import Rollout
+
+if TYPE_CHECKING:
+    import mujoco
 
 FPS = 25.0
 SIZE = (480, 640)
@@ -49,7 +52,7 @@ def film_run(
     return write_film(pictures, path, FPS)
 
 
-def has_shapes(model: Any) -> bool:
+def has_shapes(model: mujoco.MjModel) -> bool:
     """Whether MuJoCo's picture of a model shows something that moves.  The arm of a URDF whose mesh
     files are missing has no shapes.
     """
@@ -70,7 +73,9 @@ def _can_draw() -> bool:
     return done.returncode == 0
 
 
-def _pictures(renderer: Any, robot: MujocoPlant, positions: np.ndarray) -> Iterator[np.ndarray]:
+def _pictures(
+    renderer: mujoco.Renderer, robot: MujocoPlant, positions: np.ndarray
+) -> Iterator[np.ndarray]:
     data = robot.mujoco.MjData(robot.model)
     for place in positions:
         data.qpos[:] = place

@@ -4,7 +4,7 @@ and actuator, with the steps of `simulate`.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -66,7 +66,7 @@ class RunSettings(NamedTuple):
     """The inputs of a run besides its scenario."""
 
     dt: jax.Array
-    noise: Any
+    noise: jax.Array | tuple[()]
     """The key of a sensor's noise, (4,); empty without noise."""
 
 

@@ -424,7 +424,7 @@ def _scenario_row(law: Law) -> str:
     return f"\n| `scenario.toml` | the exported scenario: {repeats} |"
 
 
-def _users_classes(part: Any) -> set[str]:
+def _users_classes(part: object) -> set[str]:
     """The names of the classes of a scenario's parts that are defined outside this package."""
     if isinstance(part, tuple | list):
         return set().union(*map(_users_classes, part))

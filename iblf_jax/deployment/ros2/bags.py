@@ -8,7 +8,6 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections.abc import Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -172,7 +171,7 @@ def read_bag(
     return rollout_of(scenario, folds, motion, dt, 1, "recorded", is_gap)
 
 
-def _log(path: Any, scenario: Scenario, options: BagOptions) -> dict[str, np.ndarray]:
+def _log(path: str | os.PathLike, scenario: Scenario, options: BagOptions) -> dict[str, np.ndarray]:
     """The signals of a recording."""
     what = "a rosbag2 recording"
     place = checks.file_path("path", path, what)

@@ -19,6 +19,7 @@ from xml.sax.saxutils import escape
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from iblf_jax import __version__
 from iblf_jax.core import checks, notices
@@ -99,7 +100,9 @@ def check_ros_name(name: str) -> None:
     raise checks.fail("name", name, expected, 'It names the ROS package: name="arm_law".')
 
 
-def ros_options(scenario: Scenario, gains: Any, torque_limits: Any, on_fault: str) -> RosOptions:
+def ros_options(
+    scenario: Scenario, gains: Any, torque_limits: ArrayLike | None, on_fault: str
+) -> RosOptions:
     """The options of a package.
 
     Args:
@@ -123,7 +126,7 @@ def ros_options(scenario: Scenario, gains: Any, torque_limits: Any, on_fault: st
     return RosOptions(_gains(scenario, gains), limits, on_fault)
 
 
-def _torque_limits(scenario: Scenario, given: Any) -> np.ndarray:
+def _torque_limits(scenario: Scenario, given: ArrayLike | None) -> np.ndarray:
     """The largest torques, (n,) [N m]: the given ones, at most those of the model."""
     n = scenario.n
     effort = scenario.model.effort
@@ -194,7 +197,7 @@ def _warn_of_default_range(gain: GainOption) -> None:
     )
 
 
-def _range_end(given: Any, numbers: np.ndarray) -> np.ndarray:
+def _range_end(given: ArrayLike | None, numbers: np.ndarray) -> np.ndarray:
     """An end of a range: the given one, as that of `tune` has passed through a logarithm."""
     if given is None or np.size(given) not in (1, numbers.size):
         return numbers

@@ -5,11 +5,13 @@ from __future__ import annotations
 import gc
 import time
 from collections.abc import Callable, Sequence
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from iblf_jax.control.sensors import Ideal
+from iblf_jax.control.sensors._base import AnySensor
 from iblf_jax.core import checks
 from iblf_jax.deployment.cosimulate import own_step
 from iblf_jax.deployment.mujoco_plant import INTEGRATORS, MujocoPlant
@@ -55,7 +57,7 @@ def robot_node(
     real_time: bool = False,
     dt: float | None = None,
     integrator: str | None = "RK4",
-    sensor: Any = None,
+    sensor: AnySensor | None = None,
     delay: float = 0.0,
     state_dropout: float = 0.0,
     effort_dropout: float = 0.0,
@@ -489,7 +491,7 @@ class SimulatedRobot:
         )
 
 
-def _executor(rclpy: Any, context: Any) -> Any:
+def _executor(rclpy: ModuleType, context: object) -> Any:
     """An executor of callbacks; the one of events has a quarter of the latency."""
     try:
         from rclpy.experimental import EventsExecutor

@@ -44,6 +44,7 @@ from iblf_jax.deployment.ros2.node.supervisor import (
     UNKNOWN,
     Command,
     Configuration,
+    Fault,
     FaultKind,
     Mode,
     Sender,
@@ -71,7 +72,7 @@ class RefusedError(ValueError):
     """A parameter with which the node does not start."""
 
 
-def refused(field: str, value: Any, expected: str, remedy: str) -> RefusedError:
+def refused(field: str, value: object, expected: str, remedy: str) -> RefusedError:
     """An error that names the parameter, its value, the expected value and the remedy."""
     return RefusedError(f"{field}: got {value}, expected {expected}. {remedy}")
 
@@ -441,7 +442,7 @@ class LawNode(Node):  # type: ignore[misc]
         return DiagnosticStatus.WARN if is_warning else DiagnosticStatus.OK
 
 
-def _fault_text(fault: Any) -> str:
+def _fault_text(fault: Fault) -> str:
     return f"{fault.kind.value}: {fault.reason}"
 
 
@@ -491,7 +492,7 @@ def _numbers(value: Any) -> list[float]:
     return []
 
 
-def _why_refused_origin(value: Any) -> str:
+def _why_refused_origin(value: object) -> str:
     """Why a value of `time_origin` is refused; empty if it is valid."""
     if isinstance(value, float) and (math.isnan(value) or abs(value) < LARGEST_STAMP):
         return ""
@@ -529,7 +530,7 @@ def _spin(executor: Any) -> None:
     """Runs the callbacks of an executor until a signal asks the process to end."""
     ended = [False]
 
-    def end(*_: Any) -> None:
+    def end(*_: object) -> None:
         ended[0] = True
 
     for number in SIGNALS:
