@@ -178,7 +178,7 @@ def output_folder(name: str) -> Path:
 # ------------------------------------------------------------------------------- numbers as text
 
 
-def write_json(path: Path, value: Any) -> None:
+def write_json(path: Path, value: object) -> None:
     """Writes strict JSON."""
     from iblf_jax.core import tables
 
