@@ -16,7 +16,7 @@ from typing import ClassVar, NamedTuple, cast
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
+from numpy.typing import ArrayLike
 
 from iblf_jax.control import controllers, observers
 from iblf_jax.core import checks
