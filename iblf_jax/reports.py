@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import numpy as np
+from numpy.typing import ArrayLike
 
 from iblf_jax.core import checks, notices, tables
 from iblf_jax.core.attributes import has_members
@@ -71,12 +72,12 @@ class Shown(NamedTuple):
     on_card: int = 1
 
 
-def _contents(result: Any) -> Content:
+def _contents(result: object) -> Content:
     """What a result prints; that of another object of this package is its text."""
     return result._content() if isinstance(result, Result) else repr(result).splitlines()
 
 
-def _described(result: Any) -> list[str]:
+def _described(result: object) -> list[str]:
     """The lines of a result without the name of its class, which is in the title."""
     lines = [line for line in _contents(result) if isinstance(line, str)]
     match = re.fullmatch(rf"{type(result).__name__}(?:\((.*)\)| of (.*)|: (.*))", lines[0])
@@ -99,7 +100,7 @@ def _parts_of(scenario: Scenario) -> str:
     return tables.as_html(("part", "kind", "parameters"), rows)
 
 
-def _kind(part: Any) -> str:
+def _kind(part: object) -> str:
     """The class of a component, with the class of the law or the barrier inside it."""
     inner = getattr(part, wrapped_field(part) or "barrier", None)
     if inner is None:
@@ -115,7 +116,7 @@ MAX_LEAVES = 4
 """Largest number of parameters of a component in the table of a scenario."""
 
 
-def _short(value: Any) -> str:
+def _short(value: ArrayLike) -> str:
     if not checks.is_concrete(value):
         return "traced"
     options: dict[str, Any] = {"precision": 4, "threshold": 7, "edgeitems": 2, "separator": ", "}
@@ -334,7 +335,7 @@ def _lines(words: Sequence[str]) -> str:
     return f"<p>{text}</p>" if words else ""
 
 
-def card(result: Any) -> str:
+def card(result: object) -> str:
     """The card of a result in a notebook: title, text, first table and first figure, as HTML."""
     parts = shown(result)
     text = [f"<b>{html.escape(parts.title)}</b>", _lines(parts.words)]
@@ -346,7 +347,7 @@ def card(result: Any) -> str:
 
 @notices.each_warning_once
 @announced("writing a report; the bands of a study simulate its runs again")
-def report(result: Any, path: str | Path, *, title: str | None = None) -> Path:
+def report(result: object, path: str | Path, *, title: str | None = None) -> Path:
     """Writes a result as one self-contained HTML file with text, tables, figures, the scenario and
     the versions.
 

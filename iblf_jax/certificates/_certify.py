@@ -8,7 +8,7 @@ and the traces. `_over_runs` combines the certificates of many runs.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from typing import Any
 
 import jax
@@ -68,7 +68,7 @@ AT_CHECKS = "measured; it holds at the instants at which the condition of the tr
 @takes_runs
 def certify(
     scenario: Scenario,
-    run: Any = None,
+    run: Rollout | Study | None = None,
     *,
     duration: float = 20.0,
     dt: float = 1e-3,
@@ -124,7 +124,11 @@ def certify(
     if isinstance(scenario, Rollout | Study):
         remedy = "Pass certify(scenario, run) or certify(scenario, study)."
         raise checks.fail("scenario", type(scenario).__name__, "a Scenario", remedy)
-    scenario = _with_history_of(canonical(scenario), run, dt)
+    scenario = canonical(scenario)
+    if scenario.actuator.input_delay is not None:
+        # The scenario gets as many past commands as the run has.
+        step = run.dt if isinstance(run, Rollout | Study) else dt
+        scenario = with_history(scenario, float(step))
     if not checks.is_concrete(scenario):
         remedy = "certify works on the host: call it outside jit, vmap and grad."
         raise checks.fail("scenario", "traced values", "numbers", remedy)
@@ -140,30 +144,14 @@ def certify(
         if not run.is_batch:
             return _certificate_of(run)
         return _over_runs((i, run[i]) for i in range(len(run)))
-    return _over_runs(_runs_of_study(scenario, run, worst))
-
-
-def _with_history_of(scenario: Scenario, run: Any, dt: float) -> Scenario:
-    """The scenario with as many past commands as the run has, where its input has a delay."""
-    if scenario.actuator.input_delay is None:
-        return scenario
-    step = run.dt if isinstance(run, Rollout | Study) else dt
-    return with_history(scenario, float(step))
+    if not isinstance(run, Study):
+        remedy = "Pass what ij.simulate or ij.monte_carlo returned."
+        raise checks.fail("run", run, "a Rollout, a study or None", remedy)
+    _check_same(scenario, canonical(run.scenario), numbers=True)
+    return _over_runs((i, _replayed(run, i)) for i in _nearest_to_bounds(run, worst))
 
 
 # --- the runs ------------------------------------------------------------------------------------
-
-
-def _runs_of_study(
-    scenario: Scenario, study: Study, worst: int | None
-) -> Iterator[tuple[int, Rollout]]:
-    """The runs of a study to check; ValueError for a study of another scenario."""
-    if not isinstance(study, Study):
-        remedy = "Pass what ij.simulate or ij.monte_carlo returned."
-        raise checks.fail("run", study, "a Rollout, a study or None", remedy)
-    _check_same(scenario, canonical(study.scenario), numbers=True)
-    for index in _nearest_to_bounds(study, worst):
-        yield index, _replayed(study, index)
 
 
 def _on_host(run: Rollout) -> Rollout:
@@ -365,7 +353,7 @@ def _trigger_lines(run: Rollout) -> tuple[Line, ...]:
     sampling, law = scenario.sampling, scenario.controller
     if sampling is None or sampling.trigger is None:
         return ()
-    trigger: Any = sampling.trigger
+    trigger = sampling.trigger
     if isinstance(law, EventCompensated):
         return (measured(COMPENSATED, AT_CHECKS, value=float(excess(law))),)
     inner = unwrapped(law)

@@ -76,7 +76,7 @@ class Line:
         """
         if self.margin is None and self.value is None:
             return ""
-        joint: Any = None
+        joint: str | None = None
         if self.joint is not None:
             joint = joints[self.joint] if joints else f"joint {self.joint}"
         parts = (

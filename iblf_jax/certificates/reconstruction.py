@@ -18,7 +18,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator
 from functools import partial
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -32,6 +32,7 @@ from iblf_jax.core.status import UNTRUSTED, Status, describe, has_flag
 from iblf_jax.engine import Step, step_states
 from iblf_jax.simulation import discontinuities
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state
+from iblf_jax.simulation.results import Rollout
 from iblf_jax.world.plants import Plant
 
 if TYPE_CHECKING:
@@ -52,6 +53,9 @@ STATES = {
 """Part of a state -> kind of its tolerance."""
 OWN_UNITS = ("controller_state", "observer_state", "x[2:]")
 """Parts with units of their own, hence with their own scale if it is larger."""
+
+
+T = TypeVar("T")
 
 
 class TimeGrid(NamedTuple):
@@ -81,12 +85,12 @@ class Steps(NamedTuple):
     """Error of the integrator in |f_tilde|^2/2 over one step from each."""
 
 
-def is_valid(run: Any) -> bool:
+def is_valid(run: Rollout) -> bool:
     """Whether the status of a run leaves its numbers meaningful."""
     return not int(run.status) & int(UNTRUSTED)
 
 
-def time_grid(run: Any) -> TimeGrid:
+def time_grid(run: Rollout) -> TimeGrid:
     """The steps of a run; ValueError if its samples do not determine them."""
     t, dt = np.asarray(run.t, float), float(run.dt)
     every = (run.steps or 0) + 1
@@ -112,7 +116,7 @@ def time_grid(run: Any) -> TimeGrid:
     return TimeGrid(every, last, last * dt)
 
 
-def steps_of(run: Any, grid: TimeGrid, claims: tuple[Claim, ...]) -> Iterator[Steps]:
+def steps_of(run: Rollout, grid: TimeGrid, claims: tuple[Claim, ...]) -> Iterator[Steps]:
     """All steps of one run, its arrays on the host, in order, in blocks, with the terms of some
     claims about its scenario.
 
@@ -122,7 +126,11 @@ def steps_of(run: Any, grid: TimeGrid, claims: tuple[Claim, ...]) -> Iterator[St
     valid, sizes = is_valid(run), tolerances(run)
     blocks = _integrated_again(run, grid) if valid else _as_recorded(run, grid)
     for index, states in blocks:
-        steps = _with_terms(run, index, states, grid, claims)
+        t, padded = index.astype(run.t.dtype) * run.dt, padded_index(index.size)
+        padded_states = _rows(jax.tree.map(np.asarray, states), padded)
+        found = terms_along(run, index[padded], padded_states, claims)
+        terms, sample, defect, defect_f = _rows(found, slice(0, index.size))
+        steps = Steps(t, sample, terms, index % grid.record_every == 0, defect, defect_f)
         if valid:
             _check_signals(run, steps, index[steps.recorded] // grid.record_every, sizes)
         yield steps
@@ -131,17 +139,17 @@ def steps_of(run: Any, grid: TimeGrid, claims: tuple[Claim, ...]) -> Iterator[St
 # --- the states of all steps ---------------------------------------------------------------------
 
 
-def _recorded_states(run: Any) -> LoopState:
+def _recorded_states(run: Rollout) -> LoopState:
     """The states at the recorded samples."""
     return LoopState(run.x, run.controller_state, run.observer_state, run.actuator_state)
 
 
-def _rows(tree: Any, rows: Any) -> Any:
+def _rows(tree: T, rows: np.ndarray | slice | tuple[slice, int]) -> T:
     """Some rows of every array of a pytree."""
     return jax.tree.map(lambda x: x[rows], tree)
 
 
-def _as_recorded(run: Any, grid: TimeGrid) -> Iterator[tuple[np.ndarray, LoopState]]:
+def _as_recorded(run: Rollout, grid: TimeGrid) -> Iterator[tuple[np.ndarray, LoopState]]:
     """Numbers and states of the recorded steps only."""
     states = _recorded_states(run)
     for first in range(0, run.t.size, BLOCK_STEPS):
@@ -149,7 +157,7 @@ def _as_recorded(run: Any, grid: TimeGrid) -> Iterator[tuple[np.ndarray, LoopSta
         yield rows * grid.record_every, _rows(states, rows)
 
 
-def _integrated_again(run: Any, grid: TimeGrid) -> Iterator[tuple[np.ndarray, LoopState]]:
+def _integrated_again(run: Rollout, grid: TimeGrid) -> Iterator[tuple[np.ndarray, LoopState]]:
     """Numbers and states of all steps, integrated again from each recorded sample to the next.
 
     A block holds the intervals of several samples where these are short, and a part of one interval
@@ -236,7 +244,7 @@ class AdvanceStep(Step):
         return at._replace(state=result.state), (at.state, energies)
 
 
-def _positions(index: np.ndarray, states: LoopState, dt: Any, substeps: int = 1) -> Position:
+def _positions(index: np.ndarray, states: LoopState, dt: jax.Array, substeps: int = 1) -> Position:
     """Positions of some steps, in time steps of dt divided by `substeps`."""
     dtype = np.asarray(dt).dtype
     steps = (substeps * index).astype(dtype)
@@ -245,7 +253,7 @@ def _positions(index: np.ndarray, states: LoopState, dt: Any, substeps: int = 1)
 
 
 def _advance(
-    run: Any, first: np.ndarray, states: LoopState, length: int
+    run: Rollout, first: np.ndarray, states: LoopState, length: int
 ) -> tuple[LoopState, LoopState]:
     """States after `length` steps from each of some states, and along the way."""
     at = _positions(first, states, run.dt)
@@ -262,20 +270,8 @@ def padded_index(size: int) -> np.ndarray:
     return np.minimum(np.arange(BLOCK_STEPS), size - 1)
 
 
-def _with_terms(
-    run: Any, index: np.ndarray, states: LoopState, grid: TimeGrid, claims: tuple[Claim, ...]
-) -> Steps:
-    """The steps with the terms of some claims."""
-    size, padded = index.size, padded_index(index.size)
-    t = index.astype(run.t.dtype) * run.dt
-    padded_states = _rows(jax.tree.map(np.asarray, states), padded)
-    found = terms_along(run, index[padded], padded_states, claims)
-    terms, sample, defect, defect_f = _rows(found, slice(0, size))
-    return Steps(t, sample, terms, index % grid.record_every == 0, defect, defect_f)
-
-
 def terms_along(
-    run: Any, index: np.ndarray, states: LoopState, claims: tuple[Claim, ...]
+    run: Rollout, index: np.ndarray, states: LoopState, claims: tuple[Claim, ...]
 ) -> tuple[Any, Any, np.ndarray, np.ndarray]:
     """Terms of claims, samples and integration errors at some steps of a run.
 
@@ -317,7 +313,7 @@ def _defect(energy: jax.Array) -> np.ndarray:
 # --- comparison with what the run recorded -------------------------------------------------------
 
 
-def tolerances(run: Any) -> dict[str, float]:
+def tolerances(run: Rollout) -> dict[str, float]:
     """Admissible differences between recorded and reconstructed signals, by kind [rad, rad/s,
     N m].
     """
@@ -348,7 +344,7 @@ def _parts_of_state(state: LoopState) -> dict[str, Any]:
 
 
 def _check_arrival(
-    run: Any, recorded: LoopState, reconstructed: LoopState, rows: np.ndarray
+    run: Rollout, recorded: LoopState, reconstructed: LoopState, rows: np.ndarray
 ) -> None:
     """Raises ValueError if the reconstructed states are not those that the run recorded."""
     sizes = tolerances(run)
@@ -363,7 +359,7 @@ def _check_arrival(
             _compare(run, label, kept, made, rows, tolerance)
 
 
-def _check_signals(run: Any, steps: Steps, rows: np.ndarray, sizes: dict[str, float]) -> None:
+def _check_signals(run: Rollout, steps: Steps, rows: np.ndarray, sizes: dict[str, float]) -> None:
     """Raises ValueError if the signals of the scenario at recorded states are not those that the
     run recorded.
     """
@@ -376,7 +372,7 @@ def _check_signals(run: Any, steps: Steps, rows: np.ndarray, sizes: dict[str, fl
 
 
 def _compare(
-    run: Any,
+    run: Rollout,
     name: str,
     recorded: np.ndarray,
     reconstructed: np.ndarray,
@@ -401,7 +397,7 @@ def _compare(
     )
 
 
-def check_status(run: Any, distance: float) -> None:
+def check_status(run: Rollout, distance: float) -> None:
     """Raises ValueError if the status of a run contradicts the smallest distance to a bound over
     all its steps [rad] beyond rounding.
     """

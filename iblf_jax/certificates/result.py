@@ -165,9 +165,13 @@ class Certificate(Result):
         if self.inaccurate:
             shown.append(self.accuracy_note)
         shown += tables.as_text(rows)
-        notes = [f"  {'; '.join(names)}: {note}" for note, names in self._notes().items()]
+        notes: dict[str, list[str]] = {}
+        for line in self.applicable:
+            if line.note:
+                notes.setdefault(line.note, []).append(line.name)
         if notes:
-            shown += ["notes", *notes]
+            shown.append("notes")
+            shown += [f"  {'; '.join(names)}: {note}" for note, names in notes.items()]
         if self.omitted:
             shown.append(self.omitted)
         return "\n".join(shown)
@@ -212,8 +216,12 @@ class Certificate(Result):
         """How many lines do not apply, and why, in one sentence; "" if all apply."""
         reasons: dict[str, list[str]] = {}
         for line in self.lines:
-            if not line.applies:
-                reasons.setdefault(_reason(line.note), []).append(line.name)
+            if line.applies:
+                continue
+            reason = line.note
+            if reason.startswith(OBSERVED_ONLY):
+                reason = reason.removeprefix(OBSERVED_ONLY).removesuffix(")")
+            reasons.setdefault(reason, []).append(line.name)
         count = sum(map(len, reasons.values()))
         if count == 0:
             return ""
@@ -224,14 +232,6 @@ class Certificate(Result):
             return f"{subject}, because {next(iter(reasons))}."
         parts = [f"{_listed(names)}, because {reason}" for reason, names in reasons.items()]
         return f"{subject}: {'; '.join(parts)}."
-
-    def _notes(self) -> dict[str, list[str]]:
-        """Each note and the lines that it belongs to."""
-        notes: dict[str, list[str]] = {}
-        for line in self.applicable:
-            if line.note:
-                notes.setdefault(line.note, []).append(line.name)
-        return notes
 
     @property
     def subject(self) -> str:
@@ -277,13 +277,6 @@ class Certificate(Result):
 def _listed(names: list[str]) -> str:
     """The names of lines, or their number where there are many."""
     return ", ".join(names) if len(names) <= MAX_LISTED else f"{len(names)} lines"
-
-
-def _reason(note: str) -> str:
-    """Why a line does not apply, from its note."""
-    if note.startswith(OBSERVED_ONLY):
-        return note.removeprefix(OBSERVED_ONLY).removesuffix(")")
-    return note
 
 
 def _number(value: float | None, unit: str) -> str:

@@ -41,6 +41,7 @@ from iblf_jax.certificates.terms import rounding
 from iblf_jax.control.controllers import AdaptiveParameters, Saturated
 from iblf_jax.core.pytree import layers, unwrapped
 from iblf_jax.core.status import UNTRUSTED, describe
+from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.units import status_words
 
@@ -70,11 +71,11 @@ class DecayBound(NamedTuple):
 class Summary:
     """Quantities of a whole run, and the claims about its scenario."""
 
-    run: Any
-    """The Rollout, its arrays on the host."""
+    run: Rollout
+    """Its arrays are on the host."""
     claims: tuple[Claim, ...]
-    extrema: Any
-    """`Extrema` over all steps."""
+    extrema: Extrema
+    """Over all steps."""
     duration: float
     """[s]."""
 
@@ -211,7 +212,7 @@ class Segment(NamedTuple):
     """By key of the claim and case."""
 
 
-def summarise(run: Any, claims: Sequence[Claim]) -> tuple[Summary, Iterator[Segment]]:
+def summarise(run: Rollout, claims: Sequence[Claim]) -> tuple[Summary, Iterator[Segment]]:
     """The summary of one run, its arrays on the host, and its segments in order."""
     grid, claims = time_grid(run), tuple(claims)
     if grid.last <= KEPT_STEPS:
@@ -272,7 +273,7 @@ def largest_norm(values: np.ndarray) -> np.ndarray:
 
 
 def _summary(
-    run: Any, grid: TimeGrid, claims: tuple[Claim, ...], all_steps: Iterable[Steps]
+    run: Rollout, grid: TimeGrid, claims: tuple[Claim, ...], all_steps: Iterable[Steps]
 ) -> Summary:
     """Extremes over all steps, and the constants that follow from them."""
     extrema = Extrema()

@@ -31,6 +31,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 
 from iblf_jax.control.barriers import Barrier
 from iblf_jax.control.controllers import (
@@ -40,6 +41,7 @@ from iblf_jax.control.controllers import (
     LawContext,
     RobotLaw,
     Saturated,
+    TrackingLaw,
 )
 from iblf_jax.control.controllers._base import law_of_x, layers_with_states
 from iblf_jax.core.linalg import matvec, solve_spd
@@ -99,7 +101,7 @@ class Terms(NamedTuple):
     """Terms that claims add, a dict: by the key of the claim, TORQUE or ESTIMATED."""
 
 
-def rounding(dtype: Any) -> float:
+def rounding(dtype: DTypeLike) -> float:
     """The relative error that is attributed to rounding in sums of this floating-point type."""
     return DECAY_ROUNDING * float(jnp.finfo(dtype).eps)
 
@@ -244,7 +246,7 @@ class TorquePoint(Point):
             torques = torques + jnp.abs(self.now[name])
         return jnp.sum(jnp.abs(slope[1]) * jnp.abs(solve_spd(self.M0, torques)))
 
-    def differs_from_command(self, law: Any, law_state: Any) -> jax.Array:
+    def differs_from_command(self, law: TrackingLaw, law_state: Any) -> jax.Array:
         """Whether the torque differs from the command of a law, () bool.  A smooth limit changes it
         before the limit is reached, which the status flags do not show.
         """
@@ -263,7 +265,7 @@ def _differ(commanded: jax.Array, applied: jax.Array) -> jax.Array:
 def _signals(scenario: Scenario, t: jax.Array, state: LoopState) -> tuple[dict[str, Any], Sample]:
     """The signals that are differentiated along the vector field of the loop, and the sample."""
     state_rate, sample = evaluate(scenario, t, state)
-    law: Any = unwrapped(scenario.controller)
+    law: TrackingLaw = unwrapped(scenario.controller)
     barrier_slope = jnp.zeros_like(state.q)
     if isinstance(law, Backstepping | BarrierBackstepping):
         barrier, weight = on_position(law)

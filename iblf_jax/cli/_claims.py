@@ -14,6 +14,9 @@ import numpy as np
 from iblf_jax.core.status import Status, has_flag
 
 if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from iblf_jax.control.barriers import Barrier
     from iblf_jax.simulation.results import Rollout
 
 Pair = Mapping[str, "Rollout"]
@@ -59,7 +62,7 @@ def paper_claims(runs: Pair) -> list[PaperClaim]:
     ]
 
 
-def each_joint(values: Any, unit: str) -> str:
+def each_joint(values: ArrayLike, unit: str) -> str:
     """One number per joint as text, such as 0.99 / 0.71 s."""
     numbers = np.ravel(np.asarray(values, float))
     shown = " / ".join(f"{x:.3g}" if np.isfinite(x) else "never" for x in numbers)
@@ -70,11 +73,11 @@ def _versus(by_name: Mapping[str, Any], unit: str) -> str:
     return ", ".join(f"{name} {each_joint(values, unit)}" for name, values in by_name.items())
 
 
-def _peak(values: Any) -> np.ndarray:
+def _peak(values: ArrayLike) -> np.ndarray:
     return np.abs(np.asarray(values)).max(axis=0)
 
 
-def _late_peak(run: Rollout, values: Any) -> np.ndarray:
+def _late_peak(run: Rollout, values: ArrayLike) -> np.ndarray:
     """The peak over the second half of a run, (n,)."""
     t = np.asarray(run.t)
     return _peak(np.asarray(values)[t >= 0.5 * t[-1]])
@@ -214,7 +217,7 @@ def small_neighbourhood(runs: Pair) -> PaperClaim:
     )
 
 
-def _along(run: Rollout, barrier: Any) -> tuple[np.ndarray, np.ndarray]:
+def _along(run: Rollout, barrier: Barrier) -> tuple[np.ndarray, np.ndarray]:
     """V1 of a barrier and xi at every sample of a run, (T, n) each.
 
     Both come from one evaluation of the bounds, so that no rounding separates them.
@@ -286,7 +289,7 @@ def assumed_briefly(runs: Pair) -> str:
     return f"Masses {masses} kg and lengths {lengths} m are assumed: the paper prints none."
 
 
-def _all_digits(values: Any) -> str:
+def _all_digits(values: ArrayLike) -> str:
     """One number per joint as text, in six significant digits."""
     return " / ".join(f"{x:.6g}" for x in np.ravel(np.asarray(values, float)))
 

@@ -79,7 +79,7 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
 def scenario_of(args: argparse.Namespace) -> ScenarioFile:
     """The scenario of the arguments with its changes, and the [run] table of its file."""
     from iblf_jax.files.scenario import ScenarioFile, from_dict, load_scenario_file
-    from iblf_jax.files.values import numbers
+    from iblf_jax.files.values import did_you_mean, numbers
     from iblf_jax.presets import PRESETS
     from iblf_jax.simulation.paths import with_parameters
 
@@ -95,7 +95,11 @@ def scenario_of(args: argparse.Namespace) -> ScenarioFile:
             " for parameters."
         )
     else:
-        _check_exists(args.scenario)
+        if not Path(args.scenario).is_file():
+            remedy = did_you_mean(args.scenario, PRESETS)
+            if args.scenario.endswith(".toml"):
+                remedy = "Give the path of a scenario file."
+            raise ValueError(f"{args.scenario}: no such file, and no such preset. {remedy}")
         file = load_scenario_file(args.scenario)
     changes = assignments("--set", args.set)
     try:
@@ -103,18 +107,6 @@ def scenario_of(args: argparse.Namespace) -> ScenarioFile:
         return ScenarioFile(with_parameters(file.scenario, changes), file.run)
     except ValueError as error:
         raise ValueError(f"--set: {error}") from error
-
-
-def _check_exists(name: str) -> None:
-    from iblf_jax.files.values import did_you_mean
-    from iblf_jax.presets import PRESETS
-
-    if Path(name).is_file():
-        return
-    remedy = did_you_mean(name, PRESETS)
-    if name.endswith(".toml"):
-        remedy = "Give the path of a scenario file."
-    raise ValueError(f"{name}: no such file, and no such preset. {remedy}")
 
 
 def assignments(option: str, words: list[str]) -> dict[str, Any]:
@@ -186,7 +178,7 @@ def output_folder(name: str) -> Path:
 # ------------------------------------------------------------------------------- numbers as text
 
 
-def write_json(path: Path, value: Any) -> None:
+def write_json(path: Path, value: object) -> None:
     """Writes strict JSON."""
     from iblf_jax.core import tables
 

@@ -123,7 +123,10 @@ def as_markdown(claims: Sequence[PaperClaim], peaks_text: str, assumption: str, 
       assumption: the numbers that the paper does not print.
       remark: on the comparison of the two laws.
     """
-    numbered = [f"{i}. {_claim_line(claim)}" for i, claim in enumerate(claims, 1)]
+    numbered = []
+    for i, claim in enumerate(claims, 1):
+        verdict = "held" if claim.confirmed else "did not hold"
+        numbered.append(f"{i}. {claim.claim} **{verdict}**: {claim.detail}")
     parts = [
         "# The simulation of Zhang & Yan (2024), section 4",
         f"**Assumed:** {assumption}",
@@ -138,11 +141,6 @@ def as_markdown(claims: Sequence[PaperClaim], peaks_text: str, assumption: str, 
         *map(_figure_section, COMPARISONS),
     ]
     return "\n\n".join(parts) + "\n"
-
-
-def _claim_line(claim: PaperClaim) -> str:
-    verdict = "held" if claim.confirmed else "did not hold"
-    return f"{claim.claim} **{verdict}**: {claim.detail}"
 
 
 def _figure_section(one: FigureComparison) -> str:

@@ -65,7 +65,11 @@ def run_study(args: argparse.Namespace, work: Callable[[dict[str, Any]], int]) -
     from iblf_jax.studies import WorkerError
     from iblf_jax.studies.store import StoreError, StoreWriteError
 
-    _check_out(args.out)
+    if args.out is not None:
+        if Path(args.out).suffix != ".nc":
+            raise ValueError(f"--out: got {args.out!r}, expected a file that ends in .nc.")
+        if not Path(args.out).absolute().parent.is_dir():
+            raise ValueError(f"--out: got {args.out!r}, expected a file in a folder that exists.")
     _set_devices(args.devices)
     try:
         with _executor(args) as executor:
@@ -118,15 +122,6 @@ def _executor(args: argparse.Namespace) -> Iterator[Any]:
     with Client(args.dask, timeout=DASK_TIMEOUT) as client:
         client.register_worker_callbacks(initialize_worker)
         yield client.get_executor()
-
-
-def _check_out(name: str | None) -> None:
-    if name is None:
-        return
-    if Path(name).suffix != ".nc":
-        raise ValueError(f"--out: got {name!r}, expected a file that ends in .nc.")
-    if not Path(name).absolute().parent.is_dir():
-        raise ValueError(f"--out: got {name!r}, expected a file in a folder that exists.")
 
 
 def write_netcdf(data: xarray.Dataset, name: str | None) -> None:

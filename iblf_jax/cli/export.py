@@ -104,18 +104,6 @@ def _tunable(text: str) -> Any:
     return tunable(path, low, high)
 
 
-def _ros_options(args: argparse.Namespace) -> dict[str, Any]:
-    """The options of a ROS 2 package that have a value."""
-    from iblf_jax.cli._common import given_options
-
-    options = given_options(args, "torque_limits", "on_fault")
-    if len(options.get("torque_limits", ())) == 1:
-        options["torque_limits"] = options["torque_limits"][0]
-    if args.gains is not None:
-        options["gains"] = [_tunable(text) for text in args.gains]
-    return options
-
-
 def run(args: argparse.Namespace) -> int:
     """Runs the command."""
     from iblf_jax.cli import complain
@@ -125,7 +113,11 @@ def run(args: argparse.Namespace) -> int:
 
     file = scenario_of(args)
     names = ("target", "period", "dtype", "reference", "name", "seed")
-    chosen = given_options(args, *names) | _ros_options(args)
+    chosen = given_options(args, *names, "torque_limits", "on_fault")
+    if len(chosen.get("torque_limits", ())) == 1:
+        chosen["torque_limits"] = chosen["torque_limits"][0]
+    if args.gains is not None:
+        chosen["gains"] = [_tunable(text) for text in args.gains]
     if args.target == "ros2":
         # A law has no time step: only what the user gave is checked, not what the file has.
         chosen |= given_options(args, "dt", "method")

@@ -65,13 +65,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Runs the command."""
     from iblf_jax.cli._common import given_options, scenario_of
+    from iblf_jax.core import checks
     from iblf_jax.proofs import prove
     from iblf_jax.reports import report
 
     names = ("weight", "duration", "disturbance_rate", "threads", "checkpoint", "seed")
     options: dict[str, Any] = given_options(args, *names)
     if args.max_boxes is not None:
-        options["max_boxes"] = _integer(args.max_boxes)
+        if not args.max_boxes.is_integer():
+            raise checks.fail("--max-boxes", args.max_boxes, "a whole number, such as 1e8")
+        options["max_boxes"] = int(args.max_boxes)
     found = prove(
         scenario_of(args).scenario,
         level=args.level,
@@ -83,14 +86,6 @@ def run(args: argparse.Namespace) -> int:
     if args.out:
         print(f"\nwritten to {report(found, args.out)}")
     return int(not found.proved)
-
-
-def _integer(number: float) -> int:
-    from iblf_jax.core import checks
-
-    if not number.is_integer():
-        raise checks.fail("--max-boxes", number, "a whole number, such as 1e8")
-    return int(number)
 
 
 def perturbations(words: list[str]) -> dict[str, Any]:

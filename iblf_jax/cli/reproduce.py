@@ -81,7 +81,12 @@ def run(args: argparse.Namespace) -> int:
         "Peaks with their signs; the metrics peak_error and peak_torque are absolute values\n"
         f"{peaks_text}\n"
     )
-    _print_claims(claims, note)
+    print("The claims of the paper, and what these runs show")
+    for i, claim in enumerate(claims, 1):
+        verdict = "HELD" if claim.confirmed else "DID NOT HOLD"
+        print(f"{i}. {verdict:12}  {claim.claim}")
+        print(textwrap.fill(claim.detail, 118, initial_indent=" " * 5, subsequent_indent=" " * 5))
+    print(textwrap.fill(f"Remark: {note}", 118))
     findings = {"assumed": assumption, "peaks": peaks(runs), "claims": claims, "remark": note}
     _write_data(folder, args, runs, findings, seconds)
     report = as_markdown(claims, peaks_text, assumption, note)
@@ -132,15 +137,6 @@ def check_claims(runs: Mapping[str, Rollout]) -> list[PaperClaim]:
     from iblf_jax.cli._claims import paper_claims
 
     return paper_claims(runs)
-
-
-def _print_claims(claims: list[PaperClaim], note: str) -> None:
-    print("The claims of the paper, and what these runs show")
-    for i, claim in enumerate(claims, 1):
-        verdict = "HELD" if claim.confirmed else "DID NOT HOLD"
-        print(f"{i}. {verdict:12}  {claim.claim}")
-        print(textwrap.fill(claim.detail, 118, initial_indent=" " * 5, subsequent_indent=" " * 5))
-    print(textwrap.fill(f"Remark: {note}", 118))
 
 
 def _write_data(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import signal
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -263,7 +264,7 @@ def _numbers(option: str, text: str) -> list[float]:
 
 
 @contextmanager
-def _stopped_by_signals(stop: Any) -> Any:
+def _stopped_by_signals(stop: Callable[[], object]) -> Iterator[None]:
     """Context in which an interrupt or a request to terminate calls `stop`."""
     numbers = (signal.SIGINT, signal.SIGTERM)
     before = {number: signal.signal(number, lambda *_: stop()) for number in numbers}

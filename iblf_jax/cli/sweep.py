@@ -99,7 +99,7 @@ def report(data: xarray.Dataset) -> str:
     return "\n".join([head, "", *as_text(rows[: MAX_ROWS + 1], left=(0,)), *more])
 
 
-def _tick(value: Any) -> str:
+def _tick(value: object) -> str:
     if isinstance(value, list):
         return " ".join(f"{x:.4g}" for x in value)
     return f"{value:.4g}"

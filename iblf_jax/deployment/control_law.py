@@ -10,12 +10,14 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 
+from iblf_jax.control import controllers, observers
 from iblf_jax.control.sensors import Ideal, Levels, Measurement
 from iblf_jax.control.sensors._base import measurement_of
 from iblf_jax.core import checks
@@ -24,10 +26,12 @@ from iblf_jax.engine import LOWERING_LIMITS
 from iblf_jax.kernels import Program, Shapes, compile_step, written_out
 from iblf_jax.simulation.closed_loop import discrete_observer, law_update, plant_input
 from iblf_jax.simulation.levels import start_levels
-from iblf_jax.simulation.sampling import nothing_sent
+from iblf_jax.simulation.sampling import SentCommand, nothing_sent
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.world import plants
 from iblf_jax.world.references import Reference
+
+S = TypeVar("S")
 
 
 @component
@@ -54,26 +58,22 @@ class GivenReference(Reference):
         s = t - self.t
         acceleration = self.ddq_d
         if self.further_d is not None:
-            acceleration = acceleration + _further_terms(s, self.further_d)
+            # The sum of 2 s^k/(k + 2)! times the derivative k + 2, from k = 1 on.
+            further = jnp.zeros_like(self.further_d[0])
+            for k in range(len(self.further_d), 0, -1):
+                further = s * (1.0 / (k + 2)) * (self.further_d[k - 1] + further)
+            acceleration = acceleration + further
         return self.q_d + s * (self.dq_d + 0.5 * s * acceleration)
-
-
-def _further_terms(s: jax.Array, derivatives: jax.Array) -> jax.Array:
-    """The sum of 2 s^k/(k + 2)! times the derivative k + 2, from k = 1 on, (n,)."""
-    total = jnp.zeros_like(derivatives[0])
-    for k in range(len(derivatives), 0, -1):
-        total = s * (1.0 / (k + 2)) * (derivatives[k - 1] + total)
-    return total
 
 
 class LawState(NamedTuple):
     """The internal state of the law between samples; the generated C calls it `memory`."""
 
-    controller: Any
-    observer: Any
-    velocity: Any
+    controller: controllers.State
+    observer: observers.State
+    velocity: tuple[Any, ...]
     """The states of the sensor's velocity filters."""
-    sent: Any = ()
+    sent: SentCommand | tuple[()] = ()
     """The `SentCommand` of a law with an event trigger."""
 
 
@@ -85,12 +85,12 @@ class SampleInputs(NamedTuple):
     t: jax.Array
     q: jax.Array
     dq: jax.Array
-    higher: Any = ()
+    higher: jax.Array | tuple[()] = ()
     """Levels of the model from the third on, (r - 2, n); `()` for a model of two levels."""
-    q_d: Any = ()
-    dq_d: Any = ()
-    ddq_d: Any = ()
-    further_d: Any = ()
+    q_d: jax.Array | tuple[()] = ()
+    dq_d: jax.Array | tuple[()] = ()
+    ddq_d: jax.Array | tuple[()] = ()
+    further_d: jax.Array | tuple[()] = ()
     """Derivatives of the reference from the third to the r-th, (r - 2, n)."""
 
 
@@ -146,7 +146,7 @@ def start(scenario: Scenario, inputs: SampleInputs) -> tuple[LawState, jax.Array
     balance = loop.model.steady_input(x[0])
     if balance is None:
         balance = jnp.zeros_like(x[0])
-    sent: Any = ()
+    sent: SentCommand | tuple[()] = ()
     if scenario.sampling.trigger is not None:  # type: ignore[union-attr]
         sent = nothing_sent(balance)
     return LawState(controller, observer, filtered, sent), balance
@@ -155,7 +155,14 @@ def start(scenario: Scenario, inputs: SampleInputs) -> tuple[LawState, jax.Array
 def sample(scenario: Scenario, inputs: SampleInputs, state: LawState) -> tuple[LawState, Outputs]:
     """One sample: the state for the next sample, and the outputs."""
     scenario = _with_reference(scenario, inputs)
-    measured, filtered = _measurement(scenario, inputs, state.velocity)
+    period = scenario.sampling.period  # type: ignore[union-attr]
+    levels = list(_levels(inputs))
+    filtered = []
+    for (row, velocity), before in zip(velocity_filters(scenario), state.velocity, strict=True):
+        normal = jnp.zeros((velocity.draws, scenario.n), inputs.q.dtype)
+        levels[row], after = velocity.estimate(levels[row - 1], levels[row], normal, period, before)
+        filtered.append(after)
+    measured = measurement_of(jnp.stack(levels))
     update = law_update(scenario, inputs.t, measured, state.controller, state.observer, state.sent)
     command = update.command
     tube = scenario.context.tube(inputs.t)
@@ -171,29 +178,13 @@ def sample(scenario: Scenario, inputs: SampleInputs, state: LawState) -> tuple[L
         jnp.any(command.saturated),
         infeasible,
     )
-    return LawState(update.controller, update.observer, filtered, update.sent), outputs
+    return LawState(update.controller, update.observer, tuple(filtered), update.sent), outputs
 
 
 def bounds_at(scenario: Scenario, inputs: SampleInputs) -> tuple[jax.Array, jax.Array]:
     """The lower and the upper bounds of the positions at the time of a sample, (n,) each [rad]."""
     tube = _with_reference(scenario, inputs).context.tube(inputs.t)
     return tube.lower, tube.upper
-
-
-def _measurement(
-    scenario: Scenario, inputs: SampleInputs, states: tuple[Any, ...]
-) -> tuple[Measurement, tuple[Any, ...]]:
-    """The levels of the inputs with the velocities of the sensor's filters, and the next states of
-    these.
-    """
-    period = scenario.sampling.period  # type: ignore[union-attr]
-    rows = list(_levels(inputs))
-    after = []
-    for (row, velocity), state in zip(velocity_filters(scenario), states, strict=True):
-        normal = jnp.zeros((velocity.draws, scenario.n), inputs.q.dtype)
-        rows[row], found = velocity.estimate(rows[row - 1], rows[row], normal, period, state)
-        after.append(found)
-    return measurement_of(jnp.stack(rows)), tuple(after)
 
 
 class VelocityFilter(NamedTuple):
@@ -293,12 +284,12 @@ def control_law(scenario: Scenario, external_reference: bool) -> ControlLaw:
     return ControlLaw(start_program, sample_program, names, unread, estimate.size, bounds_program)
 
 
-def as_floats(state: Any, dtype: Any) -> Any:
+def as_floats(state: S, dtype: DTypeLike) -> S:
     """The state as floats of one type; integers and flags become 0.0, 1.0, ..."""
     return jax.tree.map(lambda x: x.astype(dtype), state)
 
 
-def of_floats(state: Any, like: Any) -> Any:
+def of_floats(state: S, like: S) -> S:
     """The inverse of `as_floats`, with the types of `like`."""
 
     def converted(x: jax.Array, kind: jax.Array) -> jax.Array:
@@ -309,7 +300,7 @@ def of_floats(state: Any, like: Any) -> Any:
     return jax.tree.map(converted, state, like)
 
 
-def program_of(function: Callable, scenario: Scenario, given: Any, carry: Any) -> Program:
+def program_of(function: Callable, scenario: Scenario, given: object, carry: object) -> Program:
     """The scalar program of `function(scenario, given, carry, index) -> (carry, results)`.
 
     Args:
@@ -337,7 +328,7 @@ def program_of(function: Callable, scenario: Scenario, given: Any, carry: Any) -
     return written_out(step.program)
 
 
-def number_names(tree: Any) -> tuple[str, ...]:
+def number_names(tree: object) -> tuple[str, ...]:
     """Names of the numbers of a pytree of arrays, such as "observer.p[1]"."""
     names = list[str]()
     for path, x in jax.tree_util.tree_flatten_with_path(tree)[0]:

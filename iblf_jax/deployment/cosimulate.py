@@ -12,7 +12,7 @@ import math
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -45,12 +45,15 @@ from iblf_jax.world import plants
 from iblf_jax.world.disturbances import Nothing
 from iblf_jax.world.robots import at_time
 
+if TYPE_CHECKING:
+    import mujoco
+
 
 @notices.each_warning_once
 @announced("simulating the plant and the law side by side")
 def cosimulate(
     scenario: Scenario,
-    plant: Any,
+    plant: str | Path | mujoco.MjSpec | mujoco.MjModel,
     *,
     duration: float,
     period: float | None = None,
@@ -111,7 +114,11 @@ def cosimulate(
         checks.one_of("integrator", integrator, INTEGRATORS)
     check_single(scenario)
     _check_robots(scenario)
-    _check_no_process_noise(scenario)
+    if scenario.process_noise is not None:
+        came = type(scenario.process_noise).__name__
+        expected = "None, as MuJoCo integrates the motion without noise"
+        remedy = "Take ij.with_parts(scenario, process_noise=None), or ij.simulate with the noise."
+        raise checks.fail("scenario.process_noise", came, expected, remedy)
     scenario = canonical(with_period(scenario, period))
     seed, throw = checks.seed(seed), checks.boolean("throw", throw)
     names = scenario.plant.joints
@@ -154,16 +161,6 @@ def _check_robots(scenario: Scenario) -> None:
             remedy += f" Take {name}=scenario.{name}.robot, and a law for robots."
         expected = "a robot, whose inputs are torques"
         raise checks.fail(f"scenario.{name}", type(part).__name__, expected, remedy)
-
-
-def _check_no_process_noise(scenario: Scenario) -> None:
-    """Raises ValueError for process noise, which MuJoCo's integrators do not have."""
-    noise = scenario.process_noise
-    if noise is None:
-        return
-    expected = "None, as MuJoCo integrates the motion without noise"
-    remedy = "Take ij.with_parts(scenario, process_noise=None), or ij.simulate with the noise."
-    raise checks.fail("scenario.process_noise", type(noise).__name__, expected, remedy)
 
 
 def own_step(period: float, robot: MujocoPlant) -> float:
@@ -413,7 +410,7 @@ def _observed(scenario: Scenario, folds, dt, motion: RecordedMotion, is_gap):
 
 def rollout_of(
     scenario: Scenario,
-    folds: Any,
+    folds: tuple[Fold, ...],
     motion: RecordedMotion,
     dt: float,
     record_every: int,

@@ -8,7 +8,7 @@ import dataclasses
 import math
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
+from numpy.typing import ArrayLike
 
 from iblf_jax.control.actuators import Ideal
 from iblf_jax.core import checks, notices, taylor
@@ -120,7 +122,7 @@ def export(
     method: str = "rk4",
     seed: int = 0,
     gains: Sequence[Any] | None = None,
-    torque_limits: Any = None,
+    torque_limits: ArrayLike | None = None,
     on_fault: str = "hold",
 ) -> Exported:
     """Writes a scenario's law, or its complete closed loop, as code that runs without JAX.
@@ -174,10 +176,9 @@ def export(
     """
     checks.one_of("target", target, (*LAW_TARGETS, *LOOP_TARGETS))
     is_loop = target in LOOP_TARGETS
-    _check_options(target, dtype, reference, is_loop)
     loop_options = {"dt": dt, "method": method, "seed": seed}
     ros_only = {"gains": gains, "torque_limits": torque_limits, "on_fault": on_fault}
-    _check_target_options(target, loop_options, ros_only)
+    _check_options(target, dtype, reference, loop_options, ros_only)
     tableau(method)
     dt, seed = checks.time_span("dt", dt), checks.seed(seed)
     name = checked_name(name, "iblf_loop" if is_loop else "iblf_law")
@@ -185,12 +186,25 @@ def export(
         check_ros_name(name)
     check_single(scenario)
     if not is_loop:
-        scenario = _without_parts_of_the_plant(scenario)
+        # The program of a law ends with its command: the noise acts on the plant, and the delay
+        # belongs to the computer that runs the law.
+        if scenario.actuator.input_delay is not None:
+            scenario = dataclasses.replace(scenario, actuator=Ideal())
+        scenario = dataclasses.replace(scenario, process_noise=None)
     if not is_loop or period is not None:
         scenario = with_period(scenario, period)
-    scenario = canonical(astype(scenario, _available(dtype)))
+    jax_type = TYPES[dtype]
+    if jax.dtypes.canonicalize_dtype(jax_type) != jax_type:
+        expected = '"float", as JAX computes in float32 here'
+        remedy = 'Call jax.config.update("jax_enable_x64", True) first.'
+        raise checks.fail("dtype", dtype, expected, remedy)
+    scenario = canonical(astype(scenario, jax_type))
     if not is_loop:
-        _check_period(float(scenario.sampling.period))  # type: ignore[union-attr]
+        period = float(scenario.sampling.period)  # type: ignore[union-attr]
+        if not SHORTEST_PERIOD <= period <= LONGEST_PERIOD:
+            expected = f"a period of the law from {SHORTEST_PERIOD:g} to {LONGEST_PERIOD:g} s"
+            remedy = "The self-test contains a simulated run with this period."
+            raise checks.fail("period", period, expected, remedy)
     ros = None
     if target == "ros2":
         ros = ros_options(scenario, gains, torque_limits, on_fault)
@@ -205,19 +219,16 @@ def export(
         raise checks.fail("scenario", came, "a scenario whose operations are lowered") from None
 
 
-def _without_parts_of_the_plant(scenario: Scenario) -> Scenario:
-    """The scenario without process noise and without a delay of the input.
-
-    The program of a law ends with its command; the noise acts on the plant, and the delay belongs
-    to the computer that runs the law.
+def _check_options(
+    target: str,
+    dtype: str,
+    reference: str,
+    loop_options: Mapping[str, object],
+    ros_only: Mapping[str, object],
+) -> None:
+    """Raises ValueError for an unknown option, for options that exclude each other, and for those
+    of another target.
     """
-    if scenario.actuator.input_delay is not None:
-        scenario = dataclasses.replace(scenario, actuator=Ideal())
-    return dataclasses.replace(scenario, process_noise=None)
-
-
-def _check_options(target: str, dtype: str, reference: str, is_loop: bool) -> None:
-    """Raises ValueError for an unknown option, or for options that exclude each other."""
     checks.one_of("dtype", dtype, tuple(TYPES))
     checks.one_of("reference", reference, ("inside", "given"))
     if target.startswith("fmu") and dtype != "double":
@@ -229,16 +240,10 @@ def _check_options(target: str, dtype: str, reference: str, is_loop: bool) -> No
         expected = '"inside" for a ROS 2 package'
         remedy = "The node has no topic for a reference: give the scenario a reference."
         raise checks.fail("reference", reference, expected, remedy)
-    if is_loop and reference == "given":
+    if target in LOOP_TARGETS and reference == "given":
         expected = '"inside" for a closed loop'
         remedy = "Only a law alone receives its reference as an input."
         raise checks.fail("reference", reference, expected, remedy)
-
-
-def _check_target_options(
-    target: str, loop_options: dict[str, Any], ros_only: dict[str, Any]
-) -> None:
-    """Raises ValueError for options of another target."""
     if target == "ros2":
         for name, value in loop_options.items():
             if value != LOOP_DEFAULTS[name]:
@@ -260,7 +265,12 @@ def _export_law(
     external_reference: bool,
     ros: RosOptions | None,
 ) -> Exported:
-    scenario_toml, notes = _scenario_toml(scenario)
+    scenario_toml: str | None = None
+    notes: tuple[str, ...] = ()
+    try:
+        scenario_toml = scenario_to_toml(scenario)
+    except ValueError as error:
+        notes = (f"scenario.toml left out: {error}",)
     law = Law(
         scenario=scenario,
         programs=control_law(scenario, external_reference),
@@ -313,7 +323,7 @@ def _export_loop(
     return Exported(folder, target, files, operations_of(loop.step), sizes, paths)
 
 
-def checked_name(name: Any, default: str) -> str:
+def checked_name(name: str | None, default: str) -> str:
     """The prefix of all names in the code; ValueError if it is invalid."""
     if name is None:
         return default
@@ -325,32 +335,6 @@ def checked_name(name: Any, default: str) -> str:
     expected = f"a C identifier of at most {LONGEST_IDENTIFIER} characters"
     expected += " that is not reserved by C, its headers or CMake"
     raise checks.fail("name", name, expected, 'Such as name="arm_law".')
-
-
-def _check_period(period: float) -> None:
-    """Raises ValueError for a period that makes the run of the self-test too long."""
-    if not SHORTEST_PERIOD <= period <= LONGEST_PERIOD:
-        expected = f"a period of the law from {SHORTEST_PERIOD:g} to {LONGEST_PERIOD:g} s"
-        remedy = "The self-test contains a simulated run with this period."
-        raise checks.fail("period", period, expected, remedy)
-
-
-def _available(dtype: str) -> str:
-    """JAX's name of a C type; ValueError if JAX does not compute with it."""
-    jax_type = TYPES[dtype]
-    if jax.dtypes.canonicalize_dtype(jax_type) != jax_type:
-        expected = '"float", as JAX computes in float32 here'
-        remedy = 'Call jax.config.update("jax_enable_x64", True) first.'
-        raise checks.fail("dtype", dtype, expected, remedy)
-    return jax_type
-
-
-def _scenario_toml(scenario: Scenario) -> tuple[str | None, tuple[str, ...]]:
-    """The scenario as TOML, or None and the reason if a file cannot hold it."""
-    try:
-        return scenario_to_toml(scenario), ()
-    except ValueError as error:
-        return None, (f"scenario.toml left out: {error}",)
 
 
 def vectors(scenario: Scenario, external_reference: bool) -> Vectors:
@@ -433,7 +417,7 @@ def _first_torque(scenario: Scenario) -> jax.Array:
     return jnp.where(jnp.isfinite(rate.dq), found.tau, rate.dq)[None]
 
 
-def _rounded(x: Any, samples: int, dtype: Any) -> jax.Array:
+def _rounded(x: jax.Array, samples: int, dtype: DTypeLike) -> jax.Array:
     """The first samples, rounded to DECIMALS so that the written inputs are short."""
     return jnp.asarray(np.round(np.asarray(x[:samples], float), DECIMALS), dtype)
 

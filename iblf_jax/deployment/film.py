@@ -9,7 +9,7 @@ import sys
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from PIL import Image
@@ -17,6 +17,9 @@ from PIL import Image
 from iblf_jax.deployment.mujoco_plant import MujocoPlant
 from iblf_jax.plotting.animation import animate, frame_times, write_film
 from iblf_jax.simulation.results import Rollout
+
+if TYPE_CHECKING:
+    import mujoco
 
 FPS = 25.0
 SIZE = (480, 640)
@@ -40,24 +43,16 @@ def film_run(
       dt: the step [s].
       path: the file, ".gif" or ".html".
     """
-    renderer = _renderer(robot)
-    if renderer is None:
+    if not has_shapes(robot.model) or not _can_draw():
         return animate(run, path, FPS)
     times = frame_times((len(positions) - 1) * dt, FPS)
     shown = positions[np.round(times / dt).astype(int)]
-    with renderer:
+    with robot.mujoco.Renderer(robot.model, *SIZE) as renderer:
         pictures = [Image.fromarray(x) for x in _pictures(renderer, robot, shown)]
     return write_film(pictures, path, FPS)
 
 
-def _renderer(robot: MujocoPlant) -> Any:
-    """MuJoCo's renderer; None if MuJoCo cannot draw, or if the arm has no visible shapes."""
-    if not has_shapes(robot.model) or not _can_draw():
-        return None
-    return robot.mujoco.Renderer(robot.model, *SIZE)
-
-
-def has_shapes(model: Any) -> bool:
+def has_shapes(model: mujoco.MjModel) -> bool:
     """Whether MuJoCo's picture of a model shows something that moves.  The arm of a URDF whose mesh
     files are missing has no shapes.
     """
@@ -78,7 +73,9 @@ def _can_draw() -> bool:
     return done.returncode == 0
 
 
-def _pictures(renderer: Any, robot: MujocoPlant, positions: np.ndarray) -> Iterator[np.ndarray]:
+def _pictures(
+    renderer: mujoco.Renderer, robot: MujocoPlant, positions: np.ndarray
+) -> Iterator[np.ndarray]:
     data = robot.mujoco.MjData(robot.model)
     for place in positions:
         data.qpos[:] = place

@@ -37,22 +37,6 @@ def check_finite(
         return
     row, joint = wrong[0]
     finding = f"the torque tau[{joint}] is {torques[row, joint]} {instant}"
-    cause = _cause(scenario, torques_of)
-    if cause is None:
-        came = f"a law that yields no numbers: {finding}"
-        remedy = "Check its gains and its model."
-        raise checks.fail("scenario", came, "finite torques", remedy)
-    path, value = cause
-    expected = "a value with which the law yields finite numbers"
-    raise checks.fail(path, value, expected, f"With it {finding}.")
-
-
-def _cause(
-    scenario: Scenario, torques_of: Callable[[Scenario], Any]
-) -> tuple[str, np.ndarray] | None:
-    """The parameter of extreme size with which the torques are not finite, and its value; None if
-    no single parameter is the cause.
-    """
     for parameter in parameters(scenario, named=False):
         value = np.asarray(parameter.value, float)
         size = np.abs(value)
@@ -65,5 +49,8 @@ def _cause(
         except ValueError:  # this value is the only one that fits the others
             continue
         if np.all(np.isfinite(np.asarray(torques_of(changed)))):
-            return parameter.path, value
-    return None
+            expected = "a value with which the law yields finite numbers"
+            raise checks.fail(parameter.path, value, expected, f"With it {finding}.")
+    came = f"a law that yields no numbers: {finding}"
+    remedy = "Check its gains and its model."
+    raise checks.fail("scenario", came, "finite torques", remedy)

@@ -4,7 +4,7 @@ and actuator, with the steps of `simulate`.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,6 @@ from iblf_jax.simulation import error_estimate
 from iblf_jax.simulation.closed_loop import initial_state
 from iblf_jax.simulation.noise import has_noise
 from iblf_jax.simulation.scenario import Scenario
-from iblf_jax.simulation.signals import Sample
 from iblf_jax.world import plants
 
 
@@ -59,12 +58,6 @@ def loop_outputs(scenario: Scenario) -> tuple[LoopOutput, ...]:
     return tuple(found)
 
 
-def _value_of(output: LoopOutput, sample: Sample) -> jax.Array:
-    """The n numbers of an output in a sample."""
-    value = attributes(sample, [output.signal])[output.signal]
-    return value if output.row is None else value[output.row]
-
-
 UNLIMITED_STEPS = 2.0**52
 """Number of steps that stands for a run without an end."""
 
@@ -73,7 +66,7 @@ class RunSettings(NamedTuple):
     """The inputs of a run besides its scenario."""
 
     dt: jax.Array
-    noise: Any
+    noise: jax.Array | tuple[()]
     """The key of a sensor's noise, (4,); empty without noise."""
 
 
@@ -121,7 +114,10 @@ def loop_program(scenario: Scenario, method: str) -> Loop:
         before = start(inputs, method, jnp.zeros((size, size), dtype))
         before = before._replace(state=state, status=status)
         done = advance(inputs, before, index, method, StepOptions(scalar=True))
-        values = [_value_of(output, done.sample) for output in loop_outputs(scenario)]
+        values = []
+        for output in loop_outputs(scenario):
+            value = attributes(done.sample, [output.signal])[output.signal]
+            values.append(value if output.row is None else value[output.row])
         outputs = (*values, done.carry.status.astype(dtype))
         return as_floats((done.carry.state, done.carry.status), dtype), outputs
 

@@ -12,7 +12,8 @@ import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import jax
 import numpy as np
@@ -26,6 +27,12 @@ from iblf_jax.world.robots.tree import HINGE, SLIDE, Tree, mujoco_package, unkno
 
 INTEGRATORS = ("RK4", "Euler", "implicit", "implicitfast")
 
+if TYPE_CHECKING:
+    import mujoco
+
+MujocoSource: TypeAlias = "str | os.PathLike[str] | mujoco.MjSpec | mujoco.MjModel"
+"""What MuJoCo simulates: the path of an MJCF or URDF, a specification or a compiled model."""
+
 TorqueCallback = Callable[[float, np.ndarray, np.ndarray], np.ndarray]
 """Computes the torque of the joints, (n,) [N m], from time [s], q and q'."""
 
@@ -35,7 +42,7 @@ class MujocoPlant:
 
     def __init__(
         self,
-        plant: Any,
+        plant: MujocoSource,
         names: tuple[str, ...],
         n: int,
         locked: Mapping[str, float],
@@ -196,7 +203,7 @@ class Stages:
 # ----------------------------------------------------------------- the model and its joints
 
 
-def _driven_bodies(mujoco: Any, model: Any, a: int) -> list[int]:
+def _driven_bodies(mujoco: ModuleType, model: mujoco.MjModel, a: int) -> list[int]:
     """The bodies that an actuator of the model acts on."""
     kind, target = mujoco.mjtTrn(int(model.actuator_trntype[a])), int(model.actuator_trnid[a, 0])
     if kind in (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT):
@@ -214,7 +221,7 @@ def _driven_bodies(mujoco: Any, model: Any, a: int) -> list[int]:
     return bodies
 
 
-def _specification(mujoco: Any, plant: Any) -> Any:
+def _specification(mujoco: ModuleType, plant: MujocoSource) -> Any:
     """MuJoCo's specification of the complete model, with its collision geometry."""
     if isinstance(plant, mujoco.MjSpec):
         return plant.copy()
@@ -231,7 +238,7 @@ def _specification(mujoco: Any, plant: Any) -> Any:
     return spec
 
 
-def _refused(plant: Any, error: ValueError) -> ValueError:
+def _refused(plant: MujocoSource, error: ValueError) -> ValueError:
     """The error for a model that MuJoCo does not accept, with its message."""
     name, words = "plant", " ".join(str(error).split())
     if isinstance(plant, str | os.PathLike):
@@ -241,7 +248,7 @@ def _refused(plant: Any, error: ValueError) -> ValueError:
     return ValueError(f"{name}: {words}")
 
 
-def _without_missing_meshes(spec: Any, path: Path) -> None:
+def _without_missing_meshes(spec: mujoco.MjSpec, path: Path) -> None:
     """Removes the shapes of a URDF whose mesh files are missing; the masses of its links are given
     as numbers.
     """
@@ -267,7 +274,7 @@ LEAST_INERTIA = 1e-12
 """Moment of inertia of a payload that has none [kg m^2]; MuJoCo accepts no smaller one."""
 
 
-def with_payload(plant: Any, names: tuple[str, ...], payload: Payload) -> Any:
+def with_payload(plant: MujocoSource, names: tuple[str, ...], payload: Payload) -> Any:
     """MuJoCo's specification of a robot with a payload, a body that is fixed to the one which the
     last driven joint moves.
 
@@ -358,7 +365,7 @@ def _joints_by_name(
     return joints
 
 
-def _compiled(spec: Any, plant: Any) -> Any:
+def _compiled(spec: mujoco.MjSpec, plant: MujocoSource) -> mujoco.MjModel:
     """The model of a specification; ValueError with MuJoCo's message if it is not accepted."""
     try:
         return spec.compile()
@@ -367,7 +374,12 @@ def _compiled(spec: Any, plant: Any) -> Any:
 
 
 def _with_locked_joints(
-    mujoco: Any, spec: Any, plant: Any, names: tuple[str, ...], n: int, locked: Mapping[str, float]
+    mujoco: ModuleType,
+    spec: mujoco.MjSpec,
+    plant: MujocoSource,
+    names: tuple[str, ...],
+    n: int,
+    locked: Mapping[str, float],
 ) -> tuple[Any, list[int]]:
     """The compiled model, in which the bodies of locked joints are fixed at the locked positions,
     and the indices of the driven joints in it.
@@ -391,7 +403,9 @@ def _with_locked_joints(
     return _compiled(spec, plant), [left.index(j) for j in joints]
 
 
-def _elements_to_remove(mujoco: Any, spec: Any, locked_positions: dict[int, float]) -> list[Any]:
+def _elements_to_remove(
+    mujoco: ModuleType, spec: mujoco.MjSpec, locked_positions: dict[int, float]
+) -> list[Any]:
     """The locked joints, and the elements that refer to them: tendons, couplings, actuators,
     sensors and keyframes.
     """
@@ -419,7 +433,12 @@ def _elements_to_remove(mujoco: Any, spec: Any, locked_positions: dict[int, floa
 
 
 def _weld(
-    mujoco: Any, model: Any, data: Any, spec: Any, body: int, locked_positions: dict[int, float]
+    mujoco: ModuleType,
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    spec: mujoco.MjSpec,
+    body: int,
+    locked_positions: dict[int, float],
 ) -> None:
     """Fixes a body of the specification in its parent at the positions of its locked joints."""
     start = int(model.body_jntadr[body])

@@ -55,18 +55,16 @@ def fill_template(template: str, values: Mapping[str, Any], folder: str = "c") -
 
 def operations_of(program: Program) -> Counter[str]:
     """The number of operations of a call, by their cost on a processor without vectors."""
-    counted = (node.op for node in program.nodes if node.op not in INPUTS and node.op != "const")
-    return Counter(_operation_kind(op) for op in counted)
-
-
-def _operation_kind(op: str) -> str:
     kinds = {"div": "divisions", "sqrt": "square roots", "rsqrt": "square roots"}
-    if op in kinds:
-        return kinds[op]
-    cost = OPERATIONS[op].cost
-    if cost is not None and cost <= ELEMENTARY_COST:
-        return "sums, products and choices"
-    return "elementary functions"
+    found: Counter[str] = Counter()
+    for op in (node.op for node in program.nodes):
+        if op in INPUTS or op == "const":
+            continue
+        cost = OPERATIONS[op].cost
+        is_cheap = cost is not None and cost <= ELEMENTARY_COST
+        other = "sums, products and choices" if is_cheap else "elementary functions"
+        found[kinds.get(op, other)] += 1
+    return found
 
 
 def describe_counts(counts: Counter[str]) -> str:
@@ -428,7 +426,7 @@ def _scenario_row(law: Law) -> str:
     return f"\n| `scenario.toml` | the exported scenario: {repeats} |"
 
 
-def _users_classes(part: Any) -> set[str]:
+def _users_classes(part: object) -> set[str]:
     """The names of the classes of a scenario's parts that are defined outside this package."""
     if isinstance(part, tuple | list):
         return set().union(*map(_users_classes, part))

@@ -70,19 +70,15 @@ def loop_files(
     return GeneratedLoop(texts, parameters, outputs, values)
 
 
-def _json_numbers(value: np.ndarray) -> Any:
-    """Numbers for JSON; a number that is not finite becomes null."""
-    value = np.asarray(value, object)
-    value[~np.isfinite(value.astype(float))] = None
-    return value.tolist()
-
-
 def table(generated: GeneratedLoop, run_settings: list[float]) -> dict[str, Any]:
     """The description of a module for a page: its parameters, settings and records."""
     rows, offset = [], 0
     for field in generated.parameters.fields:
         row = {"path": field.path, "offset": offset, "shape": field.shape, "unit": field.unit}
-        rows.append(row | {"value": _json_numbers(field.value)})
+        # JSON has no numbers that are not finite; they become null.
+        value = np.asarray(field.value, object)
+        value[~np.isfinite(value.astype(float))] = None
+        rows.append(row | {"value": value.tolist()})
         offset += math.prod(field.shape)
     values, n = generated.values, generated.values["joints"]
     columns = [

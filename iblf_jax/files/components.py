@@ -106,7 +106,7 @@ def families_of(hint: Any) -> list[Any]:
     return [] if None in named else named
 
 
-def _base_of(option: Any) -> Any:
+def _base_of(option: object) -> Any:
     """The base class of the family that a contract belongs to, such as that of laws for a
     `RobotLaw`; None without one.
     """
@@ -170,7 +170,7 @@ def encode(part: Any, hint: Any, path: str) -> Any:
     return {"kind": name, **encode_fields(part, path)}
 
 
-def _registration(hint: Any, name: str, cls: str, part: Any = None) -> str:
+def _registration(hint: object, name: str, cls: str, part: object = None) -> str:
     """The statement that gives a class a name in files.
 
     Args:
@@ -209,7 +209,7 @@ def encode_fields(part: Any, path: str) -> dict[str, Any]:
 # --- from tables
 
 
-def decode(value: Any, hint: Any, path: str) -> Any:
+def decode(value: object, hint: Any, path: str) -> Any:
     """The component, array or tuple of one non-static field; the inverse of `encode`.
 
     Args:
@@ -272,19 +272,22 @@ def decode_fields(cls: Any, table: Any, path: str) -> Any:
     for name, field in fields.items():
         key = dotted(path, name)
         if name in table:
-            values[name] = _decode_field(table[name], field, hints.get(name, Any), key)
+            hint = hints.get(name, Any)
+            if field.metadata.get("static"):
+                values[name] = decode_static(table[name], hint, key)
+            elif is_leaf_field(field):
+                values[name] = numbers(table[name], key, field.metadata["unit"])
+            else:
+                values[name] = decode(table[name], hint, key)
         elif field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
             remedy = f"Add {name} to [{path}]; {cls.__name__} has no default for it."
-            raise missing(key, _expectation(field), remedy)
+            expected = "a table with a kind"
+            if is_leaf_field(field):
+                expected = f"a number{SHAPES[field.metadata['shape']]} [{field.metadata['unit']}]"
+            elif field.metadata.get("static"):
+                expected = "a value"
+            raise missing(key, expected, remedy)
     return construct(cls, values, path)
-
-
-def _decode_field(value: Any, field: dataclasses.Field, hint: Any, key: str) -> Any:
-    if field.metadata.get("static"):
-        return decode_static(value, hint, key)
-    if not is_leaf_field(field):
-        return decode(value, hint, key)
-    return numbers(value, key, field.metadata["unit"])
 
 
 SHAPES = {
@@ -294,13 +297,6 @@ SHAPES = {
     "scalar": "",
 }
 """Shape of a leaf -> the words of an error message."""
-
-
-def _expectation(field: dataclasses.Field) -> str:
-    """The value that a missing field should have, in words."""
-    if is_leaf_field(field):
-        return f"a number{SHAPES[field.metadata['shape']]} [{field.metadata['unit']}]"
-    return "a value" if field.metadata.get("static") else "a table with a kind"
 
 
 def construct(make: Any, values: dict[str, Any], path: str) -> Any:

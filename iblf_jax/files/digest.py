@@ -35,7 +35,10 @@ def dataset_digests(data: xarray.Dataset) -> dict[str, str]:
     """
     found = {}
     for name, variable in data.variables.items():
-        found[f"variable {name}"] = _variable_digest(str(name), variable)
+        values = np.asarray(variable.values)
+        dims, shape = list(map(str, variable.dims)), list(values.shape)
+        head = [str(name), dims, shape, _kind(values), _canonical(variable.attrs)]
+        found[f"variable {name}"] = _hexadecimal(head, _bytes(values))
     coordinates = sorted(str(name) for name in data.coords)
     found[ATTRIBUTES] = _hexadecimal([_canonical(data.attrs), coordinates])
     return found
@@ -84,13 +87,6 @@ def differences(stored: str, data: Mapping[str, xarray.Dataset]) -> list[str]:
     return words
 
 
-def _variable_digest(name: str, variable: Any) -> str:
-    values = np.asarray(variable.values)
-    dims, shape = list(map(str, variable.dims)), list(values.shape)
-    head = [name, dims, shape, _kind(values), _canonical(variable.attrs)]
-    return _hexadecimal(head, _bytes(values))
-
-
 def _kind(values: np.ndarray) -> str:
     """The kind of number, with the precision of floating-point numbers.
 
@@ -119,7 +115,7 @@ def _bytes(values: np.ndarray) -> bytes:
     return values.tobytes()
 
 
-def _text(value: Any) -> str:
+def _text(value: object) -> str:
     return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
 
 
@@ -137,5 +133,5 @@ def _canonical(attributes: Mapping[Any, Any]) -> list[Any]:
     return found
 
 
-def _hexadecimal(head: Any, data: bytes = b"") -> str:
+def _hexadecimal(head: object, data: bytes = b"") -> str:
     return hashlib.sha256(json.dumps(head).encode() + data).hexdigest()

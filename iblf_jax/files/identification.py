@@ -69,13 +69,13 @@ def load_identification_file(
     return {"scenario": file.scenario, "log": log, "paths": table["parameters"], **options}
 
 
-def _pair(value: Any, key: str) -> tuple[Any, ...]:
+def _pair(value: object, key: str) -> tuple[Any, ...]:
     if not isinstance(value, list) or len(value) != 2:
         raise checks.fail(key, value, "a list of two, each a number or a list of numbers")
     return tuple(value)
 
 
-def _logs(given: Any, key: str, folder: Path) -> list[Path]:
+def _logs(given: object, key: str, folder: Path) -> list[Path]:
     """The files of one log or of several, relative to the file that names them."""
     names = given if isinstance(given, list) and given else [given]
     found = []

@@ -62,7 +62,7 @@ class _NoImportPathError(ValueError):
 # --- to tables
 
 
-def encode_module(module: Any) -> dict[str, Any]:
+def encode_module(module: object) -> dict[str, Any]:
     """The table of a module with its arrays in it."""
     arrays = {name: encode_numbers(x) for name, x in arrays_of_module(module).items()}
     try:
@@ -87,7 +87,7 @@ def _digest(arrays: Mapping[str, Any]) -> str:
     return found.hexdigest()
 
 
-def _class_name(value: Any) -> str:
+def _class_name(value: object) -> str:
     cls = type(value)
     return f"{cls.__module__}:{cls.__qualname__}"
 
@@ -106,18 +106,13 @@ def _described(value: Any) -> Any:
     if type(value) in (list, tuple):
         return {type(value).__name__: [_described(x) for x in value]}
     if modules.is_module(value):
-        return _described_object(value)
+        if not dataclasses.is_dataclass(value) or modules.is_component(value):
+            raise _NoImportPathError(value)
+        fields = {f.name: _described(vars(value)[f.name]) for f in dataclasses.fields(value)}
+        return {"class": _import_path(type(value)), "fields": fields}
     if callable(value):
         return {"import": _import_path(value)}
     raise _NoImportPathError(value)
-
-
-def _described_object(value: Any) -> Any:
-    """The structure of an object of a registered dataclass."""
-    if not dataclasses.is_dataclass(value) or modules.is_component(value):
-        raise _NoImportPathError(value)
-    fields = {f.name: _described(vars(value)[f.name]) for f in dataclasses.fields(value)}
-    return {"class": _import_path(type(value)), "fields": fields}
 
 
 def _import_path(value: Any) -> str:
@@ -157,7 +152,7 @@ def _found(path: str) -> Any:
     return inspect.signature(value).parameters[argument].default
 
 
-def tables_of_modules(tables: Any, path: str = "") -> Iterator[tuple[str, dict[str, Any]]]:
+def tables_of_modules(tables: object, path: str = "") -> Iterator[tuple[str, dict[str, Any]]]:
     """The dotted keys and the tables of all modules in the tables of a file."""
     if isinstance(tables, list):
         for i, table in enumerate(tables):
@@ -219,7 +214,7 @@ def with_modules_read(
             remedy = checks.did_you_mean(path, known) or "The file describes no module."
             raise checks.fail("modules", path, expected, remedy)
 
-    def read(value: Any, path: str) -> Any:
+    def read(value: object, path: str) -> Any:
         if isinstance(value, list):
             return [read(x, f"{path}[{i}]") for i, x in enumerate(value)]
         if not isinstance(value, dict):
@@ -233,9 +228,7 @@ def with_modules_read(
     return {key: read(table, key) for key, table in tables.items()}
 
 
-def _module_of(
-    table: dict[str, Any], path: str, folder: str | os.PathLike, given: Any | None
-) -> Any:
+def _module_of(table: dict[str, Any], path: str, folder: str | os.PathLike, given: object) -> Any:
     """The module of one table."""
     known_keys(table, path, KEYS)
     structure = _structure(table, path)
@@ -288,7 +281,7 @@ def _arrays(table: dict[str, Any], path: str, folder: str | os.PathLike) -> dict
         raise checks.fail(f"{path}.weights", str(file), expected, f"{error}.") from error
 
 
-def _array(value: Any, path: str) -> np.ndarray:
+def _array(value: object, path: str) -> np.ndarray:
     """The array of a table in double precision, whatever the precision of JAX."""
     try:
         return np.asarray(numbers(value, path), float)
@@ -390,7 +383,7 @@ class _Reader:
         self.used.add(name)
         return jnp.asarray(self.arrays[name])
 
-    def needs_a_module(self, class_name: Any) -> ValueError:
+    def needs_a_module(self, class_name: object) -> ValueError:
         """The error for a class that a file cannot describe."""
         came = Words(f"only the arrays of a module of class {class_name}")
         expected = "the module itself, because a file cannot rebuild its class or its functions"
@@ -409,7 +402,7 @@ CONSTANT_KINDS = ("b", "i", "u", "f", "U")
 EXPECTED_NODE = "the description of an entry of a module"
 
 
-def _imported(path: Any, key: str) -> Any:
+def _imported(path: object, key: str) -> Any:
     """The class or function of an import path, from a package that may be used."""
     text = checks.string(key, path, "an import path")
     package = text.partition(":")[0]
@@ -431,7 +424,7 @@ def _imported(path: Any, key: str) -> Any:
     return value
 
 
-def _is_of_python(value: Any) -> bool:
+def _is_of_python(value: object) -> bool:
     """Whether a class or function belongs to Python's own library, which has no parts of networks
     but has functions that act on the machine.
     """

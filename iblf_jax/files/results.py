@@ -140,7 +140,7 @@ RECORDS: dict[str, tuple[str, str]] = {
 """Name of a class in files, which never changes -> the module of the package and the class."""
 
 
-def save(result: Any, path: str | os.PathLike) -> Path:
+def save(result: object, path: str | os.PathLike) -> Path:
     """Writes a result to a file from which `load` returns an equal one.
 
     Args:
@@ -208,7 +208,11 @@ def load(path: str | os.PathLike, *, modules: Mapping[str, Any] | None = None) -
     try:
         with _opened(place) as archive:
             if ARRAY_OF_ATTRIBUTES not in archive.namelist():
-                return _loaded(archive, modules)
+                description = _described(archive)
+                reader = _Reader(archive, dict(modules or {}))
+                result = reader.value(description["result"], "result")
+                reader.check_modules()
+                return result
     except ValueError as error:
         raise checks.with_location(place, error) from error
     return load_rollouts(place, modules=modules)
@@ -384,15 +388,6 @@ def _opened(place: Path) -> zipfile.ZipFile:
     except Exception as error:  # A damaged directory raises errors of many kinds.
         found = f"{type(error).__name__}: {error}"
         raise checks.fail("file", Words("no archive"), EXPECTED, found) from error
-
-
-def _loaded(archive: zipfile.ZipFile, modules: Mapping[str, Any] | None) -> Any:
-    """The result in an archive."""
-    description = _described(archive)
-    reader = _Reader(archive, dict(modules or {}))
-    result = reader.value(description["result"], "result")
-    reader.check_modules()
-    return result
 
 
 def _described(archive: zipfile.ZipFile) -> dict[str, Any]:
@@ -612,7 +607,7 @@ MAX_NODES_INSIDE = 64
 """Largest depth of nodes, so that a file cannot exhaust the stack."""
 
 
-def _class_of(name: Any, key: str) -> Any:
+def _class_of(name: object, key: str) -> Any:
     """The class of a name in RECORDS."""
     if not isinstance(name, str) or name not in RECORDS:
         raise checks.fail(key, name, "the name of a result", checks.nearest(name, RECORDS))
@@ -620,7 +615,7 @@ def _class_of(name: Any, key: str) -> Any:
     return getattr(importlib.import_module(f"iblf_jax.{module}"), own)
 
 
-def _listed(nodes: Any, key: str) -> list[Any]:
+def _listed(nodes: object, key: str) -> list[Any]:
     """`nodes` if they are a list, else a ValueError."""
     if isinstance(nodes, list):
         return nodes

@@ -73,7 +73,7 @@ def with_robots_read(tables: dict[str, Any], folder: str | os.PathLike) -> dict[
     return {name: ReadPart(robot) for name, robot in robots.items()} | filled | given
 
 
-def _robot(table: Any, name: str, folder: str | os.PathLike) -> Robot:
+def _robot(table: object, name: str, folder: str | os.PathLike) -> Robot:
     """The robot of one table: from the file that it names, or from its numbers."""
     table = as_table(table, name)
     if "file" not in table:

@@ -30,6 +30,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from iblf_jax.core import checks
 from iblf_jax.core.attributes import attributes
@@ -96,7 +97,9 @@ def rollout_to_xarray(run: Rollout) -> xarray.Dataset:
     if not checks.is_concrete(run):
         remedy = "Call this outside of jit, vmap and grad."
         raise checks.fail("run", run, "a Rollout that holds numbers", remedy)
-    batch = _batch_dims(run)
+    batch = tuple(f"run_{i}" for i in range(np.ndim(run.status)))
+    if len(batch) == 1:
+        batch = ("run",)
     variables = _trajectories(run, batch)
     for name, value in run.metrics.items():
         dims = (*batch, *dimension_names(name, np.shape(value)[len(batch) :], run.n))
@@ -133,19 +136,13 @@ def save_rollouts(runs: Mapping[str, Rollout] | Rollout, path: str | os.PathLike
     if not isinstance(runs, Mapping) or not runs:
         raise checks.fail("runs", runs, "a Rollout, or a dict of at least one Rollout by name")
     for name in runs:
-        if not _is_name(name):
+        is_text = isinstance(name, str) and name != _ATTRIBUTES
+        if not is_text or not re.fullmatch(r"[A-Za-z0-9_][\w -]*", name, re.ASCII):
             expected = 'letters, digits, "_", "-" and blanks'
             raise checks.fail("name of a run", name, expected, "Choose another key.")
     data = {name: rollout_to_xarray(run) for name, run in runs.items()}
     write = {".nc": _write_netcdf, ".npz": _write_npz}[ending]
     write(path, data)
-
-
-def _is_name(name: Any) -> bool:
-    """Whether a file can store a run under this name."""
-    if not isinstance(name, str) or name == _ATTRIBUTES:
-        return False
-    return re.fullmatch(r"[A-Za-z0-9_][\w -]*", name, re.ASCII) is not None
 
 
 def load_rollouts(path: str | os.PathLike, *, modules: Mapping[str, Any] | None = None) -> Any:
@@ -331,18 +328,11 @@ def _components_and_levels(run: Rollout, variables: Mapping[str, Any]) -> dict[s
     return found
 
 
-def _batch_dims(run: Rollout) -> tuple[str, ...]:
-    depth = np.ndim(run.status)
-    if depth == 1:
-        return ("run",)
-    return tuple(f"run_{i}" for i in range(depth))
-
-
 def _trajectories(run: Rollout, batch: tuple[str, ...]) -> dict[str, Any]:
     """Variables of the signals and of the states of law, observer, actuator and sensor."""
     variables = {}
 
-    def add(name: str, value: Any, unit: str, description: str) -> None:
+    def add(name: str, value: ArrayLike, unit: str, description: str) -> None:
         dims = (*batch, "time", *dimension_names(name, np.shape(value)[len(batch) + 1 :], run.n))
         variables[name] = (dims, np.asarray(value), _attrs(unit, description))
 
@@ -352,19 +342,15 @@ def _trajectories(run: Rollout, batch: tuple[str, ...]) -> dict[str, Any]:
         is_shown = name in LEVEL_SIGNALS and np.shape(value)[-2] <= len(LEVEL_SIGNALS[name])
         if name != "t" and not is_absent(value) and not is_shown:
             if name in ("level_lower", "level_upper"):
-                value = _of_all_levels(value, run.x, np.inf if name == "level_upper" else -np.inf)
+                # Only the first levels have bounds.
+                rows = value
+                value = np.full_like(run.x, np.inf if name == "level_upper" else -np.inf)
+                value[..., : np.shape(rows)[-2], :] = rows
             add(name, value, signal_unit(run.scenario, name), meanings[name])
     for state, tree in attributes(run, STATES).items():
         for keys, value in jax.tree_util.tree_leaves_with_path(tree):
             add(_state_name(state, keys), value, "1", STATES[state])
     return variables
-
-
-def _of_all_levels(rows: Any, x: Any, value: float) -> np.ndarray:
-    """Rows of the first levels, with a value for the others."""
-    found = np.full_like(x, value)
-    found[..., : np.shape(rows)[-2], :] = rows
-    return found
 
 
 def _state_name(state: str, keys: tuple[Any, ...]) -> str:

@@ -39,6 +39,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import astype
@@ -202,11 +203,14 @@ def _check_round_trip(scenario: Scenario, tables: dict[str, Any]) -> None:
     """Raises ValueError if the tables do not give an equal scenario."""
     expected = "one scenario that its tables reproduce"
     remedy = "Save the runs of a batch one by one."
-    opaque = {
-        path: _part_at(scenario, path)
-        for path, table in tables_of_modules(tables)
-        if needs_a_module(table)
-    }
+    opaque = {}
+    for path, table in tables_of_modules(tables):
+        if not needs_a_module(table):
+            continue
+        part: Any = scenario
+        for token in parse(re.sub(r"^robot\b", "plant", path)):
+            part = part[token] if isinstance(token, int) else vars(part)[token]
+        opaque[path] = part
     try:
         same = _equal(from_dict(tables, modules=opaque).scenario, scenario)
     except ValueError as error:
@@ -215,14 +219,6 @@ def _check_round_trip(scenario: Scenario, tables: dict[str, Any]) -> None:
     if not same:
         came = Words("leaves that a file does not reproduce")
         raise checks.fail("scenario", came, expected, remedy)
-
-
-def _part_at(scenario: Scenario, path: str) -> Any:
-    """The part of a scenario at a dotted key of its file."""
-    part: Any = scenario
-    for token in parse(re.sub(r"^robot\b", "plant", path)):
-        part = part[token] if isinstance(token, int) else vars(part)[token]
-    return part
 
 
 def scenario_to_toml(scenario: Scenario, *, run: Mapping[str, Any] | None = None) -> str:
@@ -286,7 +282,7 @@ def _path_of_table(names: list[str], counts: dict[str, int], *, is_entry: bool) 
     return path
 
 
-def _equal(a: Any, b: Any) -> bool:
+def _equal(a: object, b: object) -> bool:
     """Whether two pytrees have the same structure, shapes, precisions and bits."""
     leaves_a, structure_a = jax.tree.flatten(a)
     leaves_b, structure_b = jax.tree.flatten(b)
@@ -295,7 +291,7 @@ def _equal(a: Any, b: Any) -> bool:
     return all(map(_same_bits, leaves_a, leaves_b))
 
 
-def _same_bits(x: Any, y: Any) -> bool:
+def _same_bits(x: ArrayLike, y: ArrayLike) -> bool:
     x, y = np.asarray(x), np.asarray(y)
     return x.shape == y.shape and x.dtype == y.dtype and x.tobytes() == y.tobytes()
 
@@ -332,7 +328,13 @@ def from_dict(
         else:
             scenario = _from_components(data, folder, modules)
         if "dtype" in data:
-            scenario = astype(scenario, _dtype(data["dtype"]))
+            dtype = data["dtype"]
+            checks.one_of("dtype", dtype, DTYPES)
+            if dtype == "float64" and jnp.result_type(float) != jnp.float64:
+                call = 'jax.config.update("jax_enable_x64", True)'
+                remedy = f"JAX's 64-bit mode is off: {call}, or leave dtype out."
+                raise checks.fail("dtype", dtype, "float32", remedy)
+            scenario = astype(scenario, jnp.dtype(dtype))
         changes = {"scenario": scenario, "values": numbers_by_path(data, "parameters")}
         scenario = construct(with_parameters, changes, "parameters")
         return ScenarioFile(scenario, _run_table(data.get("run", {})))
@@ -380,7 +382,7 @@ def _from_preset(data: dict[str, Any]) -> Scenario:
     return preset_scenario(data["preset"], as_table(data.get("arguments", {}), "arguments"))
 
 
-def preset_scenario(name: Any, arguments: dict[str, Any]) -> Scenario:
+def preset_scenario(name: object, arguments: dict[str, Any]) -> Scenario:
     """The scenario of a preset; validates the preset's name and arguments.
 
     Args:
@@ -413,15 +415,6 @@ def numbers_by_path(data: dict[str, Any], name: str) -> dict[str, Any]:
     table = as_table(data.get(name, {}), name)
     entries = by_path(table, lambda value: not isinstance(value, dict))
     return {path: numbers(value, f"{name}.{path}") for path, value in entries.items()}
-
-
-def _dtype(name: Any) -> Any:
-    checks.one_of("dtype", name, DTYPES)
-    if name == "float64" and jnp.result_type(float) != jnp.float64:
-        call = 'jax.config.update("jax_enable_x64", True)'
-        remedy = f"JAX's 64-bit mode is off: {call}, or leave dtype out."
-        raise checks.fail("dtype", name, "float32", remedy)
-    return jnp.dtype(name)
 
 
 def _run_table(table: Any) -> dict[str, Any]:

@@ -160,7 +160,7 @@ def _entries(data: dict[str, Any], name: str) -> dict[str, Any]:
     for member in distributions.MEMBERS:
         keys_of_entries |= set(_arguments(member))
 
-    def is_entry(value: Any) -> bool:
+    def is_entry(value: object) -> bool:
         """Whether a value is an entry; otherwise it is a table that continues a path."""
         if not isinstance(value, dict) or keys_of_entries & set(value):
             return True
@@ -182,7 +182,7 @@ def _arguments(name: str) -> dict[str, bool]:
     return {word: argument.default is argument.empty for word, argument in taken.items()}
 
 
-def _perturbation(table: Any, path: str) -> Perturbation:
+def _perturbation(table: object, path: str) -> Perturbation:
     if not isinstance(table, dict):
         raise checks.fail(path, table, "a table with a kind and a distribution", EXAMPLE)
     kinds = [kind for kind in KINDS if kind in table]

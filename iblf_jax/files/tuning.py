@@ -182,7 +182,7 @@ def _options(table: dict[str, Any]) -> dict[str, Any]:
     return options
 
 
-def _solver(given: Any) -> Any:
+def _solver(given: object) -> Any:
     """The solver of a name, or of a table with its kind and options."""
     if isinstance(given, str):
         given = {"kind": given}
@@ -194,7 +194,7 @@ def _solver(given: Any) -> Any:
     return components.construct(SOLVERS[kind], table, "tune.solver")
 
 
-def _parameter(entry: Any, key: str) -> Any:
+def _parameter(entry: object, key: str) -> Any:
     if isinstance(entry, str):
         return entry
     table = dict(as_table(entry, key))
@@ -208,7 +208,7 @@ def _parameter(entry: Any, key: str) -> Any:
 
 def _term(
     allowed: tuple[str, ...],
-    entry: Any,
+    entry: object,
     key: str,
     other_keys: tuple[str, ...] = (),
 ) -> Any:
@@ -239,7 +239,7 @@ _TEXT_ARGUMENTS = {"fold": "a metric", "name": "the name of one of its results"}
 """Argument of an objective that is not a number -> its description in words."""
 
 
-def _argument(name: str, value: Any, key: str) -> Any:
+def _argument(name: str, value: object, key: str) -> Any:
     if name == "joints":
         return value  # the function checks it
     if name == "name":
@@ -251,7 +251,7 @@ def _argument(name: str, value: Any, key: str) -> Any:
     return components.decode(value, metrics.Fold, key)
 
 
-def _fold_of(result: Any, key: str) -> str:
+def _fold_of(result: object, key: str) -> str:
     """The metric that returns a result."""
     owners = {
         name: kind for kind, fold in metrics.MEMBERS.items() for name in getattr(fold, "units", ())

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from iblf_jax.core import checks
 from iblf_jax.core.checks import Words, did_you_mean
@@ -44,7 +45,7 @@ def toml_tables(text: str) -> dict[str, Any]:
     return tables
 
 
-def as_table(value: Any, path: str) -> dict[str, Any]:
+def as_table(value: object, path: str) -> dict[str, Any]:
     """`value` if it is a table, else a ValueError."""
     if isinstance(value, dict):
         return value
@@ -86,7 +87,7 @@ def known_keys(table: dict[str, Any], path: str, known: Iterable[str]) -> None:
             raise checks.fail(dotted(path, str(key)), came, expected, did_you_mean(key, known))
 
 
-def numbers(value: Any, path: str, unit: str = "") -> Any:
+def numbers(value: object, path: str, unit: str = "") -> Any:
     """A number, or nested lists of numbers, as floats; ValueError for anything else."""
     if isinstance(value, int | float) and not isinstance(value, bool):
         try:
@@ -101,7 +102,7 @@ def numbers(value: Any, path: str, unit: str = "") -> Any:
     raise checks.fail(path, value, expected)
 
 
-def without_none(hint: Any) -> tuple[Any, bool]:
+def without_none(hint: object) -> tuple[Any, bool]:
     """An annotation without its `| None`, and whether it had one.
 
     A union of several other types becomes Any.
@@ -116,7 +117,7 @@ def without_none(hint: Any) -> tuple[Any, bool]:
     return Any, is_optional
 
 
-def entry_hint(hint: Any, index: int) -> Any:
+def entry_hint(hint: object, index: int) -> Any:
     """The annotation of one entry of a tuple."""
     if typing.get_origin(hint) is not tuple:
         return Any
@@ -126,7 +127,7 @@ def entry_hint(hint: Any, index: int) -> Any:
     return entries[index] if index < len(entries) else Any
 
 
-def encode_numbers(array: Any) -> Any:
+def encode_numbers(array: ArrayLike) -> Any:
     """Floats, in nested lists, whose shortest decimal form gives the same bits in the array's
     precision.
     """
@@ -164,7 +165,7 @@ def encode_static(value: Any, path: str) -> Any:
     raise not_storable(path, value, "a finite number, a string, a bool or a tuple of these")
 
 
-def not_storable(path: str, value: Any, expected: str) -> ValueError:
+def not_storable(path: str, value: object, expected: str) -> ValueError:
     """The error for a value that a file cannot hold."""
     return checks.fail(path, value, expected, "A scenario file cannot hold it.")
 

@@ -84,7 +84,10 @@ def motions_of(curves: Sequence[Curve], t: np.ndarray) -> tuple[ReferenceMotion,
     for curve in curves:
         q = curve.at("q", t)
         plant = curve.run.scenario.loop.plant
-        motions.append(Motion(q, skeletons(plant, q), _motors(curve, t)))
+        motors = None
+        if isinstance(plant, plants.FlexibleJoint):
+            motors = curve.at("level_3", t)
+        motions.append(Motion(q, skeletons(plant, q), motors))
         shape = motions[-1].skeleton.shape[1:]
         if shape != motions[0].skeleton.shape[1:]:
             expected = "points in the plane or in space, the same for all runs"
@@ -96,13 +99,6 @@ def motions_of(curves: Sequence[Curve], t: np.ndarray) -> tuple[ReferenceMotion,
         return ReferenceMotion(t, q_d, lower, upper, desired, np.zeros((len(t), 0))), motions
     fans = jax.jit(jax.vmap(lambda *args: _fans(plant.robot, *args)))(motions[0].q, lower, upper)
     return ReferenceMotion(t, q_d, lower, upper, desired, np.asarray(fans)), motions
-
-
-def _motors(curve: Curve, t: np.ndarray) -> np.ndarray | None:
-    """The positions of the motors at the times t [s], of a plant with flexible joints."""
-    if isinstance(curve.run.scenario.plant, plants.FlexibleJoint):
-        return curve.at("level_3", t)
-    return None
 
 
 def _set_points(line: Any, points: np.ndarray) -> None:
@@ -161,17 +157,16 @@ class Scene:
         dimensions = self.dimensions if axes is self.arm else 2
         return self._animated(axes.plot(*([[]] * dimensions), **options)[0])
 
-    def _fan(self) -> Any:
-        """An animated fan: an area in the plane, an outline in space."""
-        edge = _style.bound()
-        if self.dimensions == 3:
-            return self._line(self.arm, color=edge, linewidth=0.8)
-        face = _style.blend(0.11, _style.colour(0))
-        (area,) = self.arm.fill([0.0], [0.0], edgecolor=edge, facecolor=face, linewidth=0.7)
-        return self._animated(area)
-
     def _add_fans(self) -> None:
-        self.fans = [self._fan() for _ in range(self.target.fans.shape[1])]
+        """Adds the animated fans: areas in the plane, outlines in space."""
+        edge, face = _style.bound(), _style.blend(0.11, _style.colour(0))
+        self.fans = []
+        for _ in range(self.target.fans.shape[1]):
+            if self.dimensions == 3:
+                self.fans.append(self._line(self.arm, color=edge, linewidth=0.8))
+                continue
+            (area,) = self.arm.fill([0.0], [0.0], edgecolor=edge, facecolor=face, linewidth=0.7)
+            self.fans.append(self._animated(area))
         if self.fans:
             self.fans[0].set_label("joint limits")
 

@@ -30,6 +30,8 @@ from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.signals import has
 from iblf_jax.simulation.units import status_words
 from iblf_jax.world import plants
+from iblf_jax.world.plants import Plant
+from iblf_jax.world.robots import Robot
 
 POINTS = 2400
 """Approximate number of points that a line of a figure can resolve."""
@@ -75,7 +77,7 @@ def adapting_law(run: Rollout) -> AdaptiveParameters:
     return _adapting(run)[0]
 
 
-def _repeated(run: Rollout, values: Any) -> np.ndarray:
+def _repeated(run: Rollout, values: np.ndarray) -> np.ndarray:
     """Constants, (p,), at every sample of a run, (T, p)."""
     return np.broadcast_to(values, (len(run.t), len(values)))
 
@@ -113,14 +115,14 @@ LEVEL_PARTS: dict[str | None, Callable[[Rollout, int], Any]] = {
 estimate that the law received, and its disturbance with estimate and error."""
 
 
-def _row_if_any(values: Any, i: int) -> np.ndarray:
+def _row_if_any(values: jax.Array, i: int) -> np.ndarray:
     """As `_row`; NaN for a level that the signal does not have."""
     if is_absent(values) or i < values.shape[1]:
         return _row(values, i)
     return np.full((1, 1), np.nan)
 
 
-def _row(values: Any, i: int) -> np.ndarray:
+def _row(values: jax.Array, i: int) -> np.ndarray:
     """One row of a signal (T, m, n) with infinite entries as NaN; NaN for a run without it."""
     if is_absent(values):
         return np.full((1, 1), np.nan)
@@ -292,37 +294,30 @@ class Curve:
           field: the signal of the panel.
           entry: the joint, or the region, of the panel.
         """
+        # The signals of the run that have bounds: levels, and distances to regions.
+        bounded = ["q"]
+        if self.has_bounds(2):
+            bounded.append("dq")
+        order = plants.order_of(self.run.scenario.plant)
+        bounded += [f"level_{level}" for level in range(3, order + 1)]
+        if self.has_regions:
+            bounded.append("region_margin")
+        own = SAME_BOUNDS.get(field, field)
+        concerned = [name for name in bounded if name not in WITHOUT_JOINT]
+        if own in bounded:
+            concerned = [own]
+        elif own in WITHOUT_JOINT:
+            concerned = []
         exits = []
-        for name in self._bounded_by(field):
+        for name in concerned:
             outside = np.flatnonzero(self._outside(name)[:, entry])
             exits += outside[:1].tolist()
         if exits:
             return min(exits)
-        has_exit = any(self._outside(name).any() for name in self._bounded_signals())
+        has_exit = any(self._outside(name).any() for name in bounded)
         if self.diverged and not has_exit:
             return self.samples - 1
         return None
-
-    def _bounded_signals(self) -> list[str]:
-        """The signals of the run that have bounds: levels, and distances to regions."""
-        names = ["q"]
-        if self.has_bounds(2):
-            names.append("dq")
-        order = plants.order_of(self.run.scenario.plant)
-        names += [f"level_{level}" for level in range(3, order + 1)]
-        if self.has_regions:
-            names.append("region_margin")
-        return names
-
-    def _bounded_by(self, field: str) -> list[str]:
-        """The bounded signals that concern the panel of a signal."""
-        own = SAME_BOUNDS.get(field, field)
-        bounded = self._bounded_signals()
-        if own in bounded:
-            return [own]
-        if own in WITHOUT_JOINT:
-            return []
-        return [name for name in bounded if name not in WITHOUT_JOINT]
 
     def _outside(self, field: str) -> np.ndarray:
         """Whether a bounded signal touches or leaves its bounds, (T, n) bool."""
@@ -361,21 +356,19 @@ def rounding_error(curves: Sequence[Curve], field: str) -> float:
       curves: the runs.
       field: the signal; "xi" is relative to the bounds, so that its scale is 1.
     """
+    level = LEVEL_SIGNAL.fullmatch(field)
     errors = []
     for curve in curves:
+        # The size of the numbers from which the signal is computed.
+        if field == "xi":
+            size = 1.0
+        elif level is not None and level[2] == "estimate":
+            size = curve.largest_rate(int(level[1]))
+        else:
+            size = max(curve.largest(name) for name in COMPUTED_FROM.get(field, (field,)))
         unit_in_last_place = float(np.finfo(curve[field].dtype).eps)
-        errors.append(ROUNDING * unit_in_last_place * _scale_of(curve, field))
+        errors.append(ROUNDING * unit_in_last_place * size)
     return max(errors)
-
-
-def _scale_of(curve: Curve, field: str) -> float:
-    """The size of the numbers from which a signal is computed."""
-    if field == "xi":
-        return 1.0
-    level = LEVEL_SIGNAL.fullmatch(field)
-    if level is not None and level[2] == "estimate":
-        return curve.largest_rate(int(level[1]))
-    return max(curve.largest(name) for name in COMPUTED_FROM.get(field, (field,)))
 
 
 class Peak(NamedTuple):
@@ -397,7 +390,7 @@ def peak_of(curve: Curve, field: str, joints: Sequence[int]) -> Peak | None:
     return Peak(float(values[sample, column]), joints[column], float(curve.t[sample]))
 
 
-def joint_labels(plant: Any) -> list[str]:
+def joint_labels(plant: Robot | Plant) -> list[str]:
     """The labels of the joints of a robot, or of the components of a plant."""
     return [escaped(name) for name in plants.component_names(plant)]
 
@@ -411,20 +404,7 @@ def escaped(name: str) -> str:
     return name.replace("$", r"\$")
 
 
-def _valid_samples(run: Rollout) -> int:
-    """Number of samples before the state was frozen: all of them, unless the run diverged."""
-    q, dq = np.asarray(run.q), np.asarray(run.dq)
-    if not int(run.status) & Status.NOT_FINITE or len(q) < 2:
-        return len(q)
-    moved = np.any((np.diff(q, axis=0) != 0) | (np.diff(dq, axis=0) != 0), axis=1)
-    finite = np.isfinite(q).all(axis=1)
-    last = np.flatnonzero(moved & finite[1:])
-    if not last.size:
-        return len(q)
-    return int(last[-1]) + 2
-
-
-def check_class(argument: str, value: Any, cls: type, remedy: str) -> None:
+def check_class(argument: str, value: object, cls: type, remedy: str) -> None:
     """Raises ValueError if the value is not an object of this class."""
     if not isinstance(value, cls):
         raise checks.fail(argument, type(value).__name__, checks.with_article(cls.__name__), remedy)
@@ -438,7 +418,15 @@ def _checked(name: str, run: Any, argument: str) -> Curve:
     if run.is_batch:
         came = f"a batch of {len(run)} runs"
         raise checks.fail(argument, came, "one run", "Select a run: run[0].")
-    return Curve(name, run, _valid_samples(run))
+    q, dq = np.asarray(run.q), np.asarray(run.dq)
+    samples = len(q)
+    if int(run.status) & Status.NOT_FINITE and len(q) > 1:
+        # The run diverged: the samples before its state was frozen.
+        moved = np.any((np.diff(q, axis=0) != 0) | (np.diff(dq, axis=0) != 0), axis=1)
+        last = np.flatnonzero(moved & np.isfinite(q).all(axis=1)[1:])
+        if last.size:
+            samples = int(last[-1]) + 2
+    return Curve(name, run, samples)
 
 
 def curves_of(runs: Rollout | Mapping[str, Rollout]) -> list[Curve]:
@@ -464,7 +452,7 @@ def curves_of(runs: Rollout | Mapping[str, Rollout]) -> list[Curve]:
     return curves
 
 
-def check_joint(curves: Sequence[Curve], joint: Any, field: str = "joint") -> int:
+def check_joint(curves: Sequence[Curve], joint: object, field: str = "joint") -> int:
     """The index of a joint that is given by its index or its name.
 
     Raises:

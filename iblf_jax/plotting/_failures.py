@@ -90,22 +90,17 @@ def _draw_levels(axes: Axes, found: FailureProbability) -> None:
             label = "threshold of a level" if number == 0 else "_nolegend_"
             axes.axvline(level.threshold, color=_style.blend(0.4), **_style.FAINT, label=label)
     if not found.margins_stagnate:
-        _draw_estimate(axes, found)
+        low, high = found.interval
+        errors = [[found.estimate - max(low, found.estimate * 1e-3)], [high - found.estimate]]
+        label = f"estimate with {100 * found.confidence:g}% interval".replace("%", " %")
+        if found.is_upper_bound:
+            label = "upper bound"
+        colour = _style.colour(1)
+        axes.errorbar(
+            [0.0], [found.estimate], yerr=errors, fmt="o", color=colour, capsize=4, label=label
+        )
     axes.set_xlabel(_style.label("margin x above the limit", found.unit))
     axes.set_ylabel("probability [1]")
-
-
-def _draw_estimate(axes: Axes, found: FailureProbability) -> None:
-    low, high = found.interval
-    lower = max(low, found.estimate * 1e-3)
-    errors = [[found.estimate - lower], [high - found.estimate]]
-    label = f"estimate with {100 * found.confidence:g}% interval".replace("%", " %")
-    if found.is_upper_bound:
-        label = "upper bound"
-    colour = _style.colour(1)
-    axes.errorbar(
-        [0.0], [found.estimate], yerr=errors, fmt="o", color=colour, capsize=4, label=label
-    )
 
 
 def _draw_likely(axes: Axes, likely: LikelyFailure | None, numbers: int) -> None:

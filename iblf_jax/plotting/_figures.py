@@ -93,26 +93,19 @@ def windows(
     """
     end = max(float(np.asarray(curve.run.t)[-1]) for curve in curves) or 1e-3
     if zoom is None:
-        zoom = _default_zoom(curves, rows, end, transients)
+        transient = _transient_of(curves, rows)
+        zoom = ZOOM_SHARE * end
+        if transient != 0:
+            exact = min(max(transients * transient, MIN_ZOOMED * end), MAX_ZOOMED * end)
+            zoom = float(f"{exact:.0e}")
+            if zoom < transient <= exact:
+                zoom = float(f"{exact:.1e}")
     return (0.0, end), (0.0, min(checks.positive_number("zoom", zoom, "s"), end))
 
 
 def _transient_of(curves: Sequence[Curve], rows: Sequence[PanelRow]) -> float:
     """The end of the longest transient of some rows [s]."""
     return max(transient_end(curves, row.quantity, row.joint) for row in rows)
-
-
-def _default_zoom(
-    curves: Sequence[Curve], rows: Sequence[PanelRow], end: float, transients: float
-) -> float:
-    transient = _transient_of(curves, rows)
-    if transient == 0:
-        return ZOOM_SHARE * end
-    zoom = min(max(transients * transient, MIN_ZOOMED * end), MAX_ZOOMED * end)
-    rounded = float(f"{zoom:.0e}")
-    if rounded < transient <= zoom:
-        return float(f"{zoom:.1e}")
-    return rounded
 
 
 def zoom_reason(curves: Sequence[Curve], rows: Sequence[PanelRow], zoom: float) -> str:

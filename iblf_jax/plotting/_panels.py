@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.typing import ColorType
 
 from iblf_jax.core.units import per_second
 from iblf_jax.plotting import _style
@@ -501,7 +502,7 @@ MAX_MARKS = 200
 """More events than this in a window are not marked: the marks would cover the curve."""
 
 
-def _mark_events(axes: Axes, curve: Curve, joint: int, window: Window, color: Any) -> None:
+def _mark_events(axes: Axes, curve: Curve, joint: int, window: Window, color: ColorType) -> None:
     """Marks the instants at which an event trigger sent a command."""
     run = curve.run
     if not has(run, "events"):
@@ -539,7 +540,9 @@ def show(
     drawn += _draw_measured(axes, curves, quantity, joint, window)
     for i, curve in enumerate(curves):
         style = run_style(curves, i)
-        style["label"] = _run_label(curve, quantity)
+        style["label"] = curve.name or quantity.symbol
+        if quantity.truth:
+            style["label"] = f"{curve.name} {quantity.estimate_symbol}".strip()
         drawn.append((curve, draw(axes, curve, quantity.field, joint, window, **style)))
         if quantity.field == "tau":
             _mark_events(axes, curve, joint, window, style["color"])
@@ -567,12 +570,6 @@ def run_style(curves: Sequence[Curve], index: int) -> dict[str, Any]:
     if curves[index].failed and len(curves) > 1:
         return series(index) | FAINT
     return series(index)
-
-
-def _run_label(curve: Curve, quantity: PanelQuantity) -> str:
-    if quantity.truth:
-        return f"{curve.name} {quantity.estimate_symbol}".strip()
-    return curve.name or quantity.symbol
 
 
 def transient_end(curves: Sequence[Curve], quantity: PanelQuantity, joint: int) -> float:

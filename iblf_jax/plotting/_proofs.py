@@ -12,7 +12,7 @@ from iblf_jax.core import checks
 from iblf_jax.plotting import _style
 from iblf_jax.plotting._curves import check_class, curves_of, escaped, thinned
 from iblf_jax.plotting._panels import quantity_of
-from iblf_jax.proofs.result import GuaranteedTube, Proof
+from iblf_jax.proofs.result import Proof
 from iblf_jax.world import plants
 
 WIDTH = 7.6
@@ -47,7 +47,11 @@ def guaranteed_tube(found: Proof, *, runs: int = RUNS) -> Figure:
     panels = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
     shown = found.adversarial_runs(count) if count else []
     for i, axes in enumerate(panels):
-        _draw_tube(axes, tube, i)
+        for side, text in ((tube.lower_bound, "bounds"), (tube.upper_bound, "_")):
+            axes.plot(tube.t, side[:, i], color=_style.bound(), linewidth=1.0, label=text)
+        style: dict[str, Any] = {"color": _style.tube(), "linewidth": 0, "zorder": 0}
+        axes.fill_between(tube.t, tube.lower[:, i], tube.upper[:, i], label="level set", **style)
+        axes.plot(tube.t, tube.reference[:, i], label="reference", **_style.reference())
         for number, run in enumerate(shown):
             label = "runs from V = level" if number == 0 else "_"
             t, q = thinned(np.asarray(run.t), np.asarray(run.q)[:, i])
@@ -71,16 +75,6 @@ def _heading(found: Proof) -> str:
         ranges = [f"{len(ranges)} uncertain parameters"]
     words = escaped(", ".join([*ranges, str(found.verdict)]))
     return f"{level}: {words}"
-
-
-def _draw_tube(axes: Axes, tube: GuaranteedTube, i: int) -> None:
-    """Bounds, the positions of the level set and the reference of one joint."""
-    lower, upper = tube.lower_bound[:, i], tube.upper_bound[:, i]
-    for side, text in ((lower, "bounds"), (upper, "_")):
-        axes.plot(tube.t, side, color=_style.bound(), linewidth=1.0, label=text)
-    style: dict[str, Any] = {"color": _style.tube(), "linewidth": 0, "zorder": 0}
-    axes.fill_between(tube.t, tube.lower[:, i], tube.upper[:, i], label="level set", **style)
-    axes.plot(tube.t, tube.reference[:, i], label="reference", **_style.reference())
 
 
 def _draw_violation(axes: Axes, found: Proof, i: int) -> None:

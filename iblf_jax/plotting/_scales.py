@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
+from numpy.typing import ArrayLike
 
 from iblf_jax.plotting._curves import ROUNDING
 
@@ -41,16 +42,6 @@ LINEAR = Scale("linear", {}, lambda x: x, lambda x: x)
 LOGARITHMIC = Scale("log", {}, np.log10, lambda y: 10.0**y)
 
 
-def _logarithmic_on_both_sides(linear_up_to: float) -> Scale:
-    """The scale of values of both signs that is linear up to a size."""
-    return Scale(
-        "symlog",
-        {"linthresh": linear_up_to},
-        lambda x: np.arcsinh(x / linear_up_to),
-        lambda y: linear_up_to * np.sinh(y),
-    )
-
-
 def varies(x: np.ndarray) -> bool:
     """Whether the finite ones of some numbers differ by more than rounding errors."""
     x = _finite(x)
@@ -60,14 +51,14 @@ def varies(x: np.ndarray) -> bool:
     return bool(np.ptp(x) > ROUNDING * unit_in_last_place * np.max(np.abs(x)))
 
 
-def _finite(x: Any) -> np.ndarray:
+def _finite(x: ArrayLike) -> np.ndarray:
     values = np.ravel(np.asarray(x))
     if not np.issubdtype(values.dtype, np.floating):
         values = values.astype(float)
     return values[np.isfinite(values)]
 
 
-def scale_of(x: Any) -> Scale:
+def scale_of(x: ArrayLike) -> Scale:
     """The scale of an axis with these values: linear, unless a logarithmic one spreads their middle
     half (`GAIN`), or moves their median away from an end (`CORNER`).
     """
@@ -79,7 +70,12 @@ def scale_of(x: Any) -> Scale:
         usual = float(np.quantile(np.abs(values), 0.75))
         if usual == 0.0:
             return LINEAR
-        other = _logarithmic_on_both_sides(usual)
+        other = Scale(
+            "symlog",
+            {"linthresh": usual},
+            lambda x: np.arcsinh(x / usual),
+            lambda y: usual * np.sinh(y),
+        )
     if _middle_share(other, values) > GAIN * _middle_share(LINEAR, values):
         return other
     if _is_in_corner(LINEAR, values) and not _is_in_corner(other, values):
@@ -100,7 +96,7 @@ def _is_in_corner(scale: Scale, values: np.ndarray) -> bool:
     return bool(min(place, 1.0 - place) < CORNER)
 
 
-def follow(axes: Axes, direction: str, x: Any) -> None:
+def follow(axes: Axes, direction: str, x: ArrayLike) -> None:
     """Sets scale and limits of an axis so that it shows all finite ones of its values.
 
     Args:

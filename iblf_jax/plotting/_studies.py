@@ -171,7 +171,17 @@ def _draw_histogram(axes: Axes, study: Study, name: str, x: np.ndarray, bins: in
     finite = np.isfinite(x)
     unit = study.metrics.units.get(name, "1")
     if _scales.varies(x):
-        _draw_bars(axes, x[finite & ~failed], x[finite & failed], bins)
+        good, bad = x[finite & ~failed], x[finite & failed]
+        both = np.concatenate([good, bad]).astype(float)
+        scale = _scales.scale_of(both)
+        edges = scale.spread(float(both.min()), float(both.max()), bins + 1)
+        # The inverse of a scale rounds; the outermost values belong to the first and the last bar.
+        edges[0], edges[-1] = both.min(), both.max()
+        axes.hist(good, edges.tolist(), label="not failed", alpha=0.8, color=_style.colour(0))
+        style: dict[str, Any] = {"alpha": 0.8, "color": _style.colour(1), "linewidth": 0}
+        style |= {"hatch": "////", "edgecolor": _style.background()}
+        axes.hist(bad, edges.tolist(), label="failed", **style)
+        axes.set_xscale(scale.name, **scale.options)
     elif finite.any():
         centred: dict[str, Any] = {"transform": axes.transAxes, "ha": "center", "va": "center"}
         axes.text(0.5, 0.5, f"{x[finite][0]:.5g} {unit} in every run", **centred)
@@ -185,20 +195,6 @@ def _draw_histogram(axes: Axes, study: Study, name: str, x: np.ndarray, bins: in
     axes.set_title("\n".join(notes))
     axes.set_xlabel(_metric_label(study, name))
     axes.set_ylabel("runs")
-
-
-def _draw_bars(axes: Axes, good: np.ndarray, bad: np.ndarray, bins: int) -> None:
-    """The bars of a histogram, on the scale that its values need."""
-    both = np.concatenate([good, bad]).astype(float)
-    scale = _scales.scale_of(both)
-    edges = scale.spread(float(both.min()), float(both.max()), bins + 1)
-    # The inverse of a scale rounds; the outermost values belong to the first and the last bar.
-    edges[0], edges[-1] = both.min(), both.max()
-    axes.hist(good, edges.tolist(), label="not failed", alpha=0.8, color=_style.colour(0))
-    style: dict[str, Any] = {"alpha": 0.8, "color": _style.colour(1), "linewidth": 0}
-    style |= {"hatch": "////", "edgecolor": _style.background()}
-    axes.hist(bad, edges.tolist(), label="failed", **style)
-    axes.set_xscale(scale.name, **scale.options)
 
 
 def _metric_label(study: Study, name: str) -> str:

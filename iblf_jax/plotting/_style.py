@@ -21,10 +21,13 @@ from typing import Any
 
 import matplotlib
 from matplotlib.axes import Axes
+from matplotlib.backend_bases import RendererBase
 from matplotlib.colors import to_hex, to_rgb, to_rgba
 from matplotlib.figure import Figure
 from matplotlib.gridspec import SubplotSpec
 from matplotlib.rcsetup import cycler
+from matplotlib.text import Text
+from matplotlib.typing import ColorType
 
 from iblf_jax.plotting._curves import Curve
 
@@ -135,7 +138,7 @@ class StyledFigure(Figure):
             if name.split(".")[0] in STYLE_GROUPS
         }
 
-    def draw(self, renderer: Any) -> None:
+    def draw(self, renderer: RendererBase) -> None:
         """Draws the figure in the style of its creation."""
         with matplotlib.rc_context(self._style_of_creation):
             if not self._fitted:
@@ -143,7 +146,7 @@ class StyledFigure(Figure):
                 self._fit_labels(renderer)
             super().draw(renderer)
 
-    def _fit_labels(self, renderer: Any) -> None:
+    def _fit_labels(self, renderer: RendererBase) -> None:
         """Breaks every title and label that is longer than its panel.
 
         The first pass lays the panels out without the labels, further ones with the broken labels.
@@ -165,7 +168,7 @@ class StyledFigure(Figure):
                     text.set_text("\n".join(wrapped(line, most) for line in words.split("\n")))
 
     def _lengths(
-        self, labels: list[tuple[Axes, Any]], renderer: Any, in_layout: bool
+        self, labels: list[tuple[Axes, Text]], renderer: RendererBase, in_layout: bool
     ) -> list[tuple[float, float]]:
         """The length of every label and the room that its panel has for it."""
         for _, text in labels:
@@ -220,7 +223,7 @@ def background() -> str:
     return "#ffffff"
 
 
-def is_light(colour: Any) -> bool:
+def is_light(colour: ColorType) -> bool:
     """Whether dark marks contrast with this colour better than light ones."""
     red, green, blue = to_rgb(colour)
     return 0.299 * red + 0.587 * green + 0.114 * blue > 0.5

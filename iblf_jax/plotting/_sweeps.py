@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import matplotlib
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 
 from iblf_jax.core import checks
 from iblf_jax.core.status import FAILED, VIOLATED
@@ -118,7 +120,7 @@ def heat_map(
 
 def _draw_heat_map(
     figure: Figure,
-    axes: Any,
+    axes: Axes,
     data: xarray.Dataset,
     metric: str,
     x: str | None,
@@ -143,7 +145,10 @@ def _draw_heat_map(
     image = axes.imshow(picture, origin="lower", aspect="auto", cmap=_style.colour_map(COLOURS))
     axes.grid(visible=False)
     for axis, name in ((axes.xaxis, x), (axes.yaxis, y)):
-        _ticks(axis, np.asarray(data[name].values))
+        numbers = np.asarray(data[name].values)
+        last = len(numbers) - 1
+        places = np.unique(np.linspace(0, last, min(last + 1, 12)).round().astype(int))
+        axis.set_ticks(places, labels=[f"{numbers[i]:.4g}" for i in places])
     axes.set_xlabel(_axis_label(data, x))
     axes.set_ylabel(_axis_label(data, y))
     figure.colorbar(image, ax=axes, label=label)
@@ -162,12 +167,7 @@ def _equality(metric: str, picture: np.ndarray) -> str:
     return "equal at all points"
 
 
-def _ticks(axis: Any, values: np.ndarray) -> None:
-    places = np.unique(np.linspace(0, len(values) - 1, min(len(values), 12)).round().astype(int))
-    axis.set_ticks(places, labels=[f"{values[i]:.4g}" for i in places])
-
-
-def _write_numbers(axes: Any, picture: np.ndarray, image: Any) -> None:
+def _write_numbers(axes: Any, picture: np.ndarray, image: AxesImage) -> None:
     centred = {"ha": "center", "va": "center", "fontsize": _style.size(7.5)}
     for (row, column), value in np.ndenumerate(picture):
         cell: Any = _style.background()

@@ -253,7 +253,11 @@ def paths(
     Source: design of this package.
     """
     _check_tuned(result)
-    names = _two_gains(result, gains)
+    names = result.names[:2] if gains is None else gains
+    are_two = isinstance(names, tuple | list) and len(names) == 2
+    if not are_two or not all(name in result.names for name in names):
+        remedy = f"They are {', '.join(result.names)}."
+        raise checks.fail("gains", gains, "the names of two tuned numbers", remedy)
     points = checks.positive_integer("points", points, least=2, most=checks.MAX_POINTS)
     pair = [result.names.index(name) for name in names]
     iterates = {"tune": result.history["x"][:, result.best_start][:, pair]}
@@ -263,7 +267,7 @@ def paths(
     all_gains = np.concatenate([*iterates.values(), tuned[None]])
     logarithmic = bool(np.all(all_gains > 0))
     grid = [_axis(x, points, logarithmic=logarithmic) for x in all_gains.T]
-    loss, excess = result.on_slice(*names, *grid)
+    loss, excess = result.on_slice(names[0], names[1], *grid)
     figure = _style.new_figure(0.8 * _style.WIDTH, 4.4)
     axes = figure.subplots()
     _draw_contours(axes, grid[0], grid[1], loss, 0.7, 14)
@@ -280,23 +284,11 @@ def paths(
     return figure
 
 
-def _check_tuned(result: Any) -> None:
+def _check_tuned(result: object) -> None:
     """Raises ValueError for something that is no result of `tune`."""
     from iblf_jax.tuning import TuneResult  # a result exists only where its package is loaded
 
     check_class("result", result, TuneResult, "ij.tune returns one.")
-
-
-def _two_gains(result: TuneResult, gains: Any) -> tuple[str, str]:
-    """The names of two tuned numbers; by default the first two."""
-    names = gains
-    if gains is None:
-        names = result.names[:2]
-    are_two = isinstance(names, tuple | list) and len(names) == 2
-    if not are_two or not all(name in result.names for name in names):
-        remedy = f"They are {', '.join(result.names)}."
-        raise checks.fail("gains", gains, "the names of two tuned numbers", remedy)
-    return names[0], names[1]
 
 
 def _axis(x: np.ndarray, points: int, *, logarithmic: bool) -> np.ndarray:

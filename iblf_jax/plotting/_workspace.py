@@ -12,6 +12,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.gridspec import SubplotSpec
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
@@ -24,6 +25,7 @@ from iblf_jax.plotting._figures import Runs
 from iblf_jax.plotting._panels import run_style
 from iblf_jax.world.plants import Plant
 from iblf_jax.world.regions import HalfSpace, Region, Sphere, in_words, row_of
+from iblf_jax.world.robots import Robot
 
 GRID = 301
 """Points per side of the grid on which a boundary in the plane is computed."""
@@ -69,7 +71,7 @@ def skeletons(plant: Plant, q: np.ndarray) -> np.ndarray:
     return found
 
 
-def set_limits(axes: Any, points: np.ndarray, regions: Sequence[Region]) -> np.ndarray:
+def set_limits(axes: Axes, points: np.ndarray, regions: Sequence[Region]) -> np.ndarray:
     """Sets the limits of a panel so that it shows all points and all spheres to stay out of.
 
     Args:
@@ -100,7 +102,7 @@ def set_limits(axes: Any, points: np.ndarray, regions: Sequence[Region]) -> np.n
     return limits
 
 
-def draw_boundaries(axes: Any, robot: Any, regions: Sequence[Region], limits: np.ndarray) -> None:
+def draw_boundaries(axes: Any, robot: Robot, regions: Sequence[Region], limits: np.ndarray) -> None:
     """Draws the boundaries of all regions within the limits (d, 2) of a panel [m].
 
     Boundaries for the same point of the robot have the same line style and one entry in the legend.
@@ -133,31 +135,22 @@ def _draw_in_plane(axes: Any, region: Region, limits: np.ndarray, style: dict[st
 
 def _draw_in_space(axes: Any, region: Region, limits: np.ndarray, style: dict[str, Any]) -> None:
     if isinstance(region, HalfSpace):
-        _draw_plane(axes, region, limits, style)
+        corners = _plane_in_box(np.asarray(region.normal), float(region.offset), limits)
+        if len(corners):
+            edge = {"edgecolor": style["color"], "linestyle": style["linestyle"]}
+            polygon = Poly3DCollection([corners], facecolor=style["color"], alpha=0.13, **edge)
+            axes.add_collection3d(polygon)
     elif isinstance(region, Sphere):
-        _draw_sphere(axes, region, limits, style)
-
-
-def _draw_plane(axes: Any, region: HalfSpace, limits: np.ndarray, style: dict[str, Any]) -> None:
-    corners = _plane_in_box(np.asarray(region.normal), float(region.offset), limits)
-    if len(corners):
-        edge = {"edgecolor": style["color"], "linestyle": style["linestyle"]}
-        polygon = Poly3DCollection([corners], facecolor=style["color"], alpha=0.13, **edge)
-        axes.add_collection3d(polygon)
-
-
-def _draw_sphere(axes: Any, region: Sphere, limits: np.ndarray, style: dict[str, Any]) -> None:
-    theta, phi = np.meshgrid(
-        np.linspace(0.0, np.pi, SPHERE_CIRCLES[0]),
-        np.linspace(0.0, 2 * np.pi, SPHERE_CIRCLES[1]),
-        indexing="ij",
-    )
-    unit = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)])
-    points = np.asarray(region.centre)[:, None, None] + float(region.radius) * unit
-    inside = np.all((points >= limits[:, :1, None]) & (points <= limits[:, 1:, None]), axis=0)
-    visible = np.where(inside, points, np.nan)
-    for circles in (visible.transpose(1, 0, 2), visible.transpose(2, 0, 1)):
-        for circle in circles:
+        theta, phi = np.meshgrid(
+            np.linspace(0.0, np.pi, SPHERE_CIRCLES[0]),
+            np.linspace(0.0, 2 * np.pi, SPHERE_CIRCLES[1]),
+            indexing="ij",
+        )
+        unit = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)])
+        points = np.asarray(region.centre)[:, None, None] + float(region.radius) * unit
+        inside = np.all((points >= limits[:, :1, None]) & (points <= limits[:, 1:, None]), axis=0)
+        visible = np.where(inside, points, np.nan)
+        for circle in (*visible.transpose(1, 0, 2), *visible.transpose(2, 0, 1)):
             axes.plot(*circle, **style, linewidth=0.5, alpha=0.6, label="_")
 
 

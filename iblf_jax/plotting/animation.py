@@ -81,7 +81,10 @@ def film_path(path: str | Path, field: str = "path") -> Path:
 def write_film(pictures: list[Image.Image], path: Path, fps: float) -> Path:
     """Writes pictures of equal size as a film; returns its path."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    WRITERS[path.suffix.lower()](_with_one_palette(pictures), path, fps)
+    # One palette for all: 96 colours of the last picture, in which every colour occurs.
+    palette = pictures[-1].quantize(96, method=Image.Quantize.MAXCOVERAGE)
+    few = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
+    WRITERS[path.suffix.lower()](few, path, fps)
     return path
 
 
@@ -111,12 +114,6 @@ def _pictures(scene: Scene) -> Iterator[Image.Image]:
         for axes, part in scene.move_to(frame):
             axes.draw_artist(part)
         yield Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
-
-
-def _with_one_palette(pictures: list[Image.Image]) -> list[Image.Image]:
-    """The pictures in 96 colours of the last picture, in which every colour occurs."""
-    palette = pictures[-1].quantize(96, method=Image.Quantize.MAXCOVERAGE)
-    return [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
 
 
 def _write_gif(pictures: list[Image.Image], path: Path, fps: float) -> None:

@@ -50,7 +50,13 @@ def certificate(
       ValueError: not a Certificate, or `until` before the first samples.
     """
     check_class("shown", shown, Certificate, "Draw what ij.certify returned.")
-    traces = _until(shown.traces, until)
+    traces = shown.traces
+    if until is not None:
+        keep = traces.t <= checks.positive_number("until", until, "s")
+        if np.sum(keep) < 2:
+            expected = f"a time after the second sample, {float(traces.t[1]):g} s"
+            raise checks.fail("until", until, expected)
+        traces = type(traces)(*(x[keep] for x in traces))
     if isinstance(traces, LevelTraces):
         figure = _level_panels(shown, traces)
         subject = "The law's own claim" if shown.is_of_own_claim else "The claim (S.3)"
@@ -154,17 +160,6 @@ class Bounded(NamedTuple):
     name: str
     symbol: str
     unit: str
-
-
-def _until(traces: Traces | LevelTraces, until: float | None) -> Traces | LevelTraces:
-    """The traces up to a time, if one is given."""
-    if until is None:
-        return traces
-    keep = traces.t <= checks.positive_number("until", until, "s")
-    if np.sum(keep) < 2:
-        expected = f"a time after the second sample, {float(traces.t[1]):g} s"
-        raise checks.fail("until", until, expected)
-    return type(traces)(*(x[keep] for x in traces))
 
 
 def _bound_style() -> dict[str, Any]:

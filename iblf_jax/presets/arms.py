@@ -37,6 +37,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from iblf_jax.control.barriers import Barrier
 from iblf_jax.control.controllers import LAWS, PDGravity, TrackingLaw, law_by_name, within_effort
@@ -108,7 +109,9 @@ def _positions_of(reference: Reference, times: jax.Array) -> jax.Array:
     return jax.vmap(reference.position)(times)
 
 
-def inertial_gain(robot: Robot, q: Any, rate: float = RATE, least: Any = MIN_K2) -> jax.Array:
+def inertial_gain(
+    robot: Robot, q: ArrayLike, rate: float = RATE, least: ArrayLike = MIN_K2
+) -> jax.Array:
     """The gain with which the modes of the loop are about `rate` on every joint.
 
         K2_i = max(rate M_ii(q), least)
@@ -367,10 +370,10 @@ def iiwa14(*, law: str = "integral", variant: str = "corrected", payload: float 
 
 def _swinging(
     robot: Arm,
-    middle: Any,
-    amplitude: Any,
-    frequency: Any,
-    push: Any,
+    middle: ArrayLike,
+    amplitude: ArrayLike,
+    frequency: ArrayLike,
+    push: ArrayLike,
     payload: float,
     law: str,
     variant: str,

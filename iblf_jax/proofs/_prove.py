@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from numpy.typing import ArrayLike
 
 from iblf_jax.core import checks, notices
 from iblf_jax.core.progress import announced
@@ -34,6 +35,7 @@ from iblf_jax.proofs.periods import AperiodicError
 from iblf_jax.proofs.problem import LevelSetProblem
 from iblf_jax.proofs.result import GrowthPoint, Proof, Verdict, Violation, WorstBox
 from iblf_jax.proofs.search import SearchResult, search
+from iblf_jax.proofs.search import WorstBox as SearchedBox
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.distributions import Perturbation
@@ -91,7 +93,7 @@ def prove(
     parameters: Mapping[str, Perturbation] | None = None,
     weight: float | None = None,
     duration: float | None = None,
-    disturbance_rate: Any = None,
+    disturbance_rate: ArrayLike | None = None,
     max_boxes: int = 1_000_000_000,
     threads: int | None = None,
     progress: bool | None = None,
@@ -147,10 +149,16 @@ def prove(
         scenario = canonical(scenario)
         sampled = sample_weights(problem, level, weights_of(scenario, weight), options.seed)
         best = min(sampled, key=lambda found: found.largest)
-        result, worst = None, None
+        result, worst, growth_points = None, None, []
         if best.largest <= 0.0:
             best, result = _searched(problem, level, sampled, best, options)
             worst = result.worst
+        else:
+            # For each weight, V_w' > 0 at a point of the set.
+            for found in sampled:
+                constants = problem.constants(found.weight, level)
+                state = problem.state_of(found.points[0], constants)
+                growth_points.append(GrowthPoint(found.weight, found.largest, state))
         violation, verdict = None, Verdict.PROVED
         if result is None or not result.proved:
             violation = _refuted(problem, level, best, options.runs)
@@ -170,7 +178,7 @@ def prove(
             done=0.0 if result is None else result.done,
             seconds=time.monotonic() - start,
             rates={found.weight: found.largest for found in sampled},
-            growth_points=_growth_points(problem, level, sampled),
+            growth_points=tuple(growth_points),
             worst_box=None if worst is None else _worst_box(problem, level, best.weight, worst),
             violation=violation,
             assumptions=problem.assumptions,
@@ -178,7 +186,9 @@ def prove(
         )
 
 
-def _chosen(level: Any, parameters: Any) -> tuple[float, Mapping[str, Perturbation]]:
+def _chosen(
+    level: float | None, parameters: Mapping[str, Perturbation] | None
+) -> tuple[float, Mapping[str, Perturbation]]:
     """Level and parameters; the error says how to choose what is missing."""
     if level is None:
         expected = "a level of V_w, such as level=0.5 [the unit of V_w]"
@@ -211,13 +221,13 @@ class _Options(NamedTuple):
     @classmethod
     def of(
         cls,
-        weight: Any,
-        max_boxes: Any,
-        threads: Any,
-        progress: Any,
-        checkpoint: Any,
-        runs: Any,
-        seed: Any,
+        weight: float | None,
+        max_boxes: int,
+        threads: int | None,
+        progress: bool | None,
+        checkpoint: str | PathLike | None,
+        runs: int,
+        seed: int,
     ) -> _Options:
         """Raises ValueError for an option that is not admissible."""
         if weight is not None:
@@ -236,7 +246,7 @@ def problem_of(
     scenario: Scenario,
     parameters: Mapping[str, Perturbation],
     duration: float | None,
-    disturbance_rate: Any,
+    disturbance_rate: ArrayLike | None,
 ) -> LevelSetProblem:
     """The proof problem of a scenario.
 
@@ -294,7 +304,11 @@ def sample_weights(
 
 
 def _largest_rates(
-    problem: LevelSetProblem, constants: Any, weight: float, points: np.ndarray, seed: int
+    problem: LevelSetProblem,
+    constants: Sequence[np.ndarray],
+    weight: float,
+    points: np.ndarray,
+    seed: int,
 ) -> _Sampled:
     """Increases V_w' from the best of some points.
 
@@ -320,19 +334,6 @@ def _best(points: np.ndarray, rates: np.ndarray) -> tuple[np.ndarray, np.ndarray
     """The points with the largest rates."""
     order = np.argsort(-np.nan_to_num(rates, nan=-np.inf), kind="stable")[:PARENTS]
     return points[order], rates[order]
-
-
-def _growth_points(
-    problem: LevelSetProblem, level: float, sampled: Sequence[_Sampled]
-) -> tuple[GrowthPoint, ...]:
-    """The point with the largest V_w' for each weight, in physical numbers; () unless all grow."""
-    if min(each.largest for each in sampled) <= 0.0:
-        return ()
-    found = []
-    for each in sampled:
-        state = problem.state_of(each.points[0], problem.constants(each.weight, level))
-        found.append(GrowthPoint(each.weight, each.largest, state))
-    return tuple(found)
 
 
 # --- branch and bound ----------------------------------------------------------------------------
@@ -392,7 +393,9 @@ def _search(
         raise checks.fail("prove: scenario", checks.Words(str(error)), expected) from error
 
 
-def _worst_box(problem: LevelSetProblem, level: float, weight: float, found: Any) -> WorstBox:
+def _worst_box(
+    problem: LevelSetProblem, level: float, weight: float, found: SearchedBox
+) -> WorstBox:
     """The worst box with the names of its coordinates, and its bounds with narrower intervals."""
     intervals = {
         name: (float(low), float(high))

@@ -26,6 +26,7 @@ maximum over z is that at the corners of the box of z: V_w' is bounded at each c
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -125,7 +126,7 @@ class Affine(NamedTuple):
     """Its derivative, (n, n)."""
 
 
-def in_f_tilde(function: Any, n: int) -> Any:
+def in_f_tilde(function: Callable[[jax.Array], Any], n: int) -> Any:
     """A pytree of vectors that are affine in f_tilde, each as an `Affine`."""
     zero = jnp.zeros(n)
     values = function(zero)
@@ -144,7 +145,7 @@ def scaled(factor: jax.Array, vector: Affine) -> Affine:
     return Affine(factor * vector.value, factor * vector.slope)
 
 
-def on_columns(function: Any, vector: Affine) -> Affine:
+def on_columns(function: Callable[[jax.Array], jax.Array], vector: Affine) -> Affine:
     """A linear function of a vector that is affine in f_tilde."""
     n = vector.slope.shape[-1]
     columns = [function(vector.slope[:, i]) for i in range(n)]

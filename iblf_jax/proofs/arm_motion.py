@@ -41,6 +41,7 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.control import controllers
+from iblf_jax.control.barriers import Barrier
 from iblf_jax.core.linalg import inner, matvec
 from iblf_jax.proofs.forms import enclosed
 from iblf_jax.proofs.matrices import inverse
@@ -140,7 +141,7 @@ def side_of(parts: ArmParts, t: jax.Array, xi: jax.Array) -> Side:
     return Side(k, growth, Tube(zero, zero, -k_l, k_u, -dk_l, dk_u))
 
 
-def degree(barrier: Any) -> int:
+def degree(barrier: Barrier) -> int:
     """d: V1 is homogeneous of this degree in lengths."""
     return 2 if barrier.value_unit == "rad^2" else 0
 

@@ -10,12 +10,13 @@ import dataclasses
 import functools
 import itertools
 import math
-from collections.abc import Mapping
-from typing import Any, ClassVar, NamedTuple, cast
+from collections.abc import Mapping, Sequence
+from typing import ClassVar, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from iblf_jax.control import controllers, observers
 from iblf_jax.core import checks
@@ -164,7 +165,7 @@ class ArmProblem(LevelSetProblem):
         numbers = jnp.asarray(weight), jnp.asarray(level)
         return Constants(self.parts, self.uncertain.numbers, *numbers)
 
-    def state_of(self, point: Any, constants: Any) -> LevelState:
+    def state_of(self, point: np.ndarray, constants: Sequence[np.ndarray]) -> LevelState:
         """A point in physical numbers."""
         with jax.enable_x64(True):
             numbers = _physical(self.bound, np.asarray(point, float), list(constants))
@@ -199,7 +200,7 @@ def arm_problem(
     parameters: Mapping[str, Perturbation],
     *,
     duration: float | None = None,
-    disturbance_rate: Any = None,
+    disturbance_rate: ArrayLike | None = None,
 ) -> ArmProblem:
     """The proof problem of a rigid arm under the corrected backstepping law.
 
@@ -250,7 +251,18 @@ def check_supported(scenario: Scenario) -> None:
     if type(observer) is not observers.Momentum:
         reason = "The error of this observer does not obey f_tilde' = f' - kf f_tilde."
         raise unsupported("observer", type(observer).__name__, "observers.Momentum", reason)
-    _check_absent(scenario)
+    reasons = {
+        "sampling": CONTINUOUS,
+        "process_noise": "V_w' of a stochastic loop has further terms.",
+    }
+    check_absent(scenario, reasons, input="torque", rate="f'")
+    if scenario.bounds[1] is not None:
+        reason = "The level set bounds positions only."
+        raise unsupported("bounds[1]", "Bounds", "None", reason)
+    if scenario.regions:
+        names = ", ".join(type(region).__name__ for region in scenario.regions)
+        reason = "The level set bounds positions of joints only."
+        raise unsupported("regions", names, "()", reason)
     if isinstance(scenario.reference, WaypointSpline):
         reason = "The piece of a spline depends on the time, which is an interval here."
         expected = "a reference without pieces, such as references.Quintic"
@@ -274,7 +286,7 @@ def _check_plant(scenario: Scenario) -> None:
     check_same_structure(scenario, expected)
 
 
-def _check_law(law: Any) -> None:
+def _check_law(law: controllers.TrackingLaw) -> None:
     if type(law) is not controllers.Backstepping:
         reason = "V_w' is known for the paper's law with one of its barriers."
         if isinstance(law, controllers.Saturated):
@@ -295,22 +307,6 @@ def _check_law(law: Any) -> None:
         reason = "The level set needs the error at which V1 has a value, in closed form."
         expected = "a barrier with error_at, xi_bound and decay_rate"
         raise unsupported("controller.barrier", type(barrier).__name__, expected, reason)
-
-
-def _check_absent(scenario: Scenario) -> None:
-    """Raises ValueError for parts that the bound does not contain."""
-    reasons = {
-        "sampling": CONTINUOUS,
-        "process_noise": "V_w' of a stochastic loop has further terms.",
-    }
-    check_absent(scenario, reasons, input="torque", rate="f'")
-    if scenario.bounds[1] is not None:
-        reason = "The level set bounds positions only."
-        raise unsupported("bounds[1]", "Bounds", "None", reason)
-    if scenario.regions:
-        names = ", ".join(type(region).__name__ for region in scenario.regions)
-        reason = "The level set bounds positions of joints only."
-        raise unsupported("regions", names, "()", reason)
 
 
 # --- time, tube and mass matrix ------------------------------------------------------------------

@@ -83,7 +83,14 @@ class TruePlant:
             self.inside = uncertainty.between(places, numbers, nominal, self.known, z)
             self.difference = uncertainty.difference(places, numbers, nominal, self.known, z)
 
-    def above(self, p: Any, i: int, t: jax.Array, x: jax.Array, rate: jax.Array) -> jax.Array:
+    def above(
+        self,
+        p: tuple[plants.Plant, Disturbance],
+        i: int,
+        t: jax.Array,
+        x: jax.Array,
+        rate: jax.Array,
+    ) -> jax.Array:
         """Z_i of row i for a plant and a disturbance."""
         plant, disturbance = p
         return chain_motion.level_above(plant, disturbance, self.parts.model, i, t, x, rate)

@@ -313,7 +313,7 @@ def with_estimate(
     truth: Any,
     i: int,
     y: ChainState,
-    d_tilde: Any,
+    d_tilde: jax.Array,
 ) -> tuple[ChainState, jax.Array, jax.Array]:
     """The state with d_hat_i of row i, d_i and d_tilde_i.
 
@@ -400,7 +400,13 @@ def external_at(
 
 
 def level_above(
-    plant: Any, disturbance: Disturbance, model: Any, i: int, t: jax.Array, x: jax.Array, rate: Any
+    plant: Any,
+    disturbance: Disturbance,
+    model: Any,
+    i: int,
+    t: jax.Array,
+    x: jax.Array,
+    rate: jax.Array,
 ) -> jax.Array:
     """Z_i of row i: the level above, or the input, with which x_i' is `rate`."""
     external = external_at(disturbance, t, x, plant, model)

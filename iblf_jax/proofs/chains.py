@@ -8,7 +8,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple, cast
 
 import jax
@@ -163,27 +163,23 @@ class ChainProblem(LevelSetProblem):
 
     def numbers(self, weight: float, level: float) -> Constants:
         """The constants of a weight, with v_i = weight w_i s_i'(0)/(k_i kappa_i), and a level."""
+        law = self.parts.law
+        # The weight of a level that is not observed is `weight`.
+        scales = np.ones((self.signs, 1))
+        for i in np.flatnonzero(self.bound.observed).tolist():
+            slope = _slope_at_centre(self.parts, i)
+            scales[i] = np.asarray(law.weights[i] * slope / (law.k[i] * self.parts.kappa[i]))
         return Constants(
             self.parts,
             cast(plants.Plant, self.scenario.plant),
             self.scenario.disturbance,
             self.uncertain.numbers,
-            jnp.asarray(weight * self._scales_of_weights()),
+            jnp.asarray(weight * scales),
             jnp.asarray(level),
         )
 
-    def _scales_of_weights(self) -> np.ndarray:
-        """w_i s_i'(0)/(k_i kappa_i) of each observed level at t = 0, 1 of the others, (r, 1)."""
-        law = self.parts.law
-        scales = np.ones((self.signs, 1))
-        for i in np.flatnonzero(self.bound.observed).tolist():
-            slope = _slope_at_centre(self.parts, i)
-            gains = law.k[i] * self.parts.kappa[i]
-            scales[i] = np.asarray(law.weights[i] * slope / gains)
-        return scales
-
     @jax.enable_x64(True)
-    def state_of(self, point: Any, constants: Any) -> ChainLevelState:
+    def state_of(self, point: np.ndarray, constants: Sequence[np.ndarray]) -> ChainLevelState:
         """A point in physical numbers."""
         numbers: Constants = jax.tree.unflatten(
             self.bound.structure, list(map(jnp.asarray, constants))
@@ -398,7 +394,7 @@ def _digests(scenario: Scenario, uncertain: Uncertain) -> list[str]:
 
 
 def _check_law(scenario: Scenario) -> None:
-    law: Any = scenario.controller
+    law = scenario.controller
     if type(law) is not controllers.BarrierBackstepping:
         reason = "V' is known for barrier backstepping with exact derivatives."
         raise unsupported(

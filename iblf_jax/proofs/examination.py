@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 from jax.extend import core
 from jax.extend.core import primitives
+from jax.typing import ArrayLike
 
 from iblf_jax.core import checks
 from iblf_jax.core.program_digest import hash_constants
@@ -32,7 +33,7 @@ def _primitives(names: str) -> frozenset[core.Primitive]:
     return frozenset(primitive for primitive in found if primitive is not None)
 
 
-def _primitive_of(name: str, function: Callable, *inputs: Any) -> frozenset[core.Primitive]:
+def _primitive_of(name: str, function: Callable, *inputs: ArrayLike) -> frozenset[core.Primitive]:
     """JAX's primitive of this name, which `jax.extend` does not export, from a function that has
     it.  In some versions the function may consist of other primitives, which are not taken.
     """
@@ -115,7 +116,10 @@ Value = Any
 
 
 def interpreted(
-    function: Any, inputs: Sequence[Value], rule: Callable, constant: Callable[[Any], Value]
+    function: core.ClosedJaxpr | core.Jaxpr,
+    inputs: Sequence[Value],
+    rule: Callable,
+    constant: Callable[[Any], Value],
 ) -> list[Value]:
     """What is known of the outputs of a jaxpr.
 
@@ -159,7 +163,7 @@ def traced(name: str, function: Callable, inputs: Sequence[Any]) -> Any:
         raise checks.fail(name, checks.Words(got), expected) from error
 
 
-def digest_of(jaxpr: Any) -> str:
+def digest_of(jaxpr: core.ClosedJaxpr) -> str:
     """The digest of a function: of its text without addresses, and of all its constants.
 
     No text holds what a function of Python computes while a program runs.  A jaxpr that calls one
@@ -185,18 +189,21 @@ def operations(
     """
     found: dict[str, set[str]] = {"kinks": set(), "cases": set(), "unknown": set()}
 
-    def rule(eqn: Any, operands: list[frozenset]) -> list[frozenset]:
+    def rule(eqn: core.JaxprEqn, operands: list[frozenset]) -> list[frozenset]:
         seen: frozenset = frozenset().union(*operands)
         if eqn.primitive is primitives.scan_p and seen:
             return _of_scan(eqn, operands, rule, constant)
         if eqn.primitive is primitives.cond_p and not operands[0]:
-            return _of_branches(eqn, operands, rule, constant)
+            # A result depends on what it depends on in one of the branches; the choice is fixed.
+            branches = eqn.params["branches"]
+            results = [interpreted(branch, operands[1:], rule, constant) for branch in branches]
+            return [frozenset().union(*each) for each in zip(*results, strict=True)]
         kind = _kind(eqn, operands) if seen else None
         if kind is not None:
             found[kind].add(eqn.primitive.name)
         return [seen] * len(eqn.outvars)
 
-    def constant(value: Any) -> frozenset:
+    def constant(value: object) -> frozenset:
         return frozenset()
 
     jaxpr = traced(name, function, inputs)
@@ -227,7 +234,7 @@ def _kind(eqn: Any, operands: list[frozenset]) -> str | None:
 
 
 def _of_scan(
-    eqn: Any, operands: list[frozenset], rule: Callable, constant: Callable
+    eqn: core.JaxprEqn, operands: list[frozenset], rule: Callable, constant: Callable
 ) -> list[frozenset]:
     """The inputs on which the results of a loop of fixed length depend: its body is interpreted
     until what is carried no longer changes.
@@ -241,14 +248,6 @@ def _of_scan(
         if merged == values[carry]:
             return [*merged, *results[carried:]]
         values[carry] = merged
-
-
-def _of_branches(
-    eqn: Any, operands: list[frozenset], rule: Callable, constant: Callable
-) -> list[frozenset]:
-    """The inputs on which a result of one of the branches depends; what chooses does not vary."""
-    found = [interpreted(branch, operands[1:], rule, constant) for branch in eqn.params["branches"]]
-    return [frozenset().union(*results) for results in zip(*found, strict=True)]
 
 
 ADVICE = (

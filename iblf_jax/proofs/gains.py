@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from iblf_jax.core import checks
 from iblf_jax.core.presentation import Result
@@ -61,7 +62,7 @@ def gains_for_guarantee(
     parameters: Mapping[str, Perturbation],
     tries: int = TRIES,
     duration: float | None = None,
-    disturbance_rate: Any = None,
+    disturbance_rate: ArrayLike | None = None,
     seed: int = 0,
     **options: Any,
 ) -> GuaranteedGains:
@@ -171,7 +172,7 @@ class _Search(NamedTuple):
         return _Found(scenario, float(found.fun), min(before), int(found.nfev))
 
 
-def _limits(gains: Any) -> dict[str, tuple[float, float]]:
+def _limits(gains: object) -> dict[str, tuple[float, float]]:
     """Path -> ends, checked."""
     example = '{"controller.K2": (1.0, 20.0)}'
     limits = {}

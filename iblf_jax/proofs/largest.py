@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -122,7 +122,9 @@ def scaled(
     return dataclasses.replace(perturbation, distribution=interval(low, high))
 
 
-def _bisected(proof_at: Callable[[float], Proof], between: Any, accuracy: Any) -> Proof:
+def _bisected(
+    proof_at: Callable[[float], Proof], between: Sequence[float], accuracy: float
+) -> Proof:
     """The proof at the greatest value, within the accuracy, by bisection of the logarithm."""
     low, high = ends_of("between", between)
     accuracy = checks.positive_number("accuracy", accuracy, "1")
@@ -149,7 +151,7 @@ def _bisected(proof_at: Callable[[float], Proof], between: Any, accuracy: Any) -
     return dataclasses.replace(best, history=tuple(history))
 
 
-def ends_of(field: str, between: Any) -> tuple[float, float]:
+def ends_of(field: str, between: object) -> tuple[float, float]:
     """Two positive numbers in ascending order; ValueError for anything else."""
     ends = np.asarray(checks.as_floats(field, between), float)
     if ends.shape != (2,) or not 0.0 < ends[0] < ends[1] < math.inf:

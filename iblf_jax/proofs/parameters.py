@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from iblf_jax.core import checks
 from iblf_jax.proofs.uncertainty import Numbers, Place, Places
@@ -40,7 +41,7 @@ class Uncertain(NamedTuple):
         """Paths of all entries."""
         return [path for together in self.paths for path in together]
 
-    def values(self, z: Any) -> dict[str, float]:
+    def values(self, z: Sequence[float] | np.ndarray) -> dict[str, float]:
         """Path -> value of the entries at coordinates."""
         found = {}
         for k, names in enumerate(self.paths):
@@ -56,7 +57,7 @@ class Uncertain(NamedTuple):
 
 
 def uncertain_coordinates(
-    scenario: Scenario, parameters: Mapping[str, Perturbation], disturbance_rate: Any
+    scenario: Scenario, parameters: Mapping[str, Perturbation], disturbance_rate: ArrayLike | None
 ) -> Uncertain:
     """The coordinates of parameters that a user gives.
 
@@ -72,7 +73,10 @@ def uncertain_coordinates(
         for path in str(group).split(",")
     }
     for path in separate:
-        _check_part(path)
+        if path.split(".")[0].split("[")[0] not in SUPPORTED_PARTS:
+            expected = "a parameter of the plant or the disturbance, such as plant.mass"
+            remedy = "Law and observer know their model and gains exactly."
+            raise checks.fail("parameters: path", path, expected, remedy)
     targets_of(scenario, separate, "parameters", intervals=True)
     index = _places_of_entries(scenario)
     entries, bases, slopes, references, low, high, names = [], [], [], [], [], [], []
@@ -98,30 +102,19 @@ def uncertain_coordinates(
     labels = [" and ".join(x) for x in names]
     labels += [f"disturbance_rate[{i}]" for i in range(len(rates))]
     numbers = Numbers(tuple(bases), tuple(slopes), jnp.asarray(references, float))
-    at_reference = _values_at_reference(entries, numbers)
-    places = Places(tuple(entries), _differing(scenario, at_reference), len(rates))
+    places = Places(tuple(entries), _differing(scenario, entries, numbers), len(rates))
     return Uncertain(
         places, numbers, np.array(low, float), np.array(high, float), tuple(labels), tuple(names)
     )
 
 
-def _disturbance_rates(given: Any, n: int) -> np.ndarray:
+def _disturbance_rates(given: ArrayLike | None, n: int) -> np.ndarray:
     if given is None:
         return np.zeros(0)
     rates = np.asarray(checks.as_floats("disturbance_rate", given), float)
     if rates.shape not in ((), (n,)) or not np.all(np.isfinite(rates)) or np.any(rates < 0):
         raise checks.fail("disturbance_rate", given, f"one number >= 0, or {n}, in N m/s")
     return np.broadcast_to(rates, (n,))
-
-
-def _check_part(path: str) -> None:
-    """Raises ValueError unless a path is one of the plant or the disturbance."""
-    first = path.split(".")[0].split("[")[0]
-    if first in SUPPORTED_PARTS:
-        return
-    expected = "a parameter of the plant or the disturbance, such as plant.mass"
-    remedy = "Law and observer know their model and gains exactly."
-    raise checks.fail("parameters: path", path, expected, remedy)
 
 
 def _entries_of(scenario: Scenario, path: str) -> list[str]:
@@ -179,21 +172,18 @@ def _places_of_entries(scenario: Scenario) -> dict[str, Place]:
     return found
 
 
-def _values_at_reference(entries: list[tuple[Place, ...]], numbers: Numbers) -> dict[Place, float]:
-    """The entries at the reference value of their coordinate."""
-    found: dict[Place, float] = {}
-    for k, together in enumerate(entries):
-        values = numbers.base[k] + numbers.slope[k] * numbers.reference[k]
-        found |= dict(zip(together, np.asarray(values).tolist(), strict=True))
-    return found
-
-
-def _differing(scenario: Scenario, at_reference: dict[Place, float]) -> tuple[Place, ...]:
+def _differing(
+    scenario: Scenario, entries: list[tuple[Place, ...]], numbers: Numbers
+) -> tuple[Place, ...]:
     """The entries that differ from those that the law knows.
 
     An entry of a coordinate is compared at the coordinate's reference value: entries that a `value`
     sets together have one value there, although their nominal values may differ.
     """
+    at_reference: dict[Place, float] = {}
+    for k, together in enumerate(entries):
+        at = numbers.base[k] + numbers.slope[k] * numbers.reference[k]
+        at_reference |= dict(zip(together, np.asarray(at).tolist(), strict=True))
     actual = jax.tree.leaves((scenario.plant, scenario.disturbance))
     known = jax.tree.leaves((scenario.model, scenario.disturbance))
     found = []

@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 import dataclasses
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, ClassVar, NamedTuple
 
@@ -117,7 +117,7 @@ class LevelSetProblem(abc.ABC):
         """The constants of a weight and a level, as a pytree."""
 
     @abc.abstractmethod
-    def state_of(self, point: Any, constants: Any) -> Any:
+    def state_of(self, point: np.ndarray, constants: Sequence[np.ndarray]) -> Any:
         """A point in physical numbers, with t, eta and parameters."""
 
     @abc.abstractmethod
@@ -167,7 +167,7 @@ class LevelSetProblem(abc.ABC):
         return [np.asarray(x, float) for x in jax.tree.leaves(self.numbers(weight, level))]
 
     @jax.enable_x64(True)
-    def rate(self, points: Any, constants: Any) -> np.ndarray:
+    def rate(self, points: np.ndarray, constants: Sequence[np.ndarray]) -> np.ndarray:
         """V_w' at points, (count, p) -> (count,) [N m rad/s], in plain floating-point numbers."""
         return np.asarray(_rates(self.point_rate, np.asarray(points, float), list(constants)))
 
@@ -184,7 +184,7 @@ class LevelSetProblem(abc.ABC):
         share[::2] = np.round(share[::2])
         return np.concatenate([t, s, low + share * (high - low)], axis=1)
 
-    def scenario_at(self, point: Any, constants: Any) -> Scenario:
+    def scenario_at(self, point: np.ndarray, constants: Sequence[np.ndarray]) -> Scenario:
         """The scenario whose run starts at a point, with its parameters and moved in time.
 
         Raises:
@@ -206,5 +206,5 @@ class LevelSetProblem(abc.ABC):
 
 
 @partial(jax.jit, static_argnums=0)
-def _rates(point_rate: Callable, points: Any, constants: Any) -> jax.Array:
+def _rates(point_rate: Callable, points: jax.Array, constants: list[jax.Array]) -> jax.Array:
     return jax.vmap(point_rate, (0, None))(points, constants)

@@ -271,47 +271,37 @@ class Proof(Result):
         rows = [("", name, f"{low:.6g} to {high:.6g}") for name, (low, high) in self.ranges.items()]
         lines = list(tables.as_text(rows, left=(0, 1)))
         if self.proved:
-            lines.append(self._guarantee())
+            xi = self.tube.xi.max(axis=0)
+            texts = ", ".join(f"{math.ceil(x * 1e4) / 1e4:.4g}" for x in xi)
+            names = ", ".join(plants.component_names(self.scenario.plant))
+            if np.any(np.ptp(self.tube.xi, axis=0) > CONSTANT * xi):
+                names += f", the largest of {INSTANTS} instants"
+            lines.append(f"Guaranteed for every start in the set: |xi| <= {texts} ({names}).")
         if self.verdict == Verdict.NOT_PROVED:
-            lines += self._why_not_proved()
+            tried = len(self.growth_points)
+            lines.append(
+                f"For each of the {tried} weights tried, V_w' > 0 at a point of the level set."
+            )
+            if self.point is not None:
+                lines.append(f"  {self.point!r}")
+            lines.append("This refutes the Lyapunov function, not the bounds.")
         if self.violation is not None:
-            lines.append(self._how_violated(self.violation))
+            found = self.violation
+            entries = found.state._asdict().items()
+            named = (f"{name} = {_numbers(value)}" for name, value in entries if np.size(value))
+            lines.append(
+                f"The run of {found.duration:.4g} s from {', '.join(named)} violates the bounds by"
+                f" {-found.margin:.3g}; replay() returns it."
+            )
         if self.verdict == Verdict.UNDECIDED:
             lines += self._why_undecided()
         evaluated = f"w = {self.weight:.3g}, {self.boxes:,} boxes, {self.seconds:.3g} s."
         lines.append(evaluated)
         if self.history:
-            tried = ", ".join(f"{x.value:.4g} {x.verdict}" for x in self.history)
-            lines.append(f"Tried: {tried}.")
+            levels = ", ".join(f"{x.value:.4g} {x.verdict}" for x in self.history)
+            lines.append(f"Tried: {levels}.")
         lines += [f"Assumed: {sentence}" for sentence in self.assumptions if self.proved]
         return lines
-
-    def _guarantee(self) -> str:
-        xi = self.tube.xi.max(axis=0)
-        texts = ", ".join(f"{math.ceil(x * 1e4) / 1e4:.4g}" for x in xi)
-        names = ", ".join(plants.component_names(self.scenario.plant))
-        instants = ""
-        if np.any(np.ptp(self.tube.xi, axis=0) > CONSTANT * xi):
-            instants = f", the largest of {INSTANTS} instants"
-        return f"Guaranteed for every start in the set: |xi| <= {texts} ({names}{instants})."
-
-    def _why_not_proved(self) -> list[str]:
-        tried = len(self.growth_points)
-        lines = [f"For each of the {tried} weights tried, V_w' > 0 at a point of the level set."]
-        if self.point is not None:
-            lines.append(f"  {self.point!r}")
-        lines.append("This refutes the Lyapunov function, not the bounds.")
-        return lines
-
-    def _how_violated(self, found: Violation) -> str:
-        entries = found.state._asdict().items()
-        start = ", ".join(
-            f"{name} = {_numbers(value)}" for name, value in entries if np.size(value)
-        )
-        return (
-            f"The run of {found.duration:.4g} s from {start} violates the bounds by"
-            f" {-found.margin:.3g}; replay() returns it."
-        )
 
     def _why_undecided(self) -> list[str]:
         lines = [f"V_w' < 0 is proved on {100.0 * self.done:.3g} % of the volume."]
@@ -342,7 +332,7 @@ _STATEMENTS = {
 }
 
 
-def _numbers(value: Any) -> str:
+def _numbers(value: np.ndarray | float | Mapping[str, float]) -> str:
     """Numbers as text."""
     if isinstance(value, Mapping):
         return ", ".join(f"{path} {number:.5g}" for path, number in value.items())

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from iblf_jax.core import checks
 from iblf_jax.core.progress import bar
@@ -288,11 +289,11 @@ class _Results:
 
 def search(
     function: Callable,
-    lower: Any,
-    upper: Any,
+    lower: ArrayLike,
+    upper: ArrayLike,
     constants: Sequence[Any] = (),
     *,
-    patterns: Any = None,
+    patterns: ArrayLike | None = None,
     max_boxes: int = 1_000_000_000,
     threads: int | None = None,
     progress: bool | None = None,
@@ -326,7 +327,18 @@ def search(
     max_boxes = checks.positive_integer("max_boxes", max_boxes)
     if threads is not None:
         threads = checks.positive_integer("threads", threads)
-    low, high = _with_patterns(lower, upper, patterns)
+    low, high = (np.asarray(x, np.float64) for x in (lower, upper))
+    if low.shape != high.shape or low.ndim != 1 or not (low <= high).all():
+        remedy = f"The upper corner is {high.tolist()}."
+        raise checks.fail("lower", low.tolist(), "a corner below the upper one", remedy)
+    rows = np.zeros((1, 0))
+    if patterns is not None:
+        rows = np.asarray(patterns, np.float64)
+    # The corners of the boxes of all patterns, each (p, d).
+    low, high = (
+        np.concatenate([np.broadcast_to(corner, (len(rows), len(corner))), rows], axis=1)
+        for corner in (low, high)
+    )
     problem = _Problem(interval_kernel(function, low.shape[1], constants), low, high)
     units, division = problem.divided(max_boxes)
     results = _Results(checkpoint, problem.digest(units), len(units))
@@ -351,26 +363,6 @@ def search(
         left = [box for box in (worst, problem.worst(units[proved:])) if box is not None]
         worst = max(left, key=lambda box: box.value, default=None)
     return SearchResult(STATUSES[ended.status], boxes, time.monotonic() - start, done, worst)
-
-
-def _with_patterns(lower: Any, upper: Any, patterns: Any) -> tuple[np.ndarray, np.ndarray]:
-    """The corners of the boxes of all patterns, each (p, d).
-
-    Raises:
-      ValueError: a lower end is not below or at the upper one, or numbers are missing.
-    """
-    low, high = (np.asarray(x, np.float64) for x in (lower, upper))
-    if low.shape != high.shape or low.ndim != 1 or not (low <= high).all():
-        remedy = f"The upper corner is {high.tolist()}."
-        raise checks.fail("lower", low.tolist(), "a corner below the upper one", remedy)
-    rows = np.zeros((1, 0))
-    if patterns is not None:
-        rows = np.asarray(patterns, np.float64)
-    low, high = (
-        np.concatenate([np.broadcast_to(corner, (len(rows), len(corner))), rows], axis=1)
-        for corner in (low, high)
-    )
-    return low, high
 
 
 def _in_order(

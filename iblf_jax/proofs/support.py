@@ -14,6 +14,7 @@ import numpy as np
 from iblf_jax.control import controllers
 from iblf_jax.control.actuators import Ideal
 from iblf_jax.control.barriers import Barrier, Quadratic
+from iblf_jax.control.controllers import TrackingLaw
 from iblf_jax.control.decays import Exponential
 from iblf_jax.core import checks
 from iblf_jax.core.time import jump_times_of
@@ -37,7 +38,7 @@ REAL_NUMBERS = (
 CONTINUOUS = "The proof is one of the continuous loop, with an ideal sensor."
 
 
-def unsupported(field: str, given: Any, expected: str, reason: str) -> ValueError:
+def unsupported(field: str, given: object, expected: str, reason: str) -> ValueError:
     """The error for a part of a scenario whose V_w' is not known."""
     return checks.fail(f"prove: scenario.{field}", given, expected, reason)
 
@@ -66,7 +67,7 @@ def check_same_structure(scenario: Scenario, expected: str) -> None:
     raise unsupported("model", type(scenario.model).__name__, expected, reason)
 
 
-def check_exponential(law: Any, rate: str) -> None:
+def check_exponential(law: TrackingLaw, rate: str) -> None:
     """Raises ValueError for a law with other than exponential decays; `rate` is V_w' or V'."""
     if all(type(decay) is Exponential for decay in law.decays):
         return

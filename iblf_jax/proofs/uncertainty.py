@@ -13,7 +13,7 @@ the difference of the scenario's plant from its model, which is zero in most sce
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +21,7 @@ import numpy as np
 
 from iblf_jax.kernels import hull
 
+P = TypeVar("P")
 Place = tuple[int, int]
 """An entry of a leaf: the number of the leaf, and that of the entry in it."""
 
@@ -80,7 +81,7 @@ def values_at(places: Places, numbers: Numbers, z: jax.Array) -> dict[Place, jax
     return found
 
 
-def leaves_at(places: Places, numbers: Numbers, part: Any, z: jax.Array) -> Any:
+def leaves_at(places: Places, numbers: Numbers, part: P, z: jax.Array) -> P:
     """A pytree with the entries at coordinates z, (m,)."""
     new = replaced(jax.tree.leaves(part), values_at(places, numbers, z))
     return jax.tree.unflatten(jax.tree.structure(part), new)
@@ -90,7 +91,7 @@ def _entry(leaves: list[jax.Array], place: Place) -> jax.Array:
     return leaves[place[0]].reshape(-1)[place[1]]
 
 
-def between(places: Places, numbers: Numbers, nominal: Any, model: Any, z: jax.Array) -> Any:
+def between(places: Places, numbers: Numbers, nominal: P, model: P, z: jax.Array) -> P:
     """p* of (U.1): the hull of the model's entries and those at z.
 
     Args:
@@ -107,12 +108,12 @@ def between(places: Places, numbers: Numbers, nominal: Any, model: Any, z: jax.A
     return jax.tree.unflatten(jax.tree.structure(model), replaced(known, new))
 
 
-def _direction(model: Any, entries: dict[Place, jax.Array]) -> Any:
+def _direction(model: P, entries: dict[Place, jax.Array]) -> P:
     zeros = [jnp.zeros(np.shape(x)) for x in jax.tree.leaves(model)]
     return jax.tree.unflatten(jax.tree.structure(model), replaced(zeros, entries))
 
 
-def directions(places: Places, numbers: Numbers, model: Any) -> list[Any]:
+def directions(places: Places, numbers: Numbers, model: P) -> list[P]:
     """The slopes of the parameters in each coordinate, pytrees as the model's parameters."""
     found = []
     for k, entries in enumerate(places.entries):
@@ -121,7 +122,7 @@ def directions(places: Places, numbers: Numbers, model: Any) -> list[Any]:
     return found
 
 
-def fixed_difference(places: Places, numbers: Numbers, nominal: Any, model: Any) -> Any:
+def fixed_difference(places: Places, numbers: Numbers, nominal: P, model: P) -> P | None:
     """p(r) - p0 of (U.1), a pytree as the model's parameters; None where it is zero.
 
     Entries that a coordinate addresses have their value at r.
@@ -139,7 +140,7 @@ def fixed_difference(places: Places, numbers: Numbers, nominal: Any, model: Any)
     return _direction(model, new)
 
 
-def difference(places: Places, numbers: Numbers, nominal: Any, model: Any, z: jax.Array) -> Any:
+def difference(places: Places, numbers: Numbers, nominal: P, model: P, z: jax.Array) -> P:
     """The difference p - p0 of (U.1) at coordinates z, (m,), a pytree as the model's parameters."""
     new: dict[Place, jax.Array] = {}
     for place in places.differing:

@@ -16,8 +16,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend import core
 from jax.extend.core import primitives
 
+from iblf_jax.control.barriers import Barrier
 from iblf_jax.core import checks
 from iblf_jax.kernels import jaxprs
 from iblf_jax.proofs.arm_motion import degree
@@ -67,7 +69,9 @@ class _Quantity(NamedTuple):
 ZERO, NUMBER = _Quantity(), _Quantity(0)
 
 
-def check_barrier(name: str, barrier: Any, o: Any, *, n: int, homogeneous: bool) -> list[str]:
+def check_barrier(
+    name: str, barrier: Barrier, o: jax.Array | None, *, n: int, homogeneous: bool
+) -> list[str]:
     """The digests of the methods of a user's barrier (`Operations.digest`).
 
     Args:
@@ -100,13 +104,15 @@ def check_barrier(name: str, barrier: Any, o: Any, *, n: int, homogeneous: bool)
     return digests
 
 
-def _tube(lower: Any, upper: Any, dlower: Any, dupper: Any) -> OpenTube:
+def _tube(lower: jax.Array, upper: jax.Array, dlower: jax.Array, dupper: jax.Array) -> OpenTube:
     """A tube in the frame of the reference."""
     zero = jnp.zeros_like(lower)
     return OpenTube(zero, zero, lower, upper, dlower, dupper)
 
 
-def _methods(barrier: Any, o: Any, n: int) -> Iterator[tuple[str, Callable, list[_Quantity], int]]:
+def _methods(
+    barrier: Barrier, o: jax.Array | None, n: int
+) -> Iterator[tuple[str, Callable, list[_Quantity], int]]:
     """Name, function, inputs and degree of the result of each method of a barrier."""
     d = degree(barrier)
     length, of_tube = _Quantity(1), [_Quantity(1)] * 4
@@ -116,25 +122,25 @@ def _methods(barrier: Any, o: Any, n: int) -> Iterator[tuple[str, Callable, list
     yield "value", lambda *x: barrier.value(_tube(*x[:4]), x[4]), at_error, d
     yield "slope", lambda *x: barrier.slope(_tube(*x[:4]), x[4]), at_error, d - 1
 
-    def virtual_velocity(*x: Any) -> Any:
+    def virtual_velocity(*x: jax.Array) -> Any:
         own = None if gain_o is None else gain_o * x[6]
         return barrier.virtual_velocity(_tube(*x[:4]), x[4], x[5], own)
 
     yield "virtual_velocity", virtual_velocity, [*at_error, gain, gain], 1
 
-    def error_over_slope(*x: Any) -> Any:
+    def error_over_slope(*x: jax.Array) -> Any:
         return barrier.error_over_slope(_tube(*x[:4]), x[4])
 
     yield "error_over_slope", error_over_slope, at_error, 2 - d
     for above in (True, False):
 
-        def error_at(*x: Any, above: bool = above) -> Any:
+        def error_at(*x: jax.Array, above: bool = above) -> Any:
             return barrier.error_at(x[4], _tube(*x[:4]), jnp.full(n, above))
 
         yield "error_at", error_at, [*of_tube, _Quantity(d)], 1
 
 
-def _of_constant(value: Any) -> _Quantity:
+def _of_constant(value: object) -> _Quantity:
     """A constant: zeros have every unit, and a truth value does not vary."""
     is_truth = np.asarray(value).dtype == bool
     if not is_truth and not np.any(np.asarray(value)):
@@ -150,18 +156,18 @@ def _unit_of(quantities: list[_Quantity]) -> Any:
     return found.pop() if found else None
 
 
-def _homogeneous(eqn: Any, operands: list[_Quantity]) -> list[_Quantity]:
+def _homogeneous(eqn: core.JaxprEqn, operands: list[_Quantity]) -> list[_Quantity]:
     """The results of an operation on quantities of given units."""
     return [_result(eqn, operands)] * len(eqn.outvars)
 
 
-def _on_each_side(eqn: Any, operands: list[_Quantity]) -> list[_Quantity]:
+def _on_each_side(eqn: core.JaxprEqn, operands: list[_Quantity]) -> list[_Quantity]:
     """The results of an operation where lengths do not matter: all units are equal."""
     without = [x if x.degree is None else x._replace(degree=0) for x in operands]
     return [_result(eqn, without)] * len(eqn.outvars)
 
 
-def _result(eqn: Any, operands: list[_Quantity]) -> _Quantity:
+def _result(eqn: core.JaxprEqn, operands: list[_Quantity]) -> _Quantity:
     """The result of an operation."""
     primitive, first = eqn.primitive, operands[0] if operands else NUMBER
     if primitive in COMPARISONS and _is_with_zero(operands):
@@ -286,13 +292,14 @@ def _check_joints(name: str, function: Callable, inputs: list[_Quantity], n: int
 
 
 @jax.enable_x64(True)
-def _check_samples(name: str, barrier: Any, o: Any, n: int) -> None:
+def _check_samples(name: str, barrier: Barrier, o: jax.Array | None, n: int) -> None:
     """Raises ValueError for methods that contradict each other at a random point."""
     one = jnp.ones(n)
     gain_o = None if o is None else jnp.max(o) * one
 
-    def pairs(lower: Any, upper: Any, dlower: Any, dupper: Any, e: Any) -> dict[str, tuple]:
-        tube = _tube(lower, upper, dlower, dupper)
+    def pairs(*x):
+        *sides, e = x
+        tube = _tube(*sides)
         V = barrier.value(tube, e)
         slope = jax.jvp(lambda q: barrier.value(tube, q), (e,), (one,))[1]
         found = {"slope": (barrier.slope(tube, e), slope)}
@@ -304,11 +311,12 @@ def _check_samples(name: str, barrier: Any, o: Any, n: int) -> None:
             found["error_over_slope"] = (ratio * slope, e)
         return found
 
-    def functions(lower: Any, upper: Any, dlower: Any, dupper: Any, e: Any) -> tuple:
+    def functions(*x):
         """V1, slope, alpha and the derivative of alpha at an error; e1/s if it states that it does
         not jump.
         """
-        tube = _tube(lower, upper, dlower, dupper)
+        *sides, e = x
+        tube = _tube(*sides)
         alpha, rate = jax.jvp(
             lambda q: barrier.virtual_velocity(tube, q, one, gain_o), (e,), (one,)
         )

@@ -6,12 +6,13 @@ themselves: a class of the same name, or one that a user has registered, is not 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from iblf_jax.control import barriers
 from iblf_jax.core import checks
@@ -50,7 +51,7 @@ ACCURACY = 1e-8
 """Largest relative difference of methods that agree."""
 
 
-def check_constant(name: str, part: Any) -> None:
+def check_constant(name: str, part: plants.Plant | robots.Robot) -> None:
     """Raises ValueError for a robot or plant with a method `at` that depends on the time."""
     if is_default(part.at, TimeVarying.at):
         return
@@ -75,7 +76,7 @@ def check_constant(name: str, part: Any) -> None:
 # --- references and bounds ------------------------------------------------------------------------
 
 
-def check_time_functions(reference: Any, sides: dict[str, Any], n: int) -> Examined:
+def check_time_functions(reference: Any, sides: Mapping[str, bounds.Side], n: int) -> Examined:
     """What is assumed of the reference and the sides of bounds.
 
     Args:
@@ -102,7 +103,7 @@ def check_time_functions(reference: Any, sides: dict[str, Any], n: int) -> Exami
     return Examined(assumed, digests)
 
 
-def _declared(name: str, part: Any, found: Operations) -> str:
+def _declared(name: str, part: references.Reference | bounds.Side, found: Operations) -> str:
     """The sentence on a part with cases or kinks that declares its continuous derivatives."""
     refuse_unknown(f"scenario.{name}", found)
     kind = type(part).__name__
@@ -122,7 +123,7 @@ def _declared(name: str, part: Any, found: Operations) -> str:
 # --- robots ---------------------------------------------------------------------------------------
 
 
-def agreement_of_robot(robot: Any) -> list[str]:
+def agreement_of_robot(robot: robots.Robot) -> list[str]:
     """A sentence on the methods of a user's robot, which are compared at random points.
 
     Raises:
@@ -143,7 +144,7 @@ def agreement_of_robot(robot: Any) -> list[str]:
     ]
 
 
-def _is_known(robot: Any) -> bool:
+def _is_known(robot: robots.Robot) -> bool:
     """Whether a robot is one of the package."""
     if type(robot) is robots.WithMotors:
         return _is_known(robot.robot)
@@ -151,7 +152,7 @@ def _is_known(robot: Any) -> bool:
 
 
 def _robot_pairs(
-    robot: Any, q: jax.Array, v: jax.Array, u: jax.Array, a: jax.Array
+    robot: robots.Robot, q: jax.Array, v: jax.Array, u: jax.Array, a: jax.Array
 ) -> Iterator[tuple[str, tuple[jax.Array, jax.Array, jax.Array]]]:
     """Name of a method -> what it returns, what follows from M, C and G, and the size of the terms
     in it, of which a difference is a share.
@@ -177,7 +178,11 @@ def _robot_pairs(
 
 
 def check_agreement(
-    name: str, given: Any, expected: Any, size: Any = 0.0, accuracy: float = ACCURACY
+    name: str,
+    given: ArrayLike,
+    expected: ArrayLike,
+    size: ArrayLike = 0.0,
+    accuracy: float = ACCURACY,
 ) -> None:
     """Raises ValueError where two arrays (points, ...) differ; entries that are not finite in both
     do not count.
@@ -209,7 +214,7 @@ def check_agreement(
 # --- plants in strict-feedback form ---------------------------------------------------------------
 
 
-def agreement_of_plant(plant: Any) -> list[str]:
+def agreement_of_plant(plant: plants.Plant) -> list[str]:
     """A sentence on a user's plant in strict-feedback form: its methods are compared with drift and
     gain, and row i with itself at other levels above i, at random points.
 
@@ -231,7 +236,7 @@ def agreement_of_plant(plant: Any) -> list[str]:
 
 
 def _plant_pairs(
-    plant: Any, x: jax.Array, above: jax.Array
+    plant: plants.Plant, x: jax.Array, above: jax.Array
 ) -> Iterator[tuple[str, tuple[jax.Array, jax.Array, jax.Array]]]:
     """Name of a method and a level -> what it returns, what follows from drift and gain, and the
     size of the terms in it.

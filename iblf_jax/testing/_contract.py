@@ -10,11 +10,12 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from iblf_jax.core import checks
 from iblf_jax.core.families import adopt, required_members
@@ -30,6 +31,9 @@ STACKED = (
 """The remedy for rows of different shapes."""
 
 
+T = TypeVar("T")
+
+
 class ContractError(AssertionError):
     """A component violates the contract of its family; the message lists the problems with their
     remedies.
@@ -43,7 +47,7 @@ class StoppedCheckError(Exception):
 class Findings:
     """The problems of one component."""
 
-    def __init__(self, member: Any, family: str):
+    def __init__(self, member: object, family: str):
         self.name = type(member).__name__
         self.family = family
         self.problems: list[str] = []
@@ -64,7 +68,7 @@ class Findings:
         if text not in self.remarks:
             self.remarks.append(text)
 
-    def require(self, condition: Any, problem: str, remedy: str = "") -> bool:
+    def require(self, condition: object, problem: str, remedy: str = "") -> bool:
         """Records the problem unless the condition holds; returns whether it holds."""
         if not bool(condition):
             self.add(problem, remedy)
@@ -75,7 +79,7 @@ class Findings:
         self.add(problem, remedy)
         raise StoppedCheckError
 
-    def result_is(self, condition: Any, label: str, got: Any, remedy: str) -> None:
+    def result_is(self, condition: object, label: str, got: object, remedy: str) -> None:
         """Stops the check unless a result has the type that the condition requires."""
         if not condition:
             self.stop(f"{label} gives {type(got).__name__}", remedy)
@@ -91,7 +95,7 @@ class Findings:
 
 
 @contextmanager
-def examine(member: Any, family: str, base: type) -> Iterator[Findings]:
+def examine(member: object, family: str, base: type) -> Iterator[Findings]:
     """The context of a checker: computes in float64, and raises the findings at the end.
 
     Args:
@@ -112,7 +116,7 @@ def examine(member: Any, family: str, base: type) -> Iterator[Findings]:
     findings.stop_if_any()
 
 
-def _is_component(findings: Findings, member: Any) -> None:
+def _is_component(findings: Findings, member: object) -> None:
     """Requires a pytree of floating-point numbers that JAX can flatten, and unflatten with other
     objects instead of the numbers.
     """
@@ -147,7 +151,7 @@ def _is_component(findings: Findings, member: Any) -> None:
         findings.add(f"it cannot be rebuilt by JAX ({type(error).__name__}: {error})", remedy)
 
 
-def is_float(x: Any) -> bool:
+def is_float(x: ArrayLike) -> bool:
     """Whether numbers are floating-point numbers."""
     return jnp.issubdtype(jnp.result_type(x), jnp.floating)
 
@@ -158,7 +162,7 @@ def first_line(error: Exception) -> str:
     return f"{type(error).__name__}: {text.rstrip('.')}"
 
 
-def _has_members(findings: Findings, member: Any, base: type) -> None:
+def _has_members(findings: Findings, member: object, base: type) -> None:
     for name in required_members(base):
         if hasattr(member, name):
             continue
@@ -187,7 +191,7 @@ def shape_of(findings: Findings, label: str, call: Callable, *args: Any) -> Any:
         findings.stop(f"{label}{findings.kind} raised {first_line(error)}", remedy)
 
 
-def abstract_shape(x: Any) -> tuple[int, ...]:
+def abstract_shape(x: object) -> tuple[int, ...]:
     """The shape of an abstract result; () for objects that are not arrays."""
     shape: tuple[int, ...] = getattr(x, "shape", ())
     return shape
@@ -221,7 +225,7 @@ def call_has_shape(
     return has_shape(findings, label, got, shape)
 
 
-def same_structure(findings: Findings, label: str, got: Any, like: Any) -> None:
+def same_structure(findings: Findings, label: str, got: object, like: object) -> None:
     """Requires that two abstract pytrees have the same structure, shapes and types."""
     label += findings.kind
     structure: Any = jax.tree.structure(got)
@@ -241,7 +245,7 @@ def same_structure(findings: Findings, label: str, got: Any, like: Any) -> None:
     )
 
 
-def in_dtype(tree: Any, dtype: str) -> Any:
+def in_dtype(tree: T, dtype: str) -> T:
     """A pytree with its floating-point numbers in another type."""
 
     def convert(x):
@@ -261,12 +265,12 @@ def in_both_types(findings: Findings, check: Callable, *args: Any) -> None:
     findings.stop_if_any()
 
 
-def leaves_by_name(name: str, tree: Any) -> dict[str, Any]:
+def leaves_by_name(name: str, tree: object) -> dict[str, Any]:
     """The leaves of a pytree by name, for the result of an `outputs` function."""
     return {f"{name}, leaf {i}": x for i, x in enumerate(jax.tree.leaves(tree))}
 
 
-def largest(x: Any) -> float:
+def largest(x: ArrayLike) -> float:
     """The largest absolute value; 0 for an empty array."""
     return float(np.max(np.abs(x), initial=0))
 
@@ -274,7 +278,7 @@ def largest(x: Any) -> float:
 def check_function(
     findings: Findings,
     outputs: Callable,
-    member: Any,
+    member: object,
     args: Sequence[Any],
     *,
     rtol: float = 1e-5,

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.control.barriers import Barrier
+from iblf_jax.control.controllers import LawContext
 from iblf_jax.testing._contract import (
     Findings,
     call_has_shape,
@@ -52,7 +53,7 @@ FUNCTIONS = {
 TIMES = (0.0, 1.0, 2.5, 4.0)
 
 
-def check_barrier(barrier: Any, *, n: int | None = None) -> None:
+def check_barrier(barrier: object, *, n: int | None = None) -> None:
     """Checks a barrier: shapes, derivatives, float32; finite everywhere; s = dV1/dq; V1 decays
     along alpha.
 
@@ -68,11 +69,22 @@ def check_barrier(barrier: Any, *, n: int | None = None) -> None:
       ContractError: lists what does not hold, with the remedy.
       ValueError: `n` is not a number of joints, or not that of the leaves.
     """
-    with examine_joints(barrier, Barrier, n, "barrier") as (findings, barrier, joints):
-        _class_members(findings, barrier)
+    with examine_joints(barrier, Barrier, n, "barrier") as (findings, fitted, joints):
+        guard = fitted.guard
+        findings.require(
+            isinstance(guard, float) and (0 < guard < 1 or guard == -math.inf),
+            f"guard is {guard!r}",
+            "It must be a static float between 0 and 1, or minus infinity if no guard is needed",
+        )
+        findings.require(
+            isinstance(fitted.uses_o, bool),
+            f"uses_o is {fitted.uses_o!r}",
+            "It must be a bool of the class, uses_o: ClassVar[bool]",
+        )
+        findings.stop_if_any()
         context = in_dtype(scenario_of(joints), "float64").context
         k1 = jnp.asarray(np.resize([2.0, 3.0], joints))
-        o = jnp.asarray(np.resize([0.1, 0.2], joints)) if barrier.uses_o else None
+        o = jnp.asarray(np.resize([0.1, 0.2], joints)) if fitted.uses_o else None
         tube = context.tube(jnp.asarray(1.0))
         q = tube.q_d + np.resize([0.2, -0.15], joints)
         for name, label in FUNCTIONS.items():
@@ -80,24 +92,30 @@ def check_barrier(barrier: Any, *, n: int | None = None) -> None:
             def function(*args, name=name):
                 return _functions(*args)[name]
 
-            call_has_shape(findings, label, function, (barrier, tube, q, k1, o), (joints,))
+            call_has_shape(findings, label, function, (fitted, tube, q, k1, o), (joints,))
         findings.stop_if_any()
 
         def outputs(*args):
             return {FUNCTIONS[name]: x for name, x in _functions(*args).items()}
 
-        check_function(findings, outputs, barrier, (tube, q, k1, o))
-        _joints_apart(findings, barrier, tube, q, k1, o)
+        check_function(findings, outputs, fitted, (tube, q, k1, o))
+        jacobians = jax.jit(jax.jacfwd(lambda q: _functions(fitted, tube, q, k1, o)))(q)
+        for name, J in jacobians.items():
+            findings.require(
+                np.all(np.diag(np.diag(J)) == J),
+                f"{name} mixes joints",
+                "The law needs a barrier that acts on every joint separately",
+            )
         for t in TIMES:
             tube = context.tube(jnp.asarray(t))
-            numbers = _numbers(barrier, context, jnp.asarray(t), k1, o, jnp.asarray(XI))
-            _at_every_xi(findings, numbers, barrier.guard)
-            _claims(findings, barrier, tube, k1, numbers)
-            _grows_without_bound(findings, barrier, context, jnp.asarray(t), k1, o)
+            numbers = _numbers(fitted, context, jnp.asarray(t), k1, o, jnp.asarray(XI))
+            _at_every_xi(findings, numbers, fitted.guard)
+            _claims(findings, fitted, tube, k1, numbers)
+            _grows_without_bound(findings, fitted, context, jnp.asarray(t), k1, o)
 
 
 def _functions(
-    barrier: Any, tube: Tube, q: jax.Array, k1: jax.Array, o: Any
+    barrier: Barrier, tube: Tube, q: jax.Array, k1: jax.Array, o: jax.Array | None
 ) -> dict[str, jax.Array]:
     """The three functions of a barrier by name, (n,) each."""
     return {
@@ -107,25 +125,14 @@ def _functions(
     }
 
 
-def _class_members(findings: Findings, barrier: Any) -> None:
-    """Requires valid values of `guard` and `uses_o`."""
-    guard = barrier.guard
-    findings.require(
-        isinstance(guard, float) and (0 < guard < 1 or guard == -math.inf),
-        f"guard is {guard!r}",
-        "It must be a static float between 0 and 1, or minus infinity if no guard is needed",
-    )
-    findings.require(
-        isinstance(barrier.uses_o, bool),
-        f"uses_o is {barrier.uses_o!r}",
-        "It must be a bool of the class, uses_o: ClassVar[bool]",
-    )
-    findings.stop_if_any()
-
-
 @jax.jit
 def _numbers(
-    barrier: Any, context: Any, t: jax.Array, k1: jax.Array, o: Any, xi: jax.Array
+    barrier: Barrier,
+    context: LawContext,
+    t: jax.Array,
+    k1: jax.Array,
+    o: jax.Array | None,
+    xi: jax.Array,
 ) -> dict[str, jax.Array]:
     """The barrier at every xi, its derivatives with respect to q in both modes, and the rate of V1
     along q' = alpha.
@@ -199,14 +206,22 @@ def _at_every_xi(findings: Findings, numbers: dict[str, jax.Array], guard: float
 
 
 def _grows_without_bound(
-    findings: Findings, barrier: Any, context: Any, t: jax.Array, k1: jax.Array, o: Any
+    findings: Findings,
+    barrier: Any,
+    context: LawContext,
+    t: jax.Array,
+    k1: jax.Array,
+    o: jax.Array | None,
 ) -> None:
     """Requires that V1 of a barrier with a guard has no limit at the bound.
 
     V1 is evaluated at three distances from the bound, each a tenth of the one before. Where it has
     a limit, its increments fall with the distance or a power of it; those of a logarithm are equal.
     """
-    sharp = _with_guard(barrier, SMALL_GUARD)
+    try:
+        sharp = dataclasses.replace(barrier, guard=SMALL_GUARD)
+    except (TypeError, ValueError):  # Its class takes no guard.
+        sharp = barrier
     nearest = 2.0 * max(sharp.guard, SMALL_GUARD)
     if sharp.guard == -math.inf or 100.0 * nearest >= 1.0:
         return
@@ -222,14 +237,6 @@ def _grows_without_bound(
     )
 
 
-def _with_guard(barrier: Any, guard: float) -> Any:
-    """The barrier with another guard, or itself if its class does not take one."""
-    try:
-        return dataclasses.replace(barrier, guard=guard)
-    except (TypeError, ValueError):
-        return barrier
-
-
 SMALL_GUARD = 1e-7
 LEAST_INCREMENT = 0.6
 """Least ratio of two increments of V1, each over a tenth of the distance from the bound of the one
@@ -238,7 +245,7 @@ before: 1 for a logarithm, 0.32 for a square root, 0.1 for a function with a slo
 
 def _claims(
     findings: Findings,
-    barrier: Any,
+    barrier: Barrier,
     tube: Tube,
     k1: jax.Array,
     numbers: dict[str, jax.Array],
@@ -278,17 +285,4 @@ def _claims(
             np.all(kept),
             "|xi| is beyond xi_bound(V1, tube)",
             "It must hold wherever V1 <= V; return None for no claim",
-        )
-
-
-def _joints_apart(
-    findings: Findings, barrier: Any, tube: Tube, q: jax.Array, k1: jax.Array, o: Any
-) -> None:
-    """Requires that the barrier of a joint does not depend on other joints."""
-    jacobians = jax.jit(jax.jacfwd(lambda q: _functions(barrier, tube, q, k1, o)))(q)
-    for name, J in jacobians.items():
-        findings.require(
-            np.all(np.diag(np.diag(J)) == J),
-            f"{name} mixes joints",
-            "The law needs a barrier that acts on every joint separately",
         )

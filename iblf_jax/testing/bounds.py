@@ -172,13 +172,8 @@ def _at_points(scenario: Scenario, axis: str) -> Points:
         return jax.vmap(at)(xis)
 
     trees, inside, at_rest = answers(scenario, jnp.asarray(XI))
-    finite = {label: _all_finite(tree) for label, tree in zip(LABELS, trees, strict=True)}
+    finite = {}
+    for label, tree in zip(LABELS, trees, strict=True):
+        rows = [np.asarray(x).reshape(len(XI), -1) for x in jax.tree.leaves(tree)]
+        finite[label] = np.all([np.isfinite(x).all(axis=1) for x in rows], axis=0)
     return Points(finite, np.asarray(inside), np.asarray(at_rest), np.asarray(trees[0][2]))
-
-
-def _all_finite(tree: Any) -> np.ndarray:
-    """Whether all numbers of each point are finite, bool."""
-    parts = [
-        np.isfinite(np.asarray(x).reshape(len(XI), -1)).all(axis=1) for x in jax.tree.leaves(tree)
-    ]
-    return np.all(parts, axis=0)

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
+from numpy.typing import ArrayLike
 
 from iblf_jax.control.actuators import Actuator, Delivered
 from iblf_jax.control.sensors import Measurement, Sensor
@@ -40,7 +41,7 @@ UNSTABLE = 1e-6
 """Share of the largest eigenvalue above which a real part means an unstable state."""
 
 
-def check_sensor(sensor: Any, *, n: int | None = None) -> None:
+def check_sensor(sensor: object, *, n: int | None = None) -> None:
     """Checks a sensor: shapes, the state's structure, derivatives, float32.
 
     A `Sensor` of x is checked with its `order` levels, 4 if it has no such property.
@@ -55,7 +56,12 @@ def check_sensor(sensor: Any, *, n: int | None = None) -> None:
     """
     with examine_joints(sensor, contract_of(sensor), n, "sensor") as (findings, fitted, joints):
         rng = np.random.default_rng(3)
-        given = _state_for(fitted, rng, joints)
+        # A random state as the sensor receives it: (q, q'), or (x,).
+        if isinstance(fitted, Sensor):
+            order = fitted.order or DEFAULT_LEVELS
+            given = (jnp.asarray(rng.uniform(-1, 1, (order, joints))),)
+        else:
+            given = tuple(jnp.asarray(rng.uniform(-1, 1, (2, joints))))
         normal, period = jnp.asarray(rng.normal(size=(fitted.draws, joints))), jnp.asarray(1e-3)
         in_both_types(findings, _measures, fitted, given, normal, period)
 
@@ -66,14 +72,6 @@ def check_sensor(sensor: Any, *, n: int | None = None) -> None:
             return found | {"q": measured.q, "dq": measured.dq} | leaves_by_name("state", state)
 
         check_function(findings, outputs, fitted, (given, normal, period))
-
-
-def _state_for(sensor: Any, rng: np.random.Generator, joints: int) -> tuple[jax.Array, ...]:
-    """A random state as the sensor receives it: (q, q'), or (x,)."""
-    if not isinstance(sensor, Sensor):
-        return tuple(jnp.asarray(rng.uniform(-1, 1, (2, joints))))
-    order = sensor.order or DEFAULT_LEVELS
-    return (jnp.asarray(rng.uniform(-1, 1, (order, joints))),)
 
 
 def _measures(findings: Findings, sensor, given, normal, period) -> None:
@@ -94,7 +92,7 @@ def _measures(findings: Findings, sensor, given, normal, period) -> None:
 
 
 def check_actuator(
-    actuator: Any, *, n: int | None = None, torques: tuple[Any, Any] | None = None
+    actuator: object, *, n: int | None = None, torques: tuple[ArrayLike, ArrayLike] | None = None
 ) -> None:
     """Checks an actuator: shapes, the state's structure, derivatives, float32, and the initial
     torque.
@@ -115,7 +113,15 @@ def check_actuator(
       ValueError: `n` is not a number of joints, or not that of the leaves, or `torques` is not an
         increasing pair.
     """
-    low, high = _range_of(torques)
+    ends = torques
+    if torques is None:
+        ends = (-SMALL_TORQUES[0], SMALL_TORQUES[0])
+    expected = "a pair (smallest, largest) of numbers"
+    if not isinstance(ends, tuple | list) or len(ends) != 2:
+        raise checks.fail("torques", ends, expected)
+    low, high = (np.asarray(checks.as_floats("torques", side), float) for side in ends)
+    if not np.all(low < high):
+        raise checks.fail("torques", ends, expected)
     with examine_joints(actuator, Actuator, n, "actuator") as (findings, fitted, joints):
         shares, dq = np.random.default_rng(3).uniform(-0.1, 0.1, (2, joints))
         # The shares of the range are between 0.1 and 0.9.
@@ -134,19 +140,6 @@ def check_actuator(
         _starts_at_its_torque(findings, fitted.smooth, tested)
 
 
-def _range_of(torques: Any) -> tuple[np.ndarray, np.ndarray]:
-    """The smallest and the largest tested torque; ValueError unless they are an increasing pair."""
-    if torques is None:
-        torques = (-SMALL_TORQUES[0], SMALL_TORQUES[0])
-    expected = "a pair (smallest, largest) of numbers"
-    if not isinstance(torques, tuple | list) or len(torques) != 2:
-        raise checks.fail("torques", torques, expected)
-    low, high = (np.asarray(checks.as_floats("torques", side), float) for side in torques)
-    if not np.all(low < high):
-        raise checks.fail("torques", torques, expected)
-    return low, high
-
-
 def _delivers(findings: Findings, actuator, command, dq) -> None:
     state = shape_of(findings, "init(tau)", actuator.init, command)
     label = "deliver(command, dq, state)"
@@ -158,7 +151,7 @@ def _delivers(findings: Findings, actuator, command, dq) -> None:
     same_structure(findings, label + ", rate", found.rate, state)
 
 
-def _starts_at_its_torque(findings: Findings, actuator: Any, torques: list[jax.Array]) -> None:
+def _starts_at_its_torque(findings: Findings, actuator: Actuator, torques: list[jax.Array]) -> None:
     """Requires that in the state `init(tau)` some input delivers tau at a standstill, for one of
     some torques, and that the state is stable at this input.
     """
@@ -181,7 +174,7 @@ def _starts_at_its_torque(findings: Findings, actuator: Any, torques: list[jax.A
     )
 
 
-def _input_that_delivers(actuator: Any, torque: jax.Array, state: Any) -> jax.Array | None:
+def _input_that_delivers(actuator: Actuator, torque: jax.Array, state: Any) -> jax.Array | None:
     """An input, in any unit, at which a state delivers a torque at a standstill, by Newton's
     method; None if no initial guess converges.
     """
@@ -213,7 +206,7 @@ def _input_that_delivers(actuator: Any, torque: jax.Array, state: Any) -> jax.Ar
     return None
 
 
-def _growth(actuator: Any, command: jax.Array, state: Any) -> float:
+def _growth(actuator: Actuator, command: jax.Array, state: Any) -> float:
     """Growth rate of the state at a constant input at a standstill [1/s]; 0 if it is stable."""
     flat, rebuild = ravel_pytree(state)
     if flat.size == 0:

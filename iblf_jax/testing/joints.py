@@ -34,23 +34,15 @@ DEFAULT_LEVELS = 4
 """Number of levels that is assumed for a component for plants in strict-feedback form."""
 
 
-def joints_of(member: Any, default: int = DEFAULT_JOINTS) -> int:
+def joints_of(member: object, default: int = DEFAULT_JOINTS) -> int:
     """The number of joints of a member's leaves; the default if they are scalars or disagree."""
-    sizes = _sizes(member)
+    sizes = set(_declared_sizes(member))
+    if not sizes:
+        sizes = {np.shape(leaf)[0] for leaf in _undeclared(member) if np.ndim(leaf) == 1}
     return sizes.pop() if len(sizes) == 1 else default
 
 
-def _sizes(member: Any) -> set[int]:
-    """Lengths of the leaves that are declared as one number per joint; of all vectors if there are
-    none.
-    """
-    declared = set(_declared_sizes(member))
-    if declared:
-        return declared
-    return {np.shape(leaf)[0] for leaf in _undeclared(member) if np.ndim(leaf) == 1}
-
-
-def _declared_sizes(member: Any) -> Iterator[int]:
+def _declared_sizes(member: object) -> Iterator[int]:
     if isinstance(member, tuple):
         for part in member:
             yield from _declared_sizes(part)
@@ -67,7 +59,7 @@ def _declared_sizes(member: Any) -> Iterator[int]:
             yield np.shape(value)[1]
 
 
-def _undeclared(member: Any) -> list[Any]:
+def _undeclared(member: object) -> list[Any]:
     """Leaves of a class that was registered by hand, which no field declares."""
     if not dataclasses.is_dataclass(member):
         return jax.tree.leaves(member)
@@ -79,7 +71,7 @@ def _undeclared(member: Any) -> list[Any]:
 
 @contextmanager
 def examine_joints(
-    member: Any,
+    member: object,
     base: type,
     n: int | None,
     name: str,
@@ -114,7 +106,7 @@ def check_joints_of(n: int | None, owner: Any, name: str) -> None:
         raise checks.fail("n", n, expected, "Leave one of the two out.")
 
 
-def number_of_joints(findings: Findings, member: Any, n: int | None) -> int:
+def number_of_joints(findings: Findings, member: object, n: int | None) -> int:
     """The number of joints to check for: `n`, or that of the leaves."""
     if n is not None:
         return n
@@ -198,7 +190,7 @@ def scenario_of(n: int) -> Scenario:
     )
 
 
-def check_scenario(scenario: Any, n: int | None) -> None:
+def check_scenario(scenario: object, n: int | None) -> None:
     """Raises ValueError unless `scenario` is None or a Scenario, of `n` joints if `n` is given."""
     check_number(n)
     if scenario is None:
@@ -210,7 +202,7 @@ def check_scenario(scenario: Any, n: int | None) -> None:
 
 
 def scenario_for(
-    findings: Findings, member: Any, scenario: Scenario | None, n: int | None
+    findings: Findings, member: object, scenario: Scenario | None, n: int | None
 ) -> Scenario:
     """The given scenario, or one with the number of joints of the component."""
     if scenario is not None:

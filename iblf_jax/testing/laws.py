@@ -73,7 +73,7 @@ def check_law(
         if bounds[1] is None and (inner.needs_velocity_bounds or keeps_second):
             second = Bounds(lower=Constant(-SPEED), upper=Constant(SPEED))
             bounds = (bounds[0], second, *bounds[2:])
-        plant = law.drive if isinstance(law, WithDrive) else base.plant
+        plant: Any = law.drive if isinstance(law, WithDrive) else base.plant
         try:
             base = dataclasses.replace(
                 base, controller=law, bounds=bounds, plant=plant, model=base.model
@@ -110,7 +110,7 @@ def check_law(
 def _declarations(
     findings: Findings,
     outputs: Callable[..., dict[str, jax.Array]],
-    law: Any,
+    law: TrackingLaw,
     arguments: tuple[Any, ...],
 ) -> None:
     """Requires that the class attributes `gains` and `uses_observer` fit the fields and the

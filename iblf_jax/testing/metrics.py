@@ -26,7 +26,7 @@ from iblf_jax.testing.joints import examine_joints
 LENGTH, REGIONS = 40, 1
 
 
-def check_fold(fold: Any, *, n: int | None = None) -> None:
+def check_fold(fold: Fold, *, n: int | None = None) -> None:
     """Checks a metric: the accumulator's structure, names and units, derivatives, float32, no NaN.
 
     Args:
@@ -123,7 +123,7 @@ def parts(samples: Sample) -> tuple[dict[str, jax.Array], dict[str, jax.Array]]:
     return numbers, flags
 
 
-def _structure(findings: Findings, fold: Any, samples: Sample) -> None:
+def _structure(findings: Findings, fold: Fold, samples: Sample) -> None:
     first = jax.tree.map(lambda x: x[0], samples)
     acc = accumulates(findings, fold, first)
     result = shape_of(findings, "finish(acc)", fold.finish, acc)
@@ -136,7 +136,7 @@ def _structure(findings: Findings, fold: Any, samples: Sample) -> None:
     )
 
 
-def accumulates(findings: Findings, fold: Any, sample: Any) -> Any:
+def accumulates(findings: Findings, fold: Any, sample: Sample) -> Any:
     """The shapes of an accumulator; requires that `update` keeps them."""
     acc = shape_of(findings, "init(sample)", fold.init, sample)
     label = "update(acc, sample)"
@@ -144,7 +144,7 @@ def accumulates(findings: Findings, fold: Any, sample: Any) -> Any:
     return acc
 
 
-def at_rest(findings: Findings, fold: Any, samples: Sample) -> None:
+def at_rest(findings: Findings, fold: Fold, samples: Sample) -> None:
     """Requires that no result and no derivative is NaN on a run without errors and torques."""
     kept = {
         name: vars(samples)[name]

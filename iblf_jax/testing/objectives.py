@@ -46,7 +46,11 @@ DIRECTIONS = 3
 
 
 def check_objective(
-    objective: Any, *, scenario: Scenario | None = None, duration: float = 2.0, n: int | None = None
+    objective: Objective | Requirement | Quantity,
+    *,
+    scenario: Scenario | None = None,
+    duration: float = 2.0,
+    n: int | None = None,
 ) -> None:
     """Checks an objective of tuning: accumulators, derivatives, float32, no NaN, and its scales on
     a short run.
@@ -77,7 +81,11 @@ def check_objective(
             objective = Objective((), (Requirement(objective, limit, limit),))
     with examine(objective, "Objective", Objective) as findings:
         scenario = scenario_for(findings, objective, scenario, n)
-    objective = _with_joints(objective, scenario)
+    with examine(objective, "Objective", Objective) as findings:
+        try:
+            objective = for_scenario(objective, scenario)
+        except ValueError as error:  # It selects joints that the scenario does not have.
+            findings.add(str(error))
     for quantity in objective.quantities:
         selects = isinstance(quantity, TimeIntegral | Peak | MetricResult)
         joints = scenario.n if selects else joints_of(quantity)
@@ -93,17 +101,7 @@ def check_objective(
         _on_a_run(findings, in_dtype(objective, "float64"), scenario, duration)
 
 
-def _with_joints(objective: Objective, scenario: Scenario) -> Objective:
-    """The objective for the joints of the scenario's robot; a finding if it selects others."""
-    with examine(objective, "Objective", Objective) as findings:
-        try:
-            return for_scenario(objective, scenario)
-        except ValueError as error:
-            findings.add(str(error))
-    return objective
-
-
-def _quantity(findings: Findings, quantity: Any, duration: float, n: int) -> None:
+def _quantity(findings: Findings, quantity: Quantity, duration: float, n: int) -> None:
     step = duration / LENGTH
     some = samples(np.random.default_rng(4), n, step)
     # Half a step later, so that no sample is at the time from which a quantity counts.
@@ -134,7 +132,7 @@ def _quantity(findings: Findings, quantity: Any, duration: float, n: int) -> Non
         _second_order(findings, quantity, numbers, flags)
 
 
-def _structure(findings: Findings, quantity: Any, first: Any) -> None:
+def _structure(findings: Findings, quantity: Quantity, first: Any) -> None:
     acc = accumulates(findings, quantity, first)
     result = shape_of(findings, "finish(acc)", quantity.finish, acc)
     three = isinstance(result, tuple) and len(result) == 3
@@ -167,7 +165,10 @@ def _structure(findings: Findings, quantity: Any, first: Any) -> None:
 
 
 def _second_order(
-    findings: Findings, quantity: Any, numbers: dict[str, jax.Array], flags: dict[str, jax.Array]
+    findings: Findings,
+    quantity: Quantity,
+    numbers: dict[str, jax.Array],
+    flags: dict[str, jax.Array],
 ) -> None:
     """Requires a square, symmetric and finite Gauss-Newton matrix along some directions of the
     samples.

@@ -40,7 +40,9 @@ from iblf_jax.world import plants
 from iblf_jax.world.robots import Robot
 
 
-def check_observer(observer: Any, *, model: Any = None, n: int | None = None) -> None:
+def check_observer(
+    observer: Observer | RobotObserver, *, model: Any = None, n: int | None = None
+) -> None:
     """Checks an observer: shapes, the state's structure, derivatives, float32, and a hundred steps
     of a scan.
 

@@ -36,10 +36,14 @@ def check_claims(findings: Findings, scenario: Scenario) -> None:
         findings.require(name in stated, f"it has {stated[0]} and no {name}", remedy)
     findings.stop_if_any()
     in_both_types(findings, _shapes, scenario)
-    t, q, dq, f_tilde = _near_the_reference(scenario, np.random.default_rng(5))
-    context = scenario.context
-    model = scenario.loop.model
-    f_tilde = jnp.broadcast_to(f_tilde, model.estimate_shape)
+    context, model = scenario.context, scenario.loop.model
+    t, rng = jnp.asarray(0.7), np.random.default_rng(5)
+    tube = context.tube(t)
+    # States near the reference, (STATES, n) each.
+    q, dq = jnp.asarray(rng.uniform(-SPREAD, SPREAD, (2, STATES, scenario.n)))
+    width = 0.9 * jnp.minimum(tube.k_l, tube.k_u)
+    q, dq = tube.q_d + jnp.clip(q, -width, width), tube.dq_d + dq
+    f_tilde = jnp.broadcast_to(jnp.linspace(0.1, 0.2, scenario.n), model.estimate_shape)
 
     def outputs(law, t, x, f_tilde, context):
         of_x = law_of_x(law)
@@ -63,19 +67,6 @@ def check_claims(findings: Findings, scenario: Scenario) -> None:
         lowest = float(jnp.min(values))
         remedy = "V and W are nonnegative, or the inequality V' <= -W + T bounds nothing"
         findings.require(lowest >= 0, f"{name} is {lowest:.3g} somewhere where f_tilde = 0", remedy)
-
-
-def _near_the_reference(
-    scenario: Scenario,
-    rng: np.random.Generator,
-) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """A time (), positions and velocities (STATES, n), and an error of the estimate (n,)."""
-    t = jnp.asarray(0.7)
-    tube = scenario.context.tube(t)
-    q, dq = jnp.asarray(rng.uniform(-SPREAD, SPREAD, (2, STATES, scenario.n)))
-    width = jnp.minimum(tube.k_l, tube.k_u)
-    inside = tube.q_d + jnp.clip(q, -0.9 * width, 0.9 * width)
-    return t, inside, tube.dq_d + dq, jnp.linspace(0.1, 0.2, scenario.n)
 
 
 def _shapes(findings: Findings, scenario: Scenario) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from iblf_jax.core import checks, taylor
 from iblf_jax.core.families import is_default
@@ -41,7 +42,7 @@ PART = (
 Numbers = dict[str, Any]
 
 
-def check_plant(plant: Any, *, x: Any = None) -> None:
+def check_plant(plant: Plant, *, x: ArrayLike | None = None) -> None:
     """Checks a plant in strict-feedback form: shapes, derivatives, float32, the dependence of drift
     and gain on the levels, invertible gains, units, and optional members that agree with both.
 
@@ -57,7 +58,10 @@ def check_plant(plant: Any, *, x: Any = None) -> None:
       ValueError: `x` is not an array of shape (m, order, n).
     """
     with examine(plant, "Plant", Plant) as findings:
-        _dimensions(findings, plant)
+        try:
+            plants.check_dimensions(type(plant).__name__, plant)
+        except ValueError as error:
+            findings.stop(str(error).removesuffix("."))
         plant = fit_joints(in_dtype(plant, "float64"), plant.n, "plant")
         points = _points(plant, x)
         t = jnp.asarray(0.7)
@@ -67,19 +71,14 @@ def check_plant(plant: Any, *, x: Any = None) -> None:
         vectors = jnp.asarray(rng.normal(size=(2, plant.n)))
         check_function(findings, _functions, plant, (t, points[0]))
         found = jax.jit(jax.vmap(_identities, in_axes=(None, None, 0, None, None)))
-        values = found(plant, t, points, *vectors)
-        _agreement(findings, {name: np.asarray(value) for name, value in values.items()})
+        # Optional members must agree with drift and gain.
+        for name, difference in found(plant, t, points, *vectors).items():
+            problem, remedy = REMEDIES[name]
+            off = float(np.max(np.abs(np.asarray(difference))))
+            findings.require(off <= TOLERANCE, f"{problem} (by {off:.2g})", remedy)
 
 
-def _dimensions(findings: Findings, plant: Any) -> None:
-    """Requires whole numbers of components and levels, and names and units that fit them."""
-    try:
-        plants.check_dimensions(type(plant).__name__, plant)
-    except ValueError as error:
-        findings.stop(str(error).removesuffix("."))
-
-
-def _points(plant: Any, x: Any) -> jax.Array:
+def _points(plant: Plant, x: ArrayLike | None) -> jax.Array:
     """The states of the test, (m, order, n)."""
     shape = (plant.order, plant.n)
     if x is None:
@@ -94,7 +93,7 @@ def _points(plant: Any, x: Any) -> jax.Array:
     return points
 
 
-def _shapes(findings: Findings, plant: Any, t: jax.Array, x: jax.Array) -> None:
+def _shapes(findings: Findings, plant: Plant, t: jax.Array, x: jax.Array) -> None:
     """Requires the shapes of drift, gain and the optional members."""
     order, n = x.shape
     call_has_shape(findings, "drift(t, x)", plant.drift, (t, x), (order, n))
@@ -135,7 +134,7 @@ def _own_by_level(plant: Plant) -> dict[str, Any]:
     return {name: own for name, (own, default) in pairs.items() if not is_default(own, default)}
 
 
-def _dependence(findings: Findings, plant: Any, t: jax.Array, points: jax.Array) -> None:
+def _dependence(findings: Findings, plant: Plant, t: jax.Array, points: jax.Array) -> None:
     """Requires rows of drift and gain that depend on no later level."""
     of_points = jax.vmap(lambda x: plants.dependence_on_levels(plant, t, x))
     try:
@@ -144,14 +143,19 @@ def _dependence(findings: Findings, plant: Any, t: jax.Array, points: jax.Array)
         findings.stop(str(error).removesuffix("."))
 
 
-def _structure(findings: Findings, plant: Any, t: jax.Array, points: jax.Array) -> None:
+def _structure(findings: Findings, plant: Plant, t: jax.Array, points: jax.Array) -> None:
     """Requires rows that depend on no later level, except for the model of a law with filters;
     invertible gains, and finite derivatives.
     """
     if not plant.needs_filters:
         _dependence(findings, plant, t, points)
     gains = np.asarray(jax.vmap(lambda x: plant.gain(t, x))(points))
-    _finite_gains(findings, gains, points)
+    finite = np.isfinite(gains).reshape(*gains.shape[:2], -1).all(axis=-1)
+    if not finite.all():
+        point, row = np.argwhere(~finite)[0]
+        state = np.array2string(np.asarray(points[point]).ravel(), precision=4, threshold=8)
+        problem = f"row {row} of gain(t, x) is not finite at x = {state}"
+        findings.stop(problem, f"Look at roots and divisions. {PART}")
     for i in range(plant.order):
         matrices = gains[:, i]
         if gains.ndim == 3:
@@ -167,18 +171,7 @@ def _structure(findings: Findings, plant: Any, t: jax.Array, points: jax.Array) 
     findings.require(np.isfinite(np.asarray(slopes)).all(), problem, remedy)
 
 
-def _finite_gains(findings: Findings, gains: np.ndarray, points: jax.Array) -> None:
-    """Stops the check at the first row of a gain that is not finite, with its state."""
-    finite = np.isfinite(gains).reshape(*gains.shape[:2], -1).all(axis=-1)
-    if finite.all():
-        return
-    point, row = np.argwhere(~finite)[0]
-    state = np.array2string(np.asarray(points[point]).ravel(), precision=4, threshold=8)
-    problem = f"row {row} of gain(t, x) is not finite at x = {state}"
-    findings.stop(problem, f"Look at roots and divisions. {PART}")
-
-
-def _derivatives_along(plant: Any, t: jax.Array, x: jax.Array) -> jax.Array:
+def _derivatives_along(plant: Plant, t: jax.Array, x: jax.Array) -> jax.Array:
     """The Taylor coefficients of drift and gain along a straight line, all in one vector."""
     constant = [(jnp.zeros_like(t), jnp.zeros_like(x))] * (plant.order - 2)
     curve = [(t, x), (jnp.ones_like(t), jnp.ones_like(x)), *constant]
@@ -186,7 +179,7 @@ def _derivatives_along(plant: Any, t: jax.Array, x: jax.Array) -> jax.Array:
     return jnp.concatenate([jnp.ravel(value) for value in jax.tree.leaves(found)])
 
 
-def _functions(plant: Any, t: jax.Array, x: jax.Array) -> Numbers:
+def _functions(plant: Plant, t: jax.Array, x: jax.Array) -> Numbers:
     """The functions of a plant whose derivatives are tested."""
     values = {"drift(t, x)": plant.drift(t, x), "gain(t, x)": plant.gain(t, x)}
     stated = {
@@ -199,7 +192,7 @@ def _functions(plant: Any, t: jax.Array, x: jax.Array) -> Numbers:
     return values | {name: value for name, value in stated.items() if value is not None}
 
 
-def _identities(plant: Any, t: jax.Array, x: jax.Array, v: jax.Array, s: jax.Array) -> Numbers:
+def _identities(plant: Plant, t: jax.Array, x: jax.Array, v: jax.Array, s: jax.Array) -> Numbers:
     """The differences between optional members and what follows from drift and gain, one array a
     member, relative to its size.
     """
@@ -253,11 +246,3 @@ REMEDIES = {
     ),
 }
 """Optional member -> the problem where it does not agree with the others, and the remedy."""
-
-
-def _agreement(findings: Findings, differences: dict[str, np.ndarray]) -> None:
-    """Requires that optional members agree with drift and gain."""
-    for name, difference in differences.items():
-        problem, remedy = REMEDIES[name]
-        size = float(np.max(np.abs(difference)))
-        findings.require(size <= TOLERANCE, f"{problem} (by {size:.2g})", remedy)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,7 +18,7 @@ LEAST_ORDER = 2
 """Least number of levels of a plant."""
 
 
-def check_process_noise(noise: Any, *, n: int | None = None) -> None:
+def check_process_noise(noise: object, *, n: int | None = None) -> None:
     """Checks process noise: its levels, shapes, derivatives, float32; finite everywhere; whether
     `additive` is true.
 
@@ -34,22 +32,22 @@ def check_process_noise(noise: Any, *, n: int | None = None) -> None:
       ContractError: lists what does not hold, with the remedy.
       ValueError: `n` is not a number of joints, or not that of the leaves.
     """
-    with examine_joints(noise, ProcessNoise, n, "process_noise") as (findings, noise, n):
-        _structure(findings, noise)
-        order = max(LEAST_ORDER, *noise.levels)
+    with examine_joints(noise, ProcessNoise, n, "process_noise") as (findings, fitted, n):
+        _structure(findings, fitted)
+        order = max(LEAST_ORDER, *fitted.levels)
         x = jnp.asarray(np.random.default_rng(4).uniform(0.3, 1.0, (order, n)))
         t = jnp.asarray(0.4)
-        call_has_shape(findings, LABEL, _diffusion, (noise, t, x), (len(noise.levels), n))
+        call_has_shape(findings, LABEL, _diffusion, (fitted, t, x), (len(fitted.levels), n))
         findings.stop_if_any()
-        check_function(findings, lambda *args: {LABEL: _diffusion(*args)}, noise, (t, x))
-        _values(findings, noise, x)
+        check_function(findings, lambda *args: {LABEL: _diffusion(*args)}, fitted, (t, x))
+        _values(findings, fitted, x)
 
 
-def _diffusion(noise: Any, t: jax.Array, x: jax.Array) -> jax.Array:
+def _diffusion(noise: ProcessNoise, t: jax.Array, x: jax.Array) -> jax.Array:
     return noise.diffusion(t, x)  # type: ignore[no-any-return]
 
 
-def _structure(findings: Findings, noise: Any) -> None:
+def _structure(findings: Findings, noise: ProcessNoise) -> None:
     """Requires increasing levels, a number of substeps, and a Boolean `additive`."""
     try:
         check_structure(noise)
@@ -58,7 +56,7 @@ def _structure(findings: Findings, noise: Any) -> None:
         findings.stop(str(error))
 
 
-def _values(findings: Findings, noise: Any, x: jax.Array) -> None:
+def _values(findings: Findings, noise: ProcessNoise, x: jax.Array) -> None:
     """Requires finite values at many states, and, of additive noise, values that do not depend on
     the state.
     """

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from iblf_jax.core import checks
 from iblf_jax.core.families import is_default
@@ -32,7 +34,7 @@ TOLERANCE = 1e-9
 """Relative, float64: closed forms and automatic differentiation agree to rounding."""
 
 
-def check_robot(robot: Any, *, q: Any = None) -> None:
+def check_robot(robot: Robot, *, q: ArrayLike | None = None) -> None:
     """Checks a robot: shapes, derivatives, float32; M positive definite, M' - 2 C skew, G = dU/dq,
     J = d tip/dq.
 
@@ -97,13 +99,13 @@ def check_robot(robot: Any, *, q: Any = None) -> None:
         _physics(findings, {name: np.asarray(value) for name, value in numbers.items()})
 
 
-def _shapes(findings: Findings, robot: Any, q: Any) -> None:
+def _shapes(findings: Findings, robot: Robot, q: jax.Array) -> None:
     n = robot.n
     tip = shape_of(findings, "tip(q)", robot.tip, q)
     if tip.shape not in ((2,), (3,)):
         findings.stop(f"tip(q) has shape {tip.shape}", "It must be (2,) or (3,)")
     d = tip.shape[0]
-    methods = {
+    methods: dict[str, tuple[Callable, tuple[jax.Array, ...], tuple[int, ...]]] = {
         "mass_matrix(q)": (robot.mass_matrix, (q,), (n, n)),
         "coriolis(q, v, u)": (robot.coriolis, (q, q, q), (n,)),
         "gravity(q)": (robot.gravity, (q,), (n,)),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -35,7 +35,9 @@ from iblf_jax.world.regions import Region
 from iblf_jax.world.robots import Robot
 
 
-def rates(function: Any, t: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+def rates(
+    function: Callable[[jax.Array], jax.Array], t: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
     """A function of time with its first and second derivative, by jvp."""
 
     def first(t):
@@ -45,7 +47,9 @@ def rates(function: Any, t: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]
     return value, rate, second
 
 
-def _smooth_in_time(findings: Findings, label: str, function: Any, duration: float) -> None:
+def _smooth_in_time(
+    findings: Findings, label: str, function: Callable[[jax.Array], jax.Array], duration: float
+) -> None:
     """Requires on [0, duration] a finite value, rate and second rate, the first two continuous."""
     names = (label, f"the rate of {label}", f"the second rate of {label}")
     times = jnp.linspace(0.0, duration, 401)
@@ -65,7 +69,7 @@ def _smooth_in_time(findings: Findings, label: str, function: Any, duration: flo
             findings.add(f"{name} jumps at t = {jump:.6g} s", remedy)
 
 
-def check_reference(reference: Any, *, n: int | None = None, duration: float = 20.0) -> None:
+def check_reference(reference: object, *, n: int | None = None, duration: float = 20.0) -> None:
     """Checks a reference: shape, derivatives, float32, and q_d, q_d', q_d" finite, the first two
     continuous.
 
@@ -96,7 +100,7 @@ def check_reference(reference: Any, *, n: int | None = None, duration: float = 2
         _smooth_in_time(findings, "position(t)", fitted.position, duration)
 
 
-def check_side(side: Any, *, n: int | None = None, duration: float = 20.0) -> None:
+def check_side(side: object, *, n: int | None = None, duration: float = 20.0) -> None:
     """Checks one side of the bounds: shape, derivatives, float32, and the bound with its rates
     finite and continuous.
 
@@ -131,7 +135,7 @@ POINTS = 64
 """Number of points at which a region is tested."""
 
 
-def check_region(region: Any, *, dimensions: int | None = None, size: float = 2.0) -> None:
+def check_region(region: Region, *, dimensions: int | None = None, size: float = 2.0) -> None:
     """Checks a region: shapes, derivatives, float32, a distance of slope 1 at most, and a level
     with the same sign and, at the boundary, the same slope.
 
@@ -173,7 +177,7 @@ def check_region(region: Any, *, dimensions: int | None = None, size: float = 2.
         _distance_and_level(findings, fitted, points)
 
 
-def _distance_and_level(findings: Findings, region: Any, points: jax.Array) -> None:
+def _distance_and_level(findings: Findings, region: Region, points: jax.Array) -> None:
     """Requires a distance of slope 1 at most, and a level with the same sign and boundary."""
     distance_and_slope = jax.jit(jax.vmap(jax.value_and_grad(region.distance)))
     level_and_slope = jax.jit(jax.vmap(jax.value_and_grad(region.level)))
@@ -204,7 +208,7 @@ def _distance_and_level(findings: Findings, region: Any, points: jax.Array) -> N
     )
 
 
-def _accepts(region: Any, dimensions: int) -> bool:
+def _accepts(region: Region, dimensions: int) -> bool:
     """Whether a region accepts points of the plane (2) or of space (3)."""
     try:
         return jax.eval_shape(region.distance, jnp.zeros(dimensions)).shape == ()
@@ -213,10 +217,10 @@ def _accepts(region: Any, dimensions: int) -> bool:
 
 
 def check_disturbance(
-    disturbance: Any,
+    disturbance: Disturbance,
     *,
-    plant: Any = None,
-    model: Any = None,
+    plant: Robot | None = None,
+    model: Robot | None = None,
     duration: float = 20.0,
     n: int | None = None,
 ) -> None:
@@ -260,17 +264,12 @@ def check_disturbance(
         has_shape(findings, "jump_times()", jumps, one_axis)
         findings.stop_if_any()
         check_function(findings, lambda d, *args: {label: d.torque(*args)}, fitted, arguments)
-        known = _finite_jump_times(findings, fitted)
-        jump = find_jump(lambda t: fitted.torque(t, *arguments[1:]), 0.0, duration, known)
+        times = np.asarray(fitted.jump_times(), float)
+        remedy = "Return finite times, or an empty array"
+        findings.require(np.all(np.isfinite(times)), f"jump_times() has {times}", remedy)
+        findings.stop_if_any()
+        jump = find_jump(lambda t: fitted.torque(t, *arguments[1:]), 0.0, duration, tuple(times))
         if jump is not None:
             remedy = "Return that time in jump_times(): steps of a run are divided there"
             problem = f"the torque jumps at t = {jump:.6g} s, which is not one of jump_times()"
             findings.add(problem, remedy)
-
-
-def _finite_jump_times(findings: Findings, disturbance: Any) -> tuple[float, ...]:
-    times = np.asarray(disturbance.jump_times(), float)
-    remedy = "Return finite times, or an empty array"
-    findings.require(np.all(np.isfinite(times)), f"jump_times() has {times}", remedy)
-    findings.stop_if_any()
-    return tuple(times)

@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from iblf_jax.core import checks
 from iblf_jax.core.families import attribute
@@ -138,7 +139,7 @@ class Bounds:
         checks.conforms("Bounds.upper", self.upper, Side, remedy)
 
 
-def _distance(name: str, value: Any, n: int, sign: str | None) -> jax.Array:
+def _distance(name: str, value: ArrayLike, n: int, sign: str | None) -> jax.Array:
     """A user's argument as one number, or one number per joint."""
     array = checks.as_floats(name, value)
     checks.check_values(name, array, sign)

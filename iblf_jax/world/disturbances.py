@@ -60,7 +60,7 @@ class Disturbance(Timed):
         return None
 
 
-def _never(disturbance: Any) -> jax.Array:
+def _never(disturbance: object) -> jax.Array:
     """No jump times: the torque is continuous."""
     return no_times()
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import abc
 import math
 import numbers
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -297,7 +297,7 @@ class Leader(Reference):
         return jump_times_of("motion", self.motion)
 
 
-def _is_weight(value: Any) -> bool:
+def _is_weight(value: object) -> bool:
     """Whether a value is a finite number >= 0."""
     return isinstance(value, numbers.Real) and 0.0 <= float(value) < math.inf
 

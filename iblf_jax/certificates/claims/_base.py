@@ -7,7 +7,7 @@ from __future__ import annotations
 import abc
 import dataclasses
 from collections.abc import Iterable, Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -26,15 +26,20 @@ from iblf_jax.certificates.summary import DecayBound, Extremum, Segment, Summary
 from iblf_jax.certificates.terms import Point, Terms
 from iblf_jax.control.actuators import Ideal
 from iblf_jax.control.barriers import Barrier
+from iblf_jax.control.controllers import BarrierBackstepping
 from iblf_jax.control.controllers._base import decay_of
 from iblf_jax.control.decays._base import gain_at
 from iblf_jax.core import checks
 from iblf_jax.core.status import Status
+from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import has
 from iblf_jax.world.bounds import Tube
 
 REFERENCE_INSIDE = Statement("reference inside", "Assumption 2", "k_lc < x_d < k_uc", "rad")
+
+
+C = TypeVar("C", Traces, LevelTraces)
 
 
 class Claim(metaclass=abc.ABCMeta):
@@ -117,7 +122,7 @@ class MainClaim(Claim):
         """
 
     @abc.abstractmethod
-    def unclaimed_traces(self, run: Any) -> Traces | LevelTraces:
+    def unclaimed_traces(self, run: Rollout) -> Traces | LevelTraces:
         """The curves of a run, its arrays on the host, of which nothing is claimed."""
 
     def labels(self, scenario: Scenario) -> tuple[LevelLabel, ...]:
@@ -131,7 +136,7 @@ def centre_distance(tube: Tube) -> jax.Array:
 
 
 def level_dissipation(
-    law: Any, i: int, t: jax.Array, tube: Tube, x: jax.Array, slope: jax.Array
+    law: BarrierBackstepping, i: int, t: jax.Array, tube: Tube, x: jax.Array, slope: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """w_i decay_i and c_i w_i |s_i|^2 of level i + 1 of a law with barriers, () each, for the gain
     of the instant, which a decay makes a function of t and V_i; the first is 0 for a barrier that
@@ -145,19 +150,19 @@ def level_dissipation(
     return jnp.sum(w * stated * barrier.value(tube, x)), by_slope
 
 
-def xi_bound(barrier: Barrier, weight: Any, V: np.ndarray, tube: Tube) -> np.ndarray:
+def xi_bound(barrier: Barrier, weight: jax.Array, V: np.ndarray, tube: Tube) -> np.ndarray:
     """The barrier's own bound on |xi_i| where w_i V_i <= V, (T, n); NaN if it states none."""
     stated = barrier.xi_bound(V.astype(tube.lower.dtype)[:, None] / np.asarray(weight), tube)
     return np.full(tube.lower.shape, np.nan) if stated is None else np.asarray(stated)
 
 
-def unclaimed(kind: type, t: np.ndarray, **known: Any) -> Any:
+def unclaimed(kind: type, t: jax.Array | np.ndarray, **known: Any) -> Any:
     """The curves of samples of which nothing is claimed, with those that are known."""
     unknown = dict.fromkeys(kind._fields, np.full(t.shape, np.nan))  # type: ignore[attr-defined]
     return kind(**unknown | {"t": t, "excluded": np.ones(t.shape, bool)} | known)
 
 
-def at_recorded(segment: Segment, traces: Any) -> Any:
+def at_recorded(segment: Segment, traces: C) -> C:
     """The curves at the recorded samples of a segment; the left side without excluded ones."""
     left = np.where(segment.terms.excluded, np.nan, traces.left)
     return type(traces)(*(x[segment.recorded] for x in traces._replace(left=left)))

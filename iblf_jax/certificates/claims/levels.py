@@ -83,7 +83,7 @@ from iblf_jax.certificates.terms import (
     relative_gap,
 )
 from iblf_jax.control.barriers import Barrier
-from iblf_jax.control.controllers import BarrierBackstepping
+from iblf_jax.control.controllers import BarrierBackstepping, TrackingLaw
 from iblf_jax.control.controllers._base import decay_of
 from iblf_jax.control.controllers._levels import Level
 from iblf_jax.control.decays._base import gain_at
@@ -92,6 +92,7 @@ from iblf_jax.core import checks
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.status import Status
 from iblf_jax.core.units import Unit, as_text, of_component, per_second
+from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.world import plants
 from iblf_jax.world.bounds import NARROWEST, Tube
@@ -177,7 +178,7 @@ class Levels(MainClaim):
 
     def why_not(self, scenario: Scenario) -> str:
         """Why (S.3) claims nothing about a scenario, in words; "" if it does."""
-        law: Any = unwrapped(scenario.controller)
+        law: TrackingLaw = unwrapped(scenario.controller)
         if not isinstance(law, BarrierBackstepping):
             about = f"(S.3) is about BarrierBackstepping; {type(law).__name__} has no claim of this"
             return f"{about} kind"
@@ -495,7 +496,7 @@ class Levels(MainClaim):
             traces = OWN.on_traces(segment, traces)
         return at_recorded(segment, traces)  # type: ignore[no-any-return]
 
-    def unclaimed_traces(self, run: Any) -> LevelTraces:
+    def unclaimed_traces(self, run: Rollout) -> LevelTraces:
         """The curves of a run of which nothing is claimed."""
         unknown = np.full((*run.t.shape, plants.order_of(run.scenario.model), run.n), np.nan)
         error = unknown.copy()
@@ -669,7 +670,7 @@ def _lag(
     """Sum of w_i s_i . G_i (c_i - alpha_i), c_i the centre of the tube of level i + 1, (); 0 for a
     law without filters and without an auxiliary state.
     """
-    law: Any = unwrapped(scenario.controller)
+    law: TrackingLaw = unwrapped(scenario.controller)
     total = jnp.zeros_like(at.t)
     if law.filter is None and not covers_limit(scenario):
         return total

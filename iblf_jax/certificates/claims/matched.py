@@ -57,7 +57,7 @@ from iblf_jax.certificates.terms import (
     inner_context,
     relative_gap,
 )
-from iblf_jax.control.controllers import BarrierBackstepping
+from iblf_jax.control.controllers import BarrierBackstepping, TrackingLaw
 from iblf_jax.control.controllers._levels import Level
 from iblf_jax.core import checks
 from iblf_jax.core.linalg import solve_spd
@@ -102,7 +102,7 @@ class Matched(Theorem):
 
     def why_not(self, scenario: Scenario) -> str:
         """Why (F.3) claims nothing about a scenario, in words; "" if it does."""
-        law: Any = unwrapped(scenario.controller)
+        law: TrackingLaw = unwrapped(scenario.controller)
         if not isinstance(law, BarrierBackstepping) or law.order != 2 or law.filter is not None:
             return "(F.3) is about BarrierBackstepping of order 2 with exact derivatives"
         if scenario.loop.model.uncertain_levels:
@@ -124,7 +124,7 @@ class Matched(Theorem):
 
     # --- the terms --------------------------------------------------------------------------------
 
-    def has_law(self, law: Any) -> bool:
+    def has_law(self, law: object) -> bool:
         """Whether it is about a law of this class."""
         return isinstance(law, BarrierBackstepping)
 
@@ -234,20 +234,22 @@ class Matched(Theorem):
 
     def lines(self, segment: Segment) -> list[Line]:
         """The lines about every step of one segment."""
-        lines = [self._barriers_inequality(segment), *super().lines(segment)]
-        return [*lines, self._velocities_inside(segment)]
-
-    def _barriers_inequality(self, segment: Segment) -> Line:
-        """The inequality of the two barriers, at every step, for any kf and c."""
         summary, terms = segment.summary, segment.terms
+        # The inequality of the two barriers, for any kf and c.
         text = "(V1 + phi)' + decay of V1 and phi - s2 . M0^-1 f_tilde + c |s2|^2 <= 0"
         statement = Statement("barriers", "(F.2)", text, "1/s")
         reason = self.why_not_in_run(summary)
-        if reason:
-            return not_applicable(statement, reason)
-        tolerance, note = summary.eps * terms.size, self.exclusion_note(summary)
-        left = terms.claims[self.key].left
-        return check_steps(segment, statement, -left, tolerance, note=note)
+        barriers = not_applicable(statement, reason)
+        if not reason:
+            left, note = terms.claims[self.key].left, self.exclusion_note(summary)
+            barriers = check_steps(segment, statement, -left, summary.eps * terms.size, note=note)
+        statement = Statement("velocities inside", "(F.3)", "v_l < q' < v_u", "rad/s")
+        reason = ""
+        if self.case_of(summary) is None:
+            reason = self.why_not_in_case(summary, summary.case)
+        distance, flag = terms.distance[:, 1], Status.VELOCITY_VIOLATED
+        velocities = stays_inside(segment, statement, distance, flag, reason)
+        return [barriers, *super().lines(segment), velocities]
 
     def why_law_is_exact(self, summary: Summary) -> str:
         """Why the proof drops no term of the law."""
@@ -277,16 +279,6 @@ class Matched(Theorem):
         if not reason and name == "xi2, by phi" and np.all(np.isnan(bounds[name])):
             return "the velocity barrier states no bound on xi2 from phi"
         return reason
-
-    def _velocities_inside(self, segment: Segment) -> Line:
-        """Every velocity inside its bounds, at every step."""
-        summary = segment.summary
-        statement = Statement("velocities inside", "(F.3)", "v_l < q' < v_u", "rad/s")
-        why_unclaimed = ""
-        if self.case_of(summary) is None:
-            why_unclaimed = self.why_not_in_case(summary, summary.case)
-        distance, flag = segment.terms.distance[:, 1], Status.VELOCITY_VIOLATED
-        return stays_inside(segment, statement, distance, flag, why_unclaimed)
 
 
 MATCHED = Matched()

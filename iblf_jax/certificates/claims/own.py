@@ -105,7 +105,7 @@ class OwnClaim(Claim):
         if not law.uses_observer:
             d_tilde, dd_tilde = d, dd
 
-        def lyapunov(t: Any, x: Any, d_tilde: Any, law_state: Any) -> jax.Array:
+        def lyapunov(t: jax.Array, x: jax.Array, d_tilde: jax.Array, law_state: Any) -> jax.Array:
             return jnp.sum(of_x.lyapunov(t, x, d_tilde, context, law_state))
 
         at = (t, point.x, d_tilde, own_state)

@@ -38,8 +38,9 @@ from iblf_jax.certificates.claims.matched import MATCHED
 from iblf_jax.certificates.lines import Line, Statement, join_notes, not_applicable
 from iblf_jax.certificates.summary import ENERGY_ROUNDING, Segment, Summary
 from iblf_jax.certificates.terms import TORQUE
-from iblf_jax.control.controllers import Backstepping, BarrierBackstepping
+from iblf_jax.control.controllers import Backstepping, BarrierBackstepping, TrackingLaw
 from iblf_jax.control.controllers._base import decay_of
+from iblf_jax.control.decays import Decay
 from iblf_jax.control.decays._base import energy_gain
 from iblf_jax.core import programs
 from iblf_jax.core.pytree import unwrapped
@@ -69,16 +70,16 @@ INEQUALITY = Statement(
 class Part(NamedTuple):
     """One level of a law in (D.2)."""
 
-    decay: Any
-    gain: Any
+    decay: Decay
+    gain: jax.Array
     """Constant gain, (n,) [1/s]."""
-    weight: Any
+    weight: jax.Array
     """(n,)."""
     rate: Any
     """Decay rate of V for a gain, a function."""
 
 
-def parts_of(law: Any) -> list[Part]:
+def parts_of(law: Backstepping | BarrierBackstepping) -> list[Part]:
     """The levels of a law that have a barrier."""
     if isinstance(law, BarrierBackstepping):
         rows = zip(law.barriers, law.k, law.weights, strict=True)
@@ -99,7 +100,9 @@ def effective_rate(part: Part, t: jax.Array, V: jax.Array) -> jax.Array:
 # --- the least decay of a sum -------------------------------------------------------------------
 
 
-def least_decay(law: Any, mu: jax.Array, t: jax.Array, E: jax.Array) -> jax.Array:
+def least_decay(
+    law: Backstepping | BarrierBackstepping, mu: jax.Array, t: jax.Array, E: jax.Array
+) -> jax.Array:
     """D(t, E), ().
 
     Args:
@@ -130,7 +133,7 @@ def least_decay(law: Any, mu: jax.Array, t: jax.Array, E: jax.Array) -> jax.Arra
 
 
 def predicted(
-    law: Any, mu: float, start: float, rho2: float, end: float
+    law: Backstepping | BarrierBackstepping, mu: float, start: float, rho2: float, end: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Times from 0 to `end`, and the prediction v of (D.3) at them, by RK4 in ln v.
 
@@ -164,7 +167,12 @@ _least_decay = programs.jit(least_decay)
 
 @programs.jit
 def _step(
-    law: Any, mu: jax.Array, rho2: jax.Array, h: jax.Array, i: jax.Array, logarithm: jax.Array
+    law: Backstepping | BarrierBackstepping,
+    mu: jax.Array,
+    rho2: jax.Array,
+    h: jax.Array,
+    i: jax.Array,
+    logarithm: jax.Array,
 ) -> jax.Array:
     """The step i of `predicted`."""
 
@@ -203,7 +211,7 @@ class Settling(Claim):
 
     def why_not(self, scenario: Scenario) -> str:
         """Why a law predicts no settling time; "" if it has a decay that is not exponential."""
-        law: Any = unwrapped(scenario.controller)
+        law: TrackingLaw = unwrapped(scenario.controller)
         if not isinstance(law, Backstepping | BarrierBackstepping):
             return f"(D.2) is about laws with decays, not about {type(law).__name__}"
         if law.filter is not None:
@@ -254,10 +262,14 @@ class Settling(Claim):
         self, summary: Summary, data: list[Any], lines: Mapping[str, Line]
     ) -> Iterable[Line]:
         """The lines about the settling time of a run."""
-        law: Any = summary.law
+        law: Backstepping | BarrierBackstepping = summary.law
         course = Course(*map(np.concatenate, zip(*data, strict=True)))
         why_not = self.why_not_in_run(summary) or _why_not_from_the_start(summary, course)
-        band, deadline = _band(law), _deadline(law)
+        band = _band(law)
+        # The latest time of the decays that state one.
+        stated = [decay.deadline() for decay in law.decays]
+        ends = [float(np.max(np.asarray(time))) for time in stated if time is not None]
+        deadline = max(ends, default=np.inf)
         statements = []
         if np.isfinite(band):
             statements.append(TIME)
@@ -300,7 +312,7 @@ def _why_not_from_the_start(summary: Summary, course: Course) -> str:
     return ""
 
 
-def _band(law: Any) -> float:
+def _band(law: Backstepping | BarrierBackstepping) -> float:
     """The least w_j band_j of the decays that state a band; infinite if none does."""
     found = [np.inf]
     for part in parts_of(law):
@@ -314,18 +326,11 @@ def _band(law: Any) -> float:
     return min(found)
 
 
-def _deadline(law: Any) -> float:
-    """The latest time of the decays that state one [s]; infinite if none does."""
-    stated = [decay.deadline() for decay in law.decays]
-    times = [float(np.max(np.asarray(time))) for time in stated if time is not None]
-    return max(times, default=np.inf)
-
-
 def _note(rho2: float) -> str:
     return f"rho2 = {rho2:.4g}"
 
 
-def _time_line(course: Course, times: Any, v: Any, band: float, rho2: float) -> Line:
+def _time_line(course: Course, times: np.ndarray, v: np.ndarray, band: float, rho2: float) -> Line:
     """The time from which E is inside the band, and the predicted one."""
     note = f"band {band:.4g}, {_note(rho2)}"
     reached = np.flatnonzero(v <= band)
@@ -348,7 +353,9 @@ def _time_line(course: Course, times: Any, v: Any, band: float, rho2: float) -> 
     return TIME.line(verdict, margin=margin, tolerance=step, value=entered, note=note)
 
 
-def _deadline_line(course: Course, times: Any, v: Any, deadline: float, rho2: float) -> Line:
+def _deadline_line(
+    course: Course, times: np.ndarray, v: np.ndarray, deadline: float, rho2: float
+) -> Line:
     """E at the prescribed time, and what is predicted for it."""
     at = int(np.searchsorted(course.t, deadline))
     if at >= course.t.size:

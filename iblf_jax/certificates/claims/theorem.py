@@ -83,10 +83,11 @@ from iblf_jax.control.observers import AsPublished, Momentum
 from iblf_jax.core import programs
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.status import Status
+from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import has, margin_of
 from iblf_jax.world.bounds import NARROWEST
-from iblf_jax.world.robots import mass_matrix_rate
+from iblf_jax.world.robots import Robot, mass_matrix_rate
 
 LOWEST_KF = {1: 0.5, 2: 1.0}
 """Lower bound of kf: (3.17) in case 1, (3.25) in case 2."""
@@ -208,7 +209,14 @@ class Theorem(TwoCases, MainClaim):
             if isinstance(law, Backstepping):
                 entry = entry._replace(dissipation=_dissipation_of_backstepping(point, terms.e[1]))
         if covers_limit(scenario):
-            entry = entry._replace(auxiliary=_auxiliary_terms(point))
+            # The terms of (A.3), with w s of the barrier on e1.
+            sample = point.sample
+            is_left_out = jnp.any(sample.guard_active)
+            if has(sample, "dq_lower"):
+                margin = margin_of(sample, 2, sample.alpha - sample.auxiliary)
+                is_left_out |= jnp.any(margin <= NARROWEST)
+            product = jnp.sum(point.now["s"] * sample.auxiliary)
+            entry = entry._replace(auxiliary=AuxiliaryTerms(product, is_left_out))
         return terms._replace(
             size=size,
             sqrt_V_size=sqrt_V_size,
@@ -216,7 +224,7 @@ class Theorem(TwoCases, MainClaim):
             claims=terms.claims | {TORQUE: entry},
         )
 
-    def has_law(self, law: Any) -> bool:
+    def has_law(self, law: object) -> bool:
         """Whether it is about a law of this class."""
         return isinstance(law, Backstepping)
 
@@ -397,7 +405,19 @@ class Theorem(TwoCases, MainClaim):
         lines = self.decay_lines(segment)
         if segment.terms.claims[TORQUE].auxiliary:
             lines.append(self._limited_inequality(segment))
-        return [*lines, *self._dropped_lines(segment), self._joints_inside(segment)]
+        lines += self._dropped_lines(segment)
+        # Properties (I) and (II): every joint inside its bounds.
+        summary = segment.summary
+        statement = Statement("joints inside", "(I), (II)", "|xi_i| < 1: -k_l < e1 < k_u")
+        case, why_unclaimed = self.case_of(summary), ""
+        if case is None and WEIGHTED.replaces_theorem(summary):
+            case = WEIGHTED.case_of(summary)
+        if case is None:
+            why_unclaimed = self.why_not_in_case(summary, summary.case)
+        elif np.all(np.isnan(xi_bound_along(segment, segment.terms.V))):
+            why_unclaimed = NO_BOUND
+        margins, flag = 1.0 - np.abs(segment.sample.xi), Status.BOUND_VIOLATED
+        return [*lines, stays_inside(segment, statement, margins, flag, why_unclaimed)]
 
     def bound_statements(self, summary: Summary) -> dict[str, Statement]:
         """The bounds that follow from the envelope, by name."""
@@ -508,20 +528,6 @@ class Theorem(TwoCases, MainClaim):
 
     # --- inside the bounds, curves ----------------------------------------------------------------
 
-    def _joints_inside(self, segment: Segment) -> Line:
-        """Properties (I) and (II): every joint inside its bounds, at every step."""
-        summary = segment.summary
-        statement = Statement("joints inside", "(I), (II)", "|xi_i| < 1: -k_l < e1 < k_u")
-        case, why_unclaimed = self.case_of(summary), ""
-        if case is None and WEIGHTED.replaces_theorem(summary):
-            case = WEIGHTED.case_of(summary)
-        if case is None:
-            why_unclaimed = self.why_not_in_case(summary, summary.case)
-        elif np.all(np.isnan(xi_bound_along(segment, segment.terms.V))):
-            why_unclaimed = NO_BOUND
-        margins = 1.0 - np.abs(segment.sample.xi)
-        return stays_inside(segment, statement, margins, Status.BOUND_VIOLATED, why_unclaimed)
-
     def traces(self, segment: Segment) -> Traces:
         """The curves of the figure.  For a law that has only a claim about itself, V and the left
         side are those of that claim.
@@ -545,7 +551,7 @@ class Theorem(TwoCases, MainClaim):
             traces = OWN.on_traces(segment, traces)._replace(dropped=np.zeros_like(dropped))
         return at_recorded(segment, traces)  # type: ignore[no-any-return]
 
-    def unclaimed_traces(self, run: Any) -> Traces:
+    def unclaimed_traces(self, run: Rollout) -> Traces:
         """The curves of a run of which nothing is claimed."""
         f_tilde = run.disturbance - run.disturbance_estimate
         return _unclaimed_traces(run.t, run.V, run.xi, run.e2, f_tilde)
@@ -595,7 +601,9 @@ def _unless_replaced(summary: Summary, line: Line) -> Line:
     return dataclasses.replace(line, counts=counts, note=join_notes(NOT_NEEDED, line.note))
 
 
-def _unclaimed_traces(t: Any, V: Any, xi: Any, e2: Any, f_tilde: Any) -> Traces:
+def _unclaimed_traces(
+    t: jax.Array | np.ndarray, V: jax.Array, xi: jax.Array, e2: jax.Array, f_tilde: jax.Array
+) -> Traces:
     """The curves of samples of which nothing is claimed."""
     return unclaimed(  # type: ignore[no-any-return]
         Traces,
@@ -611,7 +619,7 @@ def _unclaimed_traces(t: Any, V: Any, xi: Any, e2: Any, f_tilde: Any) -> Traces:
 # --- the terms at a state -------------------------------------------------------------------------
 
 
-def _are_equal(one: Any, other: Any) -> jax.Array:
+def _are_equal(one: Robot, other: Robot) -> jax.Array:
     """Whether two robots are equal, leaf by leaf, () bool."""
     structure: Any = jax.tree.structure(one)
     if structure != jax.tree.structure(other):
@@ -630,15 +638,6 @@ def _dropped_terms(point: TorquePoint, terms: Terms) -> tuple[jax.Array, jax.Arr
     if isinstance(scenario.observer, AsPublished):
         by_observer = -terms.d_tilde @ (scenario.observer.kf * (dM0 @ state.dq))
     return by_law, by_observer
-
-
-def _auxiliary_terms(point: TorquePoint) -> AuxiliaryTerms:
-    """The terms of (A.3), with w s of the barrier on e1."""
-    sample = point.sample
-    excluded = jnp.any(sample.guard_active)
-    if has(sample, "dq_lower"):
-        excluded |= jnp.any(margin_of(sample, 2, sample.alpha - sample.auxiliary) <= NARROWEST)
-    return AuxiliaryTerms(jnp.sum(point.now["s"] * sample.auxiliary), excluded)
 
 
 def _dissipation_of_backstepping(point: TorquePoint, e2: jax.Array) -> Any:
@@ -669,7 +668,7 @@ class SignalSizes:
       guard: of the barrier on e1.
     """
 
-    def __init__(self, point: TorquePoint, K2: Any, guard: float) -> None:
+    def __init__(self, point: TorquePoint, K2: jax.Array | None, guard: float) -> None:
         now, rates = point.now, point.rates
         self.point = point
         self.K2 = jnp.zeros_like(point.state.q) if K2 is None else K2
@@ -684,7 +683,7 @@ class SignalSizes:
             + jnp.abs(now["s"]) / self.gap
         )
 
-    def of_V2(self, terms: Terms, weight: Any) -> tuple[jax.Array, jax.Array]:
+    def of_V2(self, terms: Terms, weight: jax.Array | None) -> tuple[jax.Array, jax.Array]:
         """`Terms.size` and `Terms.sqrt_V_size`; `weight` is that of V1, (n,), or None for 1."""
         point, e2, torque, gap = self.point, self.e2, self.torque, self.gap
         scenario, state, now, rates = point.scenario, point.state, point.now, point.rates

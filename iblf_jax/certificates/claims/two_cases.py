@@ -22,7 +22,8 @@ from iblf_jax.certificates.summary import (
     weighted_lyapunov,
 )
 from iblf_jax.certificates.terms import adaptive_law, on_position
-from iblf_jax.control.controllers import Backstepping
+from iblf_jax.control.barriers import Barrier
+from iblf_jax.control.controllers import Backstepping, TrackingLaw
 from iblf_jax.control.observers import AsPublished, Momentum
 from iblf_jax.core import programs
 from iblf_jax.core.pytree import unwrapped
@@ -89,20 +90,19 @@ class TwoCases(Claim):
 
     def decay_lines(self, segment: Segment) -> list[Line]:
         """The lines about the claimed decay at every step of one segment."""
-        lines = [self._inequality(segment, case) for case in CASES]
+        summary, terms, lines = segment.summary, segment.terms, []
+        for case in CASES:
+            statement, reason = self.inequalities[case], self.why_not_in_case(summary, case)
+            if reason:
+                lines.append(not_applicable(statement, reason))
+                continue
+            decay = summary.decay_bounds[self.key, case]
+            V = weighted_lyapunov(terms, decay.w_f)
+            size = max(1.0, decay.w_f) * terms.size + decay.rho * V
+            margins, note = -self.left_side(segment, case), self.exclusion_note(summary)
+            lines.append(check_steps(segment, statement, margins, summary.eps * size, note=note))
         lines += [self._envelope(segment, case) for case in CASES]
         return lines + self._bounds(segment)
-
-    def _inequality(self, segment: Segment, case: int) -> Line:
-        """The differential inequality, at every step."""
-        summary, terms, statement = segment.summary, segment.terms, self.inequalities[case]
-        reason = self.why_not_in_case(summary, case)
-        if reason:
-            return not_applicable(statement, reason)
-        decay = summary.decay_bounds[self.key, case]
-        size = max(1.0, decay.w_f) * terms.size + decay.rho * weighted_lyapunov(terms, decay.w_f)
-        margins, note = -self.left_side(segment, case), self.exclusion_note(summary)
-        return check_steps(segment, statement, margins, summary.eps * size, note=note)
 
     def _envelope(self, segment: Segment, case: int) -> Line:
         """The envelope of the Lyapunov function, at every step."""
@@ -206,13 +206,13 @@ def xi_bound_along(segment: Segment, V: np.ndarray) -> np.ndarray:
 def gains_of(scenario: Scenario) -> Gains:
     """The gains on which rho depends; only for a scenario for which `why_no_theorem` is empty."""
     law: Any = unwrapped(scenario.controller)
-    kf: Any = scenario.observer.kf
+    kf = scenario.observer.kf
     return Gains(law.barrier.decay_rate(law.k1), law.K2, kf)
 
 
 def why_no_theorem(scenario: Scenario) -> str:
     """Why Theorem 2 claims nothing about a scenario, in words; "" if it does."""
-    law: Any = unwrapped(scenario.controller)
+    law: TrackingLaw = unwrapped(scenario.controller)
     if not isinstance(law, Backstepping):
         about = f"Theorem 2 is about the backstepping law (3.14); {type(law).__name__}"
         return f"{about} has no claim of this kind{_why_no_own_claim(scenario)}"
@@ -221,7 +221,7 @@ def why_no_theorem(scenario: Scenario) -> str:
     return why_no_decay(law.barrier, law.k1) or why_not_in_loop(scenario)
 
 
-def why_no_decay(barrier: Any, gain: Any) -> str:
+def why_no_decay(barrier: Barrier, gain: jax.Array) -> str:
     """Why the V of a barrier has no known decay, in words; "" if it has."""
     if barrier.decay_rate(gain) is None:
         return f"the barrier {type(barrier).__name__} states no decay rate of its V1"

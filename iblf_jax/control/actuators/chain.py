@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.actuators._base import Actuator, Delivered
+from iblf_jax.control.actuators._base import Actuator, Delivered, State
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import component
 from iblf_jax.core.time import joined, jump_times_of
@@ -78,7 +78,7 @@ class Chain(Actuator):
         found = [part.resolution for part in self.parts]
         return next((step for step in found if step is not None), None)
 
-    def distance_to_jump(self, command: jax.Array, dq: jax.Array, state: Any) -> jax.Array:
+    def distance_to_jump(self, command: jax.Array, dq: jax.Array, state: State) -> jax.Array:
         """The smallest distance of all parts that round, (n,) [N m]; 0 behind a part with a state,
         whose torque passes the levels between two samples.
         """
@@ -119,7 +119,7 @@ class Chain(Actuator):
         """The states in which each part delivers the torque `tau`, (n,) [N m]."""
         return tuple(part.init(tau) for part in self.parts)
 
-    def deliver(self, command: jax.Array, dq: jax.Array, state: Any) -> Delivered:
+    def deliver(self, command: jax.Array, dq: jax.Array, state: State) -> Delivered:
         """The torque of the last part, and the rates of all; `limited` where any part is."""
         torque = command
         limited = jnp.zeros(command.shape, bool)

@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.actuators._base import Actuator, Delivered
+from iblf_jax.control.actuators._base import Actuator, Delivered, State
 from iblf_jax.core import checks
 from iblf_jax.core.input_limits import check_lower_limit, is_beyond, lower_or_opposite
 from iblf_jax.core.pytree import Leaf, component, leaf
@@ -78,7 +78,7 @@ class Motor(Actuator):
         """The state y: the torque itself, (n,) [N m]; `()` without a lag."""
         return () if self.bandwidth is None else tau
 
-    def deliver(self, command: jax.Array, dq: jax.Array, state: Any) -> Delivered:
+    def deliver(self, command: jax.Array, dq: jax.Array, state: State) -> Delivered:
         """The torque, and the rate of the lag; `limited` where a limit changes one of them."""
         limited = jnp.zeros(command.shape, bool)
         v: jax.Array = command

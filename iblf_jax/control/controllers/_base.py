@@ -505,12 +505,12 @@ class Wrapping(Law):
         return self.inner.switching(t, x, d_hat, context, state)
 
 
-def contract_of(law: Any) -> type[Law] | type[RobotLaw]:
+def contract_of(law: object) -> type[Law] | type[RobotLaw]:
     """The contract that a law is meant to fit."""
     return families.contract_of(law, Law, RobotLaw)
 
 
-def check_law(name: str, law: Any, remedy: str) -> None:
+def check_law(name: str, law: object, remedy: str) -> None:
     """Raises ValueError for something that is not a law; adopts its class and those of the laws
     that it wraps.
     """
@@ -520,12 +520,12 @@ def check_law(name: str, law: Any, remedy: str) -> None:
         check_law(f"{name}.{field}", vars(law)[field], remedy)
 
 
-def no_state(law: Any, q: jax.Array, dq: jax.Array, context: LawContext) -> tuple[()]:
+def no_state(law: object, q: jax.Array, dq: jax.Array, context: LawContext) -> tuple[()]:
     """`init` of a law without a state."""
     return ()
 
 
-def layers_with_states(law: Any, state: Any) -> Iterator[tuple[Any, Any]]:
+def layers_with_states(law: TrackingLaw, state: State) -> Iterator[tuple[Any, Any]]:
     """A law and the laws that it wraps, the outermost first, each with its state.
 
     Args:
@@ -538,11 +538,11 @@ def layers_with_states(law: Any, state: Any) -> Iterator[tuple[Any, Any]]:
             state = state.law
 
 
-def decay_of(law: Any, i: int) -> Decay:
+def decay_of(law: TrackingLaw, i: int) -> Decay:
     """The decay of level i + 1 of a law: `Exponential` for a law that has no `decays`."""
     if not law.decays:
         return Exponential()
-    return law.decays[i]  # type: ignore[no-any-return]
+    return law.decays[i]
 
 
 class LyapunovLaw(RobotLaw):

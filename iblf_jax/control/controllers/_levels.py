@@ -81,7 +81,12 @@ def exact_levels(
         lower, upper = _curve_of_bounds(
             context, i + 1, time_curve[: terms + 1], centre_curve[: terms + 1]
         )
-        tube_curve = _curve_of_tube(centre_curve, lower, upper, terms)
+        # The tube with its rates, and its derivatives.
+        c = centre_curve
+        tube_curve = [
+            Tube(c[m], c[m + 1], lower[m], upper[m], lower[m + 1], upper[m + 1])
+            for m in range(terms)
+        ]
         if i == order - 1:
             tube_curve = [context.shifted_tube(tube_curve[0])]
 
@@ -121,19 +126,14 @@ def surface_levels(
         slope = levels[i].slope
         if i < len(designs) - 1:
             rate = (levels[i].alpha - state[i]) / filters[i]
-            tube = _filtered_tube(context, i + 2, t, state[i], rate)
+            # The tube of the next level is around the output of the filter.
+            times = taylor.curve_of_time(t, 2)
+            lower, upper = _curve_of_bounds(context, i + 2, times, [state[i], rate])
+            tube = Tube(state[i], rate, lower[0], upper[0], lower[1], upper[1])
             if i == len(designs) - 2:
                 tube = context.shifted_tube(tube)
             tubes.append(tube)
     return levels, tubes
-
-
-def _filtered_tube(
-    context: LawContext, level: int, t: jax.Array, centre: jax.Array, rate: jax.Array
-) -> Tube:
-    """The tube of a level around the output of a filter and its rate."""
-    lower, upper = _curve_of_bounds(context, level, taylor.curve_of_time(t, 2), [centre, rate])
-    return Tube(centre, rate, lower[0], upper[0], lower[1], upper[1])
 
 
 def _level(
@@ -143,7 +143,7 @@ def _level(
     t: jax.Array,
     x: jax.Array,
     tube: Tube,
-    slope_below: Any,
+    slope_below: jax.Array | None,
     d_hat: jax.Array,
 ) -> Level:
     """The virtual control alpha and the weighted slope of level i + 1 of (S.2).
@@ -244,16 +244,6 @@ def _followed(context: LawContext, level: int) -> Callable | None:
     if level == 2 and plants.as_plant(context.model).reference_levels == 2:
         return lambda t: jax.jvp(position, (t,), (jnp.ones_like(t),))[1]
     return None
-
-
-def _curve_of_tube(
-    centre: list[jax.Array], lower: list[jax.Array], upper: list[jax.Array], terms: int
-) -> list[Tube]:
-    """A tube with its rates, and its derivatives, `terms` of them."""
-    return [
-        Tube(centre[m], centre[m + 1], lower[m], upper[m], lower[m + 1], upper[m + 1])
-        for m in range(terms)
-    ]
 
 
 def _rates_and_torque(d_hat: jax.Array) -> tuple[jax.Array | None, jax.Array | float]:

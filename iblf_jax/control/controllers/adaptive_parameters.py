@@ -39,11 +39,13 @@ from typing import Any, ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 
 from iblf_jax.control.controllers._base import (
     Command,
     Law,
     LawContext,
+    State,
     TrackingLaw,
     Wrapping,
     check_law,
@@ -235,7 +237,7 @@ class AdaptiveParameters(Wrapping):
                 remedy = "Masses and inertias are such, lengths are not."
                 raise checks.fail(field, path, expected, remedy)
 
-    def _nominal(self, model: Any) -> jax.Array:
+    def _nominal(self, model: object) -> jax.Array:
         """theta_0, (p,): the values of the model."""
         return _values_at(model, self.parameters)
 
@@ -428,7 +430,9 @@ LAWS = (
 )
 
 
-def adapting_part(law: TrackingLaw, state: Any) -> tuple[AdaptiveParameters, AdaptiveState] | None:
+def adapting_part(
+    law: TrackingLaw, state: State
+) -> tuple[AdaptiveParameters, AdaptiveState] | None:
     """The law with adapting parameters among the layers of a law, and its state; None without one.
 
     Args:
@@ -441,7 +445,7 @@ def adapting_part(law: TrackingLaw, state: Any) -> tuple[AdaptiveParameters, Ada
     return None
 
 
-def _values_at(part: Any, names: tuple[str, ...]) -> jax.Array:
+def _values_at(part: object, names: tuple[str, ...]) -> jax.Array:
     """The numbers at some paths, (p,); ValueError for a path that leads to no number."""
     values = []
     for path in names:
@@ -475,7 +479,7 @@ def _unit_at(part: Any, tokens: list[str | int]) -> str:
 # --- dependence on the parameters ---------------------------------------------------------------
 
 
-def _points(context: LawContext, dtype: Any) -> tuple[jax.Array, jax.Array]:
+def _points(context: LawContext, dtype: DTypeLike) -> tuple[jax.Array, jax.Array]:
     """Times (POINTS,) and states (POINTS, r, n) inside the bounds of the first level."""
     rng = np.random.default_rng(0)
     plant = plants.as_plant(context.model)

@@ -187,7 +187,7 @@ def stated_decay(barrier: Barrier, gain: jax.Array, V: jax.Array) -> jax.Array:
     return rate * V  # type: ignore[no-any-return]
 
 
-def check_barrier(law, field: str, barrier: Any, example: str = "Integral") -> None:
+def check_barrier(law, field: str, barrier: object, example: str = "Integral") -> None:
     """Raises ValueError unless a field of a law holds a barrier."""
     name = f"{type(law).__name__}.{field}"
     checks.conforms(name, barrier, Barrier, f"Such as iblf_jax.barriers.{example}().")

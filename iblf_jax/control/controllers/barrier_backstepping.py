@@ -76,7 +76,7 @@ from iblf_jax.control.barriers._base import (
     guard_is_active,
     has_ratio,
 )
-from iblf_jax.control.controllers._base import Command, Law, LawContext, decay_of
+from iblf_jax.control.controllers._base import Command, Law, LawContext, State, decay_of
 from iblf_jax.control.controllers._levels import Design, Level, exact_levels, surface_levels
 from iblf_jax.control.controllers.backstepping import (
     check_barrier,
@@ -229,20 +229,18 @@ class BarrierBackstepping(Law):
         scale = plants.as_plant(context.model).weights(x)
         weights = jnp.ones_like(x)
         if scale is not None:
-            weights = scale * self._centre_ratios(context, x)
+            # e_i/s_i at e_i = 0 and t = 0, with which the weights have the scale of e_i^2.
+            t = jnp.zeros((), x.dtype)
+            tube = context.tube(t)
+            ratios = [_ratio(self.barriers[0], tube, tube.q_d)]
+            for i in range(1, self.order):
+                tube = _tube_at_rest(context.bounds[i], t, jnp.zeros_like(x[i]))
+                ratios.append(_ratio(self.barriers[i], tube, tube.q_d))
+            weights = scale * jnp.stack(ratios)
         # The fields are checked already; `dataclasses.replace` would check them again.
         found = copy.copy(self)
         object.__setattr__(found, "weights", weights)
         return found
-
-    def _centre_ratios(self, context: LawContext, x: jax.Array) -> jax.Array:
-        """e_i/s_i at e_i = 0 and t = 0, (r, n), with which the weights have the scale of e_i^2."""
-        t = jnp.zeros((), x.dtype)
-        ratios = [_ratio(self.barriers[0], context.tube(t), context.tube(t).q_d)]
-        for i in range(1, self.order):
-            tube = _tube_at_rest(context.bounds[i], t, jnp.zeros_like(x[i]))
-            ratios.append(_ratio(self.barriers[i], tube, tube.q_d))
-        return jnp.stack(ratios)
 
     def check_start(self, context: LawContext) -> None:
         """Raises ValueError for a model, bounds or a reference that do not fit the law."""
@@ -257,26 +255,19 @@ class BarrierBackstepping(Law):
             expected = f"filters in place of the derivatives that {kind} does not have"
             remedy = "Such as BarrierBackstepping(..., filter=0.01)."
             raise checks.fail("controller.filter", None, expected, remedy)
-        self._check_reference(context)
+        smooth = context.reference.continuous_derivatives
+        if self.filter is None and smooth < self.order:
+            expected = f"a reference with {self.order} continuous derivatives, as u contains them"
+            got = f"{type(context.reference).__name__}, which has {smooth}"
+            remedy = (
+                f"SmoothStep and WaypointSpline take derivatives={self.order}, and Sinusoid is"
+                " smooth; or filter the virtual controls: BarrierBackstepping(filter=...)."
+            )
+            raise checks.fail("reference", checks.Words(got), expected, remedy)
         for i, barrier in enumerate(self.barriers):
             self._check_sides(context, i)
             self._check_level(context, i, barrier)
             self._check_decay(i)
-
-    def _check_reference(self, context: LawContext) -> None:
-        """Raises ValueError for a reference with too few continuous derivatives."""
-        if self.filter is not None:
-            return
-        smooth = context.reference.continuous_derivatives
-        if smooth >= self.order:
-            return
-        expected = f"a reference with {self.order} continuous derivatives, as u contains them"
-        got = f"{type(context.reference).__name__}, which has {smooth}"
-        remedy = (
-            f"SmoothStep and WaypointSpline take derivatives={self.order}, and Sinusoid is smooth;"
-            " or filter the virtual controls: BarrierBackstepping(filter=...)."
-        )
-        raise checks.fail("reference", checks.Words(got), expected, remedy)
 
     def _check_sides(self, context: LawContext, i: int) -> None:
         """Raises ValueError for bounds of level i + 1 with too few continuous derivatives."""
@@ -323,10 +314,15 @@ class BarrierBackstepping(Law):
             expected = f"a barrier whose slope has {needed} continuous derivatives at e = 0"
         else:
             return
+        centre = f", about alpha_{i},"
+        others = "TransformedError() and PrescribedPerformance() are smooth."
+        if i == 0:
+            centre = ""
+            log = f"Log(p={math.ceil(self.order / 2)})"
+            others = f"TransformedError(), PrescribedPerformance() and {log} are smooth enough."
         remedy = (
-            f"The tube of level {i + 1}{_centre_in_words(i)} is asymmetric, and the level is not"
-            f" the last. {_smooth_alternatives(i, self.order)} Or filter the virtual controls:"
-            " BarrierBackstepping(filter=...)."
+            f"The tube of level {i + 1}{centre} is asymmetric, and the level is not the last."
+            f" {others} Or filter the virtual controls: BarrierBackstepping(filter=...)."
         )
         raise checks.fail(name, kind, expected, remedy)
 
@@ -371,7 +367,7 @@ class BarrierBackstepping(Law):
         return jnp.stack([level.alpha for level in levels[:-1]])
 
     def command(
-        self, t: jax.Array, x: jax.Array, d_hat: jax.Array, context: LawContext, state: Any
+        self, t: jax.Array, x: jax.Array, d_hat: jax.Array, context: LawContext, state: State
     ) -> tuple[Command, Any]:
         """The input u, what belongs to it, and the rates of the filters.
 
@@ -411,7 +407,7 @@ class BarrierBackstepping(Law):
         return command, rates
 
     def levels(
-        self, t: jax.Array, x: jax.Array, d_hat: jax.Array, context: LawContext, state: Any
+        self, t: jax.Array, x: jax.Array, d_hat: jax.Array, context: LawContext, state: State
     ) -> tuple[list[Level], list[Tube]]:
         """What each level computes, and the tube of x_i around alpha_{i-1}, or around beta_{i-1}
         with filters; arguments as `command`.
@@ -444,7 +440,7 @@ class BarrierBackstepping(Law):
         return jnp.stack([w * value for w, value in zip(self.weights, values, strict=True)])
 
     def switching(
-        self, t: jax.Array, x: jax.Array, d_hat: jax.Array, context: LawContext, state: Any
+        self, t: jax.Array, x: jax.Array, d_hat: jax.Array, context: LawContext, state: State
     ) -> jax.Array | None:
         """e_r, (n,), where u jumps at e_r = 0; None for a last barrier without a jump."""
         if not self.barriers[-1].ratio_jumps:
@@ -492,28 +488,10 @@ def _is_symmetric(context: LawContext, i: int, bounds: Bounds) -> bool:
     if i > 0:
         if not isinstance(lower, Funnel) or not isinstance(upper, Funnel):
             return False
-        return _are_opposite(lower, upper)
+        return bool(
+            np.allclose(lower.initial, -np.asarray(upper.initial))
+            and np.allclose(lower.final, -np.asarray(upper.final))
+            and np.allclose(lower.rate, upper.rate)
+        )
     tubes = [context.tube(jnp.asarray(t)) for t in TIMES]
     return all(np.allclose(tube.k_l, tube.k_u, rtol=1e-9, atol=0.0) for tube in tubes)
-
-
-def _are_opposite(lower: Funnel, upper: Funnel) -> bool:
-    """Whether two funnels are at the same distance on both sides."""
-    return bool(
-        np.allclose(lower.initial, -np.asarray(upper.initial))
-        and np.allclose(lower.final, -np.asarray(upper.final))
-        and np.allclose(lower.rate, upper.rate)
-    )
-
-
-def _centre_in_words(i: int) -> str:
-    """The centre of the tube of level i + 1, in words; nothing for the first level."""
-    return f", about alpha_{i}," if i > 0 else ""
-
-
-def _smooth_alternatives(i: int, order: int) -> str:
-    """The barriers that are smooth enough on a level, in words."""
-    if i > 0:
-        return "TransformedError() and PrescribedPerformance() are smooth."
-    p = math.ceil(order / 2)
-    return f"TransformedError(), PrescribedPerformance() and Log(p={p}) are smooth enough."

@@ -31,11 +31,10 @@ there.  A small epsilon therefore needs a short period.
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from iblf_jax.control.controllers._base import (
     Command,
@@ -108,7 +107,7 @@ def excess(law: EventCompensated) -> jax.Array:
     return jnp.sum(2.0 * TANH_GAP * law.epsilon)
 
 
-def check_relative(name: str, value: Any) -> None:
+def check_relative(name: str, value: ArrayLike) -> None:
     """Raises ValueError for a relative threshold of 1 or more."""
     if checks.is_concrete(value) and np.any(np.asarray(value) >= 1.0):
         expected = "less than 1"

@@ -154,14 +154,18 @@ class Saturated(Wrapping):
         if self.auxiliary is None:
             command, rate = self.inner.command(t, x, d_hat, context, state)
             return self._limited(command), rate
-        shift = self.shift(state)
+        plant, shift = plants.as_plant(context.model), self.shift(state)
         if self.law.takes_shift:
             shifted = context._replace(shift=shift)
             command, rate = self.inner.command(t, x, d_hat, shifted, state.law)
         else:
-            command, rate = self._command_at_shifted_state(t, x, d_hat, context, state.law, shift)
+            # The command of (A.4), for a law that does not take the shift.
+            y = _at_shifted_state(x, shift.value)
+            command, rate = self.inner.command(t, y, d_hat, context, state.law)
+            without_limit = plants.level_rate(plant, plant.order, t, y, command.tau)
+            tau = plants.level_input(plant, plant.order, t, x, without_limit + shift.rate)
+            command = _with_shifted_control(command._replace(tau=tau), plant.order, shift.value)
         limited = self._limited(command)
-        plant = plants.as_plant(context.model)
         effect = plants.gain_times(plant, plant.order, t, x, limited.tau - command.tau)
         auxiliary_rate = AuxiliaryState(rate, shift.rate + effect)
         return limited._replace(auxiliary=state.auxiliary), auxiliary_rate
@@ -183,23 +187,6 @@ class Saturated(Wrapping):
     def shift(self, state: AuxiliaryState) -> Shift:
         """The shift of the virtual control: lambda and -k lambda."""
         return Shift(state.auxiliary, -self.auxiliary * state.auxiliary)
-
-    def _command_at_shifted_state(
-        self,
-        t: jax.Array,
-        x: jax.Array,
-        d_hat: jax.Array,
-        context: LawContext,
-        state: State,
-        shift: Shift,
-    ) -> tuple[Command, State]:
-        """The command of (A.4), for a law that does not take the shift."""
-        y = _at_shifted_state(x, shift.value)
-        command, rate = self.inner.command(t, y, d_hat, context, state)
-        plant = plants.as_plant(context.model)
-        without_limit = plants.level_rate(plant, plant.order, t, y, command.tau)
-        tau = plants.level_input(plant, plant.order, t, x, without_limit + shift.rate)
-        return _with_shifted_control(command._replace(tau=tau), plant.order, shift.value), rate
 
     def switching(
         self, t: jax.Array, x: jax.Array, d_hat: jax.Array, context: LawContext, state: State

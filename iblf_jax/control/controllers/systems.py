@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from numpy.typing import ArrayLike
+
 from iblf_jax.control import barriers
 from iblf_jax.control.controllers._base import RobotLaw, TrackingLaw
 from iblf_jax.control.controllers.adaptive_rbf import AdaptiveRBF
@@ -65,12 +67,12 @@ _WITHOUT_OBSERVER = ("adaptive_rbf", "pd", "reference_governor")
 def law_by_name(
     name: str,
     *,
-    k1: Any = 2.0,
-    K2: Any = 20.0,
+    k1: ArrayLike = 2.0,
+    K2: ArrayLike = 20.0,
     o: Any = 0.1,
     variant: str = "printed",
     p: int = 1,
-    weight: Any = 1.0,
+    weight: ArrayLike = 1.0,
 ) -> TrackingLaw:
     """The law of a system.
 

@@ -23,13 +23,17 @@ from __future__ import annotations
 
 import abc
 import math
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 
 from iblf_jax.core.families import Part
 from iblf_jax.core.units import PlantUnit
+
+if TYPE_CHECKING:
+    from iblf_jax.control.barriers import Barrier
+    from iblf_jax.world.bounds import Tube
 
 SIZE = PlantUnit("rad", "z")
 """Unit of z = sqrt(2V)."""
@@ -62,7 +66,9 @@ class Decay(Part):
         return None
 
 
-def gain_at(decay: Decay, t: jax.Array, k: jax.Array, barrier: Any, tube: Any, x: jax.Array) -> Any:
+def gain_at(
+    decay: Decay, t: jax.Array, k: jax.Array, barrier: Barrier, tube: Tube, x: jax.Array
+) -> Any:
     """The gain of one level of a law, (n,) [1/s]; k itself for a constant decay.
 
     Args:

@@ -108,13 +108,13 @@ class Observer(DisturbanceObserver):
         """As `RobotObserver.advance`."""
         return None
 
-    def complete(self, t: jax.Array, x: jax.Array, model: Any, state: State) -> jax.Array | None:
+    def complete(self, t: jax.Array, x: jax.Array, model: Plant, state: State) -> jax.Array | None:
         """The levels x, (r, n), with the estimates of an observer of levels in the place of those
         that the sensor need not measure; None for an observer that estimates none.
         """
         return None
 
-    def limit_excess(self, t: jax.Array, x: jax.Array, model: Any, state: State) -> Any:
+    def limit_excess(self, t: jax.Array, x: jax.Array, model: Plant, state: State) -> Any:
         """Positive where a limit of the estimates that the law receives is active, () [1]; `()` for
         an observer without limits.
         """
@@ -222,6 +222,6 @@ def _torque_on_joints(model: Plant, x: jax.Array, u: jax.Array) -> jax.Array:
     return torque
 
 
-def contract_of(observer: Any) -> type[Observer] | type[RobotObserver]:
+def contract_of(observer: object) -> type[Observer] | type[RobotObserver]:
     """The contract that an observer is meant to fit."""
     return families.contract_of(observer, Observer, RobotObserver)

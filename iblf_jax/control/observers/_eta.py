@@ -6,7 +6,7 @@ Each function is a member of `AsPublished` and of `Momentum`; the first argument
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -15,10 +15,14 @@ import numpy as np
 from iblf_jax.core import checks
 from iblf_jax.world.robots import Robot, momentum
 
+if TYPE_CHECKING:
+    from iblf_jax.control.observers.as_published import AsPublished
+    from iblf_jax.control.observers.momentum import Momentum
+
 STARTS = ("zero", "matched")
 
 
-def kf_advice(observer: Any) -> list[str]:
+def kf_advice(observer: AsPublished | Momentum) -> list[str]:
     """Warnings about a kf below the condition of Theorem 2; none for traced values."""
     kf = observer.kf
     if not checks.is_concrete(kf) or bool(np.all(np.asarray(kf) > 0.5)):
@@ -35,7 +39,9 @@ def kf_advice(observer: Any) -> list[str]:
     return [f"observer.kf = {kf}: {need}. {lost}; {rest}."]
 
 
-def initial_eta(observer: Any, q: jax.Array, dq: jax.Array, model: Robot) -> jax.Array:
+def initial_eta(
+    observer: AsPublished | Momentum, q: jax.Array, dq: jax.Array, model: Robot
+) -> jax.Array:
     """eta(0) of an observer with `kf`, `eta0` and `start`, (n,) [N m]."""
     eta0 = jnp.broadcast_to(observer.eta0, q.shape)
     if observer.start == "zero":
@@ -44,14 +50,19 @@ def initial_eta(observer: Any, q: jax.Array, dq: jax.Array, model: Robot) -> jax
 
 
 def eta_and_momentum(
-    observer: Any, t: jax.Array, q: jax.Array, dq: jax.Array, model: Robot, state: jax.Array
+    observer: AsPublished | Momentum,
+    t: jax.Array,
+    q: jax.Array,
+    dq: jax.Array,
+    model: Robot,
+    state: jax.Array,
 ) -> jax.Array:
     """f_hat = eta + kf M0 q', (n,) [N m]."""
     return state + observer.kf * momentum(model, q, dq)
 
 
 def advanced_eta(
-    observer: Any,
+    observer: AsPublished | Momentum,
     t: jax.Array,
     q: jax.Array,
     dq: jax.Array,
@@ -69,7 +80,7 @@ def advanced_eta(
     return state - jnp.expm1(-observer.kf * period) / observer.kf * rate
 
 
-def with_discrete_gain(observer: Any, period: jax.Array) -> Any:
+def with_discrete_gain(observer: AsPublished | Momentum, period: jax.Array) -> Any:
     """The observer with kf = (1 - exp(-kf period)) / period, for which 1 - kf period is what is
     left of an error after a period.
     """

@@ -251,7 +251,7 @@ class StateObserver(Observer):
         flow = self._flow(model, u, d_hat)
         return StateObserverValues(_runge_kutta(flow, t, x_hat, period), d_hat)
 
-    def _flow(self, model: Plant, u: jax.Array, d_hat: Any) -> Flow:
+    def _flow(self, model: Plant, u: jax.Array, d_hat: jax.Array) -> Flow:
         """The rate of the model's state with the estimated disturbance, a function of t and x."""
 
         def flow(t: jax.Array, x: jax.Array) -> jax.Array:
@@ -294,7 +294,7 @@ class StateObserver(Observer):
         return StateObserverValues(jnp.stack(states), jnp.stack(disturbances))
 
 
-def _limited(x: jax.Array, limit: Any) -> jax.Array:
+def _limited(x: jax.Array, limit: jax.Array | None) -> jax.Array:
     """An estimate within its limit; unchanged without one."""
     if limit is None:
         return x

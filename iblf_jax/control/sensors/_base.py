@@ -179,7 +179,7 @@ def sensor_of_x(sensor: AnySensor) -> Sensor:
     return SensorOfRobot(sensor)
 
 
-def contract_of(sensor: Any) -> type[Sensor] | type[RobotSensor]:
+def contract_of(sensor: object) -> type[Sensor] | type[RobotSensor]:
     """The contract that a sensor is meant to fit."""
     return families.contract_of(sensor, Sensor, RobotSensor)
 

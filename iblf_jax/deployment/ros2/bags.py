@@ -8,7 +8,6 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections.abc import Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -155,7 +154,15 @@ def read_bag(
     scenario = dataclasses.replace(scenario, actuator=Ideal())
     rows = _rows(log, dq)
     states = _replayed(scenario, log, dq)
-    _compare_torques(log, states)
+    computed = np.asarray(states.sampled.commands[:, 0])
+    largest = np.max(np.abs(log.tau))
+    distance = np.median(np.max(np.abs(computed - log.tau), axis=1))
+    if not distance <= REPRODUCED * largest:
+        notices.warn(
+            f"{log.name}: the law of the scenario has other torques on the recorded states than"
+            f" those recorded, by {distance:.3g} N m (median) of at most {largest:.3g} N m. Give"
+            " time_origin if the recording began after the law, or the scenario whose law ran."
+        )
     motion = RecordedMotion(rows, states, diverged=False)
     folds = as_folds(metrics, scenario.initial.q.dtype, scenario)
     # Two adjacent rows of joint states have no torque that was constant between them.
@@ -164,7 +171,7 @@ def read_bag(
     return rollout_of(scenario, folds, motion, dt, 1, "recorded", is_gap)
 
 
-def _log(path: Any, scenario: Scenario, options: BagOptions) -> dict[str, np.ndarray]:
+def _log(path: str | os.PathLike, scenario: Scenario, options: BagOptions) -> dict[str, np.ndarray]:
     """The signals of a recording."""
     what = "a rosbag2 recording"
     place = checks.file_path("path", path, what)
@@ -230,20 +237,6 @@ def _replayed(scenario: Scenario, log: Log, dq: np.ndarray) -> LoopState:
     t, q, dq_read, tau = (jnp.asarray(x, dtype) for x in (log.t, log.q, dq, log.tau))
     states = replay_law(scenario, t, q, dq_read, jnp.asarray(is_due), tau)
     return jax.tree.map(np.asarray, states)
-
-
-def _compare_torques(log: Log, states: LoopState) -> None:
-    """Warns if the torques of the law on the recorded states are not the recorded ones."""
-    computed = np.asarray(states.sampled.commands[:, 0])
-    largest = np.max(np.abs(log.tau))
-    distance = np.median(np.max(np.abs(computed - log.tau), axis=1))
-    if distance <= REPRODUCED * largest:
-        return
-    notices.warn(
-        f"{log.name}: the law of the scenario has other torques on the recorded states than those"
-        f" recorded, by {distance:.3g} N m (median) of at most {largest:.3g} N m. Give time_origin"
-        " if the recording began after the law, or the scenario whose law ran."
-    )
 
 
 def _samples(t: np.ndarray, period: float) -> np.ndarray:

@@ -10,12 +10,13 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.control import sensors
+from iblf_jax.control.sensors._base import AnySensor
 from iblf_jax.simulation.closed_loop import LoopState, initial_state, run_sampled_law
 from iblf_jax.simulation.initial import Initial
 from iblf_jax.simulation.scenario import Scenario
 
 
-def without_effects(sensor: Any) -> Any:
+def without_effects(sensor: AnySensor) -> AnySensor:
     """The part of a sensor that belongs to the law: its velocity filter, without counts, offset and
     noise.
     """

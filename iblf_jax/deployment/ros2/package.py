@@ -10,7 +10,7 @@ import math
 import re
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -19,6 +19,7 @@ from xml.sax.saxutils import escape
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from iblf_jax import __version__
 from iblf_jax.core import checks, notices
@@ -99,7 +100,9 @@ def check_ros_name(name: str) -> None:
     raise checks.fail("name", name, expected, 'It names the ROS package: name="arm_law".')
 
 
-def ros_options(scenario: Scenario, gains: Any, torque_limits: Any, on_fault: str) -> RosOptions:
+def ros_options(
+    scenario: Scenario, gains: Any, torque_limits: ArrayLike | None, on_fault: str
+) -> RosOptions:
     """The options of a package.
 
     Args:
@@ -123,7 +126,7 @@ def ros_options(scenario: Scenario, gains: Any, torque_limits: Any, on_fault: st
     return RosOptions(_gains(scenario, gains), limits, on_fault)
 
 
-def _torque_limits(scenario: Scenario, given: Any) -> np.ndarray:
+def _torque_limits(scenario: Scenario, given: ArrayLike | None) -> np.ndarray:
     """The largest torques, (n,) [N m]: the given ones, at most those of the model."""
     n = scenario.n
     effort = scenario.model.effort
@@ -165,7 +168,11 @@ def _gains(scenario: Scenario, given: Any) -> tuple[GainOption, ...]:
         remedy = "The period of a node is fixed: export once for each period."
         raise checks.fail("gains", PERIOD, expected, remedy)
     for item in tunables:
-        _check_tied(scenario, item)
+        value = np.asarray(paths.get(scenario, item.path), float)
+        if item.tied and np.any(value != value.flat[0]):
+            # One number would replace different ones.
+            remedy = f'Such as ij.with_parameters(scenario, {{"{item.path}": {value.flat[0]:g}}}).'
+            raise checks.fail(f"gains: {item.path}", value, "equal numbers for a tied gain", remedy)
     period = float(scenario.sampling.period)  # type: ignore[union-attr]
     blocks, box = layout(scenario, tunables, period, "rk4")
     low, high = in_units(blocks, box.low), in_units(blocks, box.high)
@@ -190,16 +197,7 @@ def _warn_of_default_range(gain: GainOption) -> None:
     )
 
 
-def _check_tied(scenario: Scenario, item: Tunable) -> None:
-    """Raises ValueError for one number that would replace different ones."""
-    value = np.asarray(paths.get(scenario, item.path), float)
-    if not item.tied or np.all(value == value.flat[0]):
-        return
-    remedy = f'Such as ij.with_parameters(scenario, {{"{item.path}": {value.flat[0]:g}}}).'
-    raise checks.fail(f"gains: {item.path}", value, "equal numbers for a tied gain", remedy)
-
-
-def _range_end(given: Any, numbers: np.ndarray) -> np.ndarray:
+def _range_end(given: ArrayLike | None, numbers: np.ndarray) -> np.ndarray:
     """An end of a range: the given one, as that of `tune` has passed through a logarithm."""
     if given is None or np.size(given) not in (1, numbers.size):
         return numbers
@@ -220,48 +218,44 @@ def _gain(scenario: Scenario, item: Tunable, low: np.ndarray, high: np.ndarray) 
     return GainOption(item.path, paths.unit_at(scenario, item.path), value, low, high, item.tied)
 
 
-def _offsets(scenario: Scenario, parameters: Parameters, path: str) -> np.ndarray:
-    """Indices of the numbers at a path in the struct of parameters, in the shape of the value.
-
-    Raises:
-      ValueError: the law does not read the leaf.
-    """
-    starts, offset = {}, 0
-    for field in parameters.fields:
-        starts[field.path] = (offset, field.shape)
-        offset += math.prod(field.shape)
-    rows = zip(paths.leaves(scenario, path), paths.places(scenario, path), strict=True)
-    for leaf, tokens in rows:
-        if leaf in starts:
-            start, shape = starts[leaf]
-            index = tuple(int(token) for token in tokens[len(paths.parse(leaf)) :])
-            return np.asarray(start + np.arange(math.prod(shape)).reshape(shape)[index])
-    remedy = checks.did_you_mean(path, [field.path for field in parameters.fields])
-    raise checks.fail("gains", path, "a parameter that the law reads", remedy)
-
-
 def _description(law: Law, generated: GeneratedLaw, options: RosOptions) -> dict[str, Any]:
     """The content of `law.json`."""
     scenario = law.scenario
-    stiffness, damping = _hold_gains(scenario)
+    period = float(scenario.sampling.period)  # type: ignore[union-attr]
+    # The hold has critical damping of each joint alone at the start, to two digits.
+    bandwidth = min(HOLD_BANDWIDTH, HOLD_BANDWIDTH_TIMES_PERIOD / period)
+    inertia = np.diag(np.asarray(mass_matrix_at(scenario.model, scenario.initial.q)))
     return {
         "name": law.name,
         "version": __version__,
         "joints": list(law.joints or (f"joint_{i + 1}" for i in range(law.scenario.n))),
         "has_joint_names": bool(law.joints),
-        "period": float(scenario.sampling.period),  # type: ignore[union-attr]
+        "period": period,
         "reads_velocity": "dq" not in law.unread_levels,
         "torque_limits": options.torque_limits.tolist(),
         "on_fault": options.on_fault,
-        "hold_stiffness": stiffness,
-        "hold_damping": damping,
+        "hold_stiffness": [float(f"{x:.2g}") for x in bandwidth**2 * inertia],
+        "hold_damping": [float(f"{x:.2g}") for x in 2 * bandwidth * inertia],
         "gains": [_gain_row(scenario, generated.parameters, gain) for gain in options.gains],
     }
 
 
 def _gain_row(scenario: Scenario, parameters: Parameters, gain: GainOption) -> dict[str, Any]:
     """A gain in `law.json`."""
-    numbers = _offsets(scenario, parameters, gain.path).reshape(-1)
+    starts, offset = {}, 0
+    for field in parameters.fields:
+        starts[field.path] = (offset, field.shape)
+        offset += math.prod(field.shape)
+    rows = zip(paths.leaves(scenario, gain.path), paths.places(scenario, gain.path), strict=True)
+    found = [(leaf, tokens) for leaf, tokens in rows if leaf in starts]
+    if not found:
+        remedy = checks.did_you_mean(gain.path, [field.path for field in parameters.fields])
+        raise checks.fail("gains", gain.path, "a parameter that the law reads", remedy)
+    leaf, tokens = found[0]
+    start, shape = starts[leaf]
+    index = tuple(int(token) for token in tokens[len(paths.parse(leaf)) :])
+    # Indices of the numbers of the gain in the struct of parameters.
+    numbers = np.ravel((start + np.arange(math.prod(shape))).reshape(shape)[index])
     offsets = [[int(x)] for x in numbers]
     if gain.tied:
         offsets = [[int(x) for x in numbers]]
@@ -273,17 +267,6 @@ def _gain_row(scenario: Scenario, parameters: Parameters, gain: GainOption) -> d
         "high": gain.high.reshape(-1).tolist(),
         "offsets": offsets,
     }
-
-
-def _hold_gains(scenario: Scenario) -> tuple[list[float], list[float]]:
-    """Stiffness [N m/rad] and damping [N m s/rad] of the hold: critical damping of each joint
-    alone at the start, two digits.
-    """
-    period = float(scenario.sampling.period)  # type: ignore[union-attr]
-    bandwidth = min(HOLD_BANDWIDTH, HOLD_BANDWIDTH_TIMES_PERIOD / period)
-    inertia = np.diag(np.asarray(mass_matrix_at(scenario.model, scenario.initial.q)))
-    stiffness, damping = bandwidth**2 * inertia, 2 * bandwidth * inertia
-    return [float(f"{x:.2g}") for x in stiffness], [float(f"{x:.2g}") for x in damping]
 
 
 def _gain_lines(options: RosOptions) -> str:
@@ -325,12 +308,9 @@ def ros_files(law: Law, generated: GeneratedLaw, options: RosOptions) -> dict[st
         "hold_stiffness": yaml_numbers(description["hold_stiffness"]),
         "hold_damping": yaml_numbers(description["hold_damping"]),
         "gains": _gain_lines(options),
-        "set_gain": _set_gain_note(name, options),
         "n": law.scenario.n,
         "rate": f"{1.0 / description['period']:.6g}",
-        "velocity": _velocity_note(description["reads_velocity"]),
-        "lost_state": _lost_state_note(description["reads_velocity"]),
-        "start_table": _start_table(law, description["joints"]),
+        **_readme_values(law, options, description),
     }
     texts = {
         "package.xml": fill_template(
@@ -359,67 +339,54 @@ def ros_files(law: Law, generated: GeneratedLaw, options: RosOptions) -> dict[st
     return texts
 
 
-def _set_gain_note(name: str, options: RosOptions) -> str:
-    """How a gain is changed while the node runs, in the README."""
-    if not options.gains:
-        return "This law was exported without gains that can be changed while the node runs."
-    gain = options.gains[0]
-    return (
-        "The gains among them can be changed while the node runs, within their ranges there; the"
-        " torque makes a step. Simulate the ends of the ranges with the delay of your loop.\n\n"
-        f"    ros2 param set /{name} {shlex.quote(gain.path)} {json.dumps(_yaml_value(gain))}"
-    )
-
-
-def _velocity_note(reads_velocity: bool) -> str:
-    if reads_velocity:
-        return "positions and velocities"
-    return "positions (the law filters velocities from them)"
-
-
-def _lost_state_note(reads_velocity: bool) -> str:
-    """What a lost state does, in the README."""
-    if reads_velocity:
-        return "the torques of the state before act for one more period."
-    return (
-        "the velocity filter divides by the period, so that one lost state doubles the difference"
-        " of the next, and the torques have an error for some periods."
-    )
-
-
-def _start_table(law: Law, joints: Sequence[str]) -> str:
-    """Reference and bounds of every joint at t = 0, in the README."""
-    scenario = law.scenario
-    inputs = inputs_at_start(scenario)
-    lower, upper = bounds_at(scenario, inputs)
-    rows = zip(joints, scenario.reference.position(inputs.t), lower, upper, strict=True)
+def _readme_values(law: Law, options: RosOptions, description: Mapping[str, Any]) -> dict[str, str]:
+    """The sentences and the table of the README that depend on the law."""
+    # How a gain is changed while the node runs.
+    set_gain = "This law was exported without gains that can be changed while the node runs."
+    if options.gains:
+        gain = options.gains[0]
+        value = f"{shlex.quote(gain.path)} {json.dumps(_yaml_value(gain))}"
+        set_gain = (
+            "The gains among them can be changed while the node runs, within their ranges there;"
+            " the torque makes a step. Simulate the ends of the ranges with the delay of your"
+            f" loop.\n\n    ros2 param set /{law.name} {value}"
+        )
+    # What the law reads, and what a lost state does.
+    velocity = "positions and velocities"
+    lost_state = "the torques of the state before act for one more period."
+    if not description["reads_velocity"]:
+        velocity = "positions (the law filters velocities from them)"
+        lost_state = (
+            "the velocity filter divides by the period, so that one lost state doubles the"
+            " difference of the next, and the torques have an error for some periods."
+        )
+    # Reference and bounds of every joint at t = 0.
+    inputs = inputs_at_start(law.scenario)
+    position, sides = law.scenario.reference.position(inputs.t), bounds_at(law.scenario, inputs)
     lines = ["| joint | reference [rad] | bounds [rad] |", "|---|---|---|"]
-    lines += [
-        f"| {markdown_code(name)} | {q:.4g} | {low:.4g} to {high:.4g} |"
-        for name, q, low, high in rows
-    ]
-    return "\n".join(f"  {line}" for line in lines)
-
-
-def _warn_of_gravity(law: Law, limits: np.ndarray) -> None:
-    """Warns of limits below the torques that carry gravity in the run of the self-test."""
-    positions = jnp.asarray(law.vectors.q[::CHECK_INTERVAL])
-    gravity = np.abs(jax.vmap(law.scenario.model.gravity)(positions)).max(axis=0)
-    if np.all(gravity <= limits):
-        return
-    needed, given = (np.array2string(x, precision=4) for x in (gravity, limits))
-    notices.warn(
-        f"torque_limits: gravity takes up to {needed} N m in the simulated run, but the node clips"
-        f" at {given} N m: the drives can neither hold nor move the robot there. Give the limits of"
-        " the drives, or a scenario that they can carry."
-    )
+    for joint, q, low, high in zip(description["joints"], position, *sides, strict=True):
+        lines.append(f"| {markdown_code(joint)} | {q:.4g} | {low:.4g} to {high:.4g} |")
+    return {
+        "set_gain": set_gain,
+        "velocity": velocity,
+        "lost_state": lost_state,
+        "start_table": "\n".join(f"  {line}" for line in lines),
+    }
 
 
 def write_package(
     law: Law, generated: GeneratedLaw, options: RosOptions, folder: Path
 ) -> tuple[str, ...]:
     """Writes the package into a folder; returns the names of its files."""
-    _warn_of_gravity(law, options.torque_limits)
+    positions = jnp.asarray(law.vectors.q[::CHECK_INTERVAL])
+    gravity = np.abs(jax.vmap(law.scenario.model.gravity)(positions)).max(axis=0)
+    if not np.all(gravity <= options.torque_limits):
+        needed, given = (np.array2string(x, precision=4) for x in (gravity, options.torque_limits))
+        notices.warn(
+            f"torque_limits: gravity takes up to {needed} N m in the simulated run, but the node"
+            f" clips at {given} N m: the drives can neither hold nor move the robot there. Give the"
+            " limits of the drives, or a scenario that they can carry."
+        )
     texts = ros_files(law, generated, options)
     for name in {str(Path(name).parent) for name in texts}:
         (folder / name).mkdir(parents=True, exist_ok=True)

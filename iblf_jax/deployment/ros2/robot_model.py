@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.deployment.mujoco_plant import LEAST_INERTIA, MujocoPlant
+from iblf_jax.deployment.mujoco_plant import LEAST_INERTIA, MujocoPlant, MujocoSource
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.world.plants import declared_joints
 from iblf_jax.world.robots import PlanarChain, TwoLink
@@ -19,7 +19,7 @@ MIN_RADIUS = 0.01
 
 
 def plant_of(
-    scenario: Scenario, plant: Any, joints: Sequence[str] | None
+    scenario: Scenario, plant: MujocoSource | None, joints: Sequence[str] | None
 ) -> tuple[Any, tuple[str, ...]]:
     """A robot for MuJoCo and the names of its joints.
 

@@ -25,7 +25,6 @@ from iblf_jax.deployment.cosimulate import (
 from iblf_jax.deployment.mujoco_plant import MujocoPlant
 from iblf_jax.deployment.ros2.law_replay import replay_law
 from iblf_jax.deployment.ros2.robot_simulation import Reading, Row
-from iblf_jax.simulation.closed_loop import LoopState
 from iblf_jax.simulation.metrics import Fold, as_folds
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical
@@ -140,16 +139,12 @@ class RobotMotion(Result):
         limited = np.zeros_like(self.tau, bool)
         columns = (self.t, self.instant, self.q, self.dq, self.ddq, self.tau, limited)
         rows = Rows(*columns, actuator=(), sample=self.sample, model_positions=self.q)
-        motion = RecordedMotion(rows, self._law_states(scenario), self.diverged)
-        return rollout_of(scenario, folds, motion, self.dt, 1, "MuJoCo over ROS 2")
-
-    def _law_states(self, scenario: Scenario) -> LoopState:
-        """The state of the law after each state of the robot."""
         dtype = scenario.initial.q.dtype
-        columns = (self.state_t, self.measured_q, self.measured_dq)
-        t, q, dq = (jnp.asarray(x, dtype) for x in columns)
+        measured = (self.state_t, self.measured_q, self.measured_dq)
+        t, q, dq = (jnp.asarray(x, dtype) for x in measured)
         states = replay_law(scenario, t, q, dq, jnp.asarray(self.published))
-        return jax.tree.map(np.asarray, states)
+        motion = RecordedMotion(rows, jax.tree.map(np.asarray, states), self.diverged)
+        return rollout_of(scenario, folds, motion, self.dt, 1, "MuJoCo over ROS 2")
 
 
 def recorded(
@@ -160,7 +155,12 @@ def recorded(
 ) -> RobotMotion:
     """The motion of a robot that has been simulated; the remaining fields are given."""
     stack = stacked(list(rows))
-    accelerations = np.array([_acceleration(robot, row) for row in rows])
+    accelerations = np.zeros((len(rows), len(robot.speeds)))
+    for i, row in enumerate(rows):
+        if not row.is_braked:
+            robot.restore(row.state)
+            robot.apply(row.tau)
+            accelerations[i] = robot.acceleration(row.t)
     start = robot.model.nq
     read = stacked(list(samples))
     return RobotMotion(
@@ -176,12 +176,3 @@ def recorded(
         measured_dq=read.dq,
         **fields,
     )
-
-
-def _acceleration(robot: MujocoPlant, row: Row) -> np.ndarray:
-    """Acceleration of the driven joints at a row, (n,) [rad/s^2]."""
-    if row.is_braked:
-        return np.zeros(len(robot.speeds))
-    robot.restore(row.state)
-    robot.apply(row.tau)
-    return robot.acceleration(row.t)

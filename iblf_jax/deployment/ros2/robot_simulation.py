@@ -13,6 +13,7 @@ import numpy as np
 
 from iblf_jax.control.actuators.delay import WHOLE_TOLERANCE
 from iblf_jax.control.sensors import Ideal
+from iblf_jax.control.sensors._base import AnySensor
 from iblf_jax.deployment.mujoco_plant import MujocoPlant
 from iblf_jax.deployment.transit import CommandsInTransit
 from iblf_jax.simulation.noise import noise_key, normals
@@ -100,7 +101,7 @@ class RobotSimulation:
         *,
         period: float,
         dt: float,
-        sensor: Any,
+        sensor: AnySensor,
         delay: float,
         effort_timeout: float,
         brake: str,

@@ -89,6 +89,15 @@ def _values(
     states = ["`position`"]
     if description["reads_velocity"]:
         states.append("`velocity`")
+    rows = []
+    for gain in gains:
+        places = ", ".join(f"{{{', '.join(map(str, entry))}}}" for entry in gain["offsets"])
+        low, high = _cpp_numbers(gain["low"]), _cpp_numbers(gain["high"])
+        rows.append(f"\n    {{{cpp_string(gain['path'])}, {{{low}}}, {{{high}}}, {{{places}}}}}")
+    gain_names = "the law was exported without gains that can be changed."
+    if gains:
+        names = ", ".join(markdown_code(gain["path"]) for gain in gains)
+        gain_names = f"the gains {names} within the exported ranges."
     values = {
         "name": law.name,
         "upper": law.name.upper(),
@@ -106,9 +115,9 @@ def _values(
         "reads_velocity": _cpp_bool(description["reads_velocity"]),
         "has_joint_names": _cpp_bool(description["has_joint_names"]),
         "cpp_names": ", ".join(map(cpp_string, joints)),
-        "cpp_gains": _cpp_gains(gains),
+        "cpp_gains": ",".join(rows),
         "gains": _gain_lines(generated, gains),
-        "gain_names": _gain_names(gains),
+        "gain_names": gain_names,
     }
     for name in ("torque_limits", "hold_stiffness", "hold_damping"):
         values[name] = yaml_numbers(description[name])
@@ -130,24 +139,6 @@ def _cpp_bool(value: bool) -> str:
 
 def _cpp_numbers(numbers: Iterable[float]) -> str:
     return ", ".join(repr(float(x)) for x in numbers)
-
-
-def _cpp_gains(gains: Sequence[Mapping[str, Any]]) -> str:
-    """The rows of the table of gains."""
-    rows = []
-    for gain in gains:
-        places = ", ".join(f"{{{', '.join(map(str, entry))}}}" for entry in gain["offsets"])
-        low, high = _cpp_numbers(gain["low"]), _cpp_numbers(gain["high"])
-        rows.append(f"\n    {{{cpp_string(gain['path'])}, {{{low}}}, {{{high}}}, {{{places}}}}}")
-    return ",".join(rows)
-
-
-def _gain_names(gains: Sequence[Mapping[str, Any]]) -> str:
-    """The sentence of the README about the gains."""
-    if not gains:
-        return "the law was exported without gains that can be changed."
-    names = ", ".join(markdown_code(gain["path"]) for gain in gains)
-    return f"the gains {names} within the exported ranges."
 
 
 def _gain_lines(generated: GeneratedLaw, gains: Sequence[Mapping[str, Any]]) -> str:

@@ -5,11 +5,13 @@ from __future__ import annotations
 import gc
 import time
 from collections.abc import Callable, Sequence
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from iblf_jax.control.sensors import Ideal
+from iblf_jax.control.sensors._base import AnySensor
 from iblf_jax.core import checks
 from iblf_jax.deployment.cosimulate import own_step
 from iblf_jax.deployment.mujoco_plant import INTEGRATORS, MujocoPlant
@@ -55,7 +57,7 @@ def robot_node(
     real_time: bool = False,
     dt: float | None = None,
     integrator: str | None = "RK4",
-    sensor: Any = None,
+    sensor: AnySensor | None = None,
     delay: float = 0.0,
     state_dropout: float = 0.0,
     effort_dropout: float = 0.0,
@@ -337,7 +339,16 @@ class SimulatedRobot:
         self, periods: int, patience: float, on_release: Callable[[], object]
     ) -> None:
         simulation = self.simulation
-        self._wait_for_release(patience)
+        # The initial state is exchanged until an effort releases the brake; the stamps advance.
+        end = time.perf_counter() + patience
+        while not self._stops:
+            self._replace_first_state()
+            self._exchange(simulation.measure(), patience)
+            if simulation.is_released:
+                break
+            self.origin += round(simulation.period * NANOSECONDS)
+            if time.perf_counter() > end:
+                raise TimeoutError(self._no_release(patience))
         on_release()
         while not self._stops and not simulation.diverged and simulation.index < periods:
             simulation.advance()
@@ -346,19 +357,6 @@ class SimulatedRobot:
             self._begin_state(is_published=not is_lost, lateness=0.0)
             if not is_lost:
                 self._exchange(reading, patience)
-
-    def _wait_for_release(self, patience: float) -> None:
-        """Exchanges the initial state until an effort releases the brake; the stamps advance."""
-        simulation = self.simulation
-        end = time.perf_counter() + patience
-        while not self._stops:
-            self._replace_first_state()
-            self._exchange(simulation.measure(), patience)
-            if simulation.is_released:
-                return
-            self.origin += round(simulation.period * NANOSECONDS)
-            if time.perf_counter() > end:
-                raise TimeoutError(self._no_release(patience))
 
     def _exchange(self, reading: Reading, patience: float) -> None:
         """Publishes a state until an effort answers it."""
@@ -381,7 +379,21 @@ class SimulatedRobot:
         self, periods: int, patience: float, on_release: Callable[[], object]
     ) -> None:
         simulation = self.simulation
-        start = self._wait_for_release_in_real_time(patience)
+        # The initial state is published every period until an effort releases the brake.
+        end = time.perf_counter() + patience
+        while True:
+            self.origin = time.time_ns()
+            start = time.perf_counter()  # the clock of the process at t = 0 [s]
+            self._replace_first_state()
+            self._publish(simulation.measure())
+            due = start + simulation.period
+            while time.perf_counter() < due and not simulation.efforts.commands:
+                self._spin(due)
+                self._take_arrivals_of_clock(start)
+            if self._stops or simulation.is_released:
+                break
+            if time.perf_counter() > end:
+                raise TimeoutError(self._no_release(patience))
         on_release()
         while simulation.index < periods and not self._stops and not simulation.diverged:
             due = start + (simulation.index + 1) * simulation.period
@@ -399,26 +411,6 @@ class SimulatedRobot:
             self._begin_state(is_published=not is_lost, lateness=time.perf_counter() - nominal)
             if not is_lost:
                 self._publish(reading)
-
-    def _wait_for_release_in_real_time(self, patience: float) -> float:
-        """Publishes the initial state every period until an effort releases the brake; the clock of
-        the process at t = 0 [s].
-        """
-        simulation = self.simulation
-        end = time.perf_counter() + patience
-        while True:
-            self.origin = time.time_ns()
-            start = time.perf_counter()
-            self._replace_first_state()
-            self._publish(simulation.measure())
-            due = start + simulation.period
-            while time.perf_counter() < due and not simulation.efforts.commands:
-                self._spin(due)
-                self._take_arrivals_of_clock(start)
-            if self._stops or simulation.is_released:
-                return start
-            if time.perf_counter() > end:
-                raise TimeoutError(self._no_release(patience))
 
     def _take_arrivals_of_clock(self, start: float) -> None:
         """Passes the efforts on to the robot at the times at which they arrived."""
@@ -499,7 +491,7 @@ class SimulatedRobot:
         )
 
 
-def _executor(rclpy: Any, context: Any) -> Any:
+def _executor(rclpy: ModuleType, context: object) -> Any:
     """An executor of callbacks; the one of events has a quarter of the latency."""
     try:
         from rclpy.experimental import EventsExecutor

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +17,7 @@ from iblf_jax.world.robots import Robot
 NEVER = 1e30
 """Time of a switch that does not happen [s]; an infinite one has no rounding error."""
 
+P = TypeVar("P")
 RobotOrPlant = Annotated[Robot, Plant]
 
 
@@ -103,7 +104,7 @@ def _as_parameters(owner: str, plant: Any, parameters: Any) -> tuple[ModeValues,
     return tuple(parameters)
 
 
-def changed(plant: Any, path: str, value: jax.Array) -> Any:
+def changed(plant: P, path: str, value: jax.Array) -> P:
     """A copy of a plant with one parameter replaced."""
     return replaced(plant, resolve(plant, path)[0], value, path, None)
 

@@ -26,6 +26,7 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from iblf_jax.core import checks, sparse
 from iblf_jax.core.pytree import component, static
@@ -91,23 +92,17 @@ class Agents(Plant):
             remedy = "An agent has no position relative to itself."
             raise checks.fail("Agents.adjacency", self.adjacency, "a zero diagonal", remedy)
         _check_reached(adjacency, leader)
-        self._check_equal()
-        check_dimensions("Agents", self)
-
-    def _check_equal(self) -> None:
-        """Raises ValueError for agents of different orders, sizes or units of the first level."""
-        first = self.agents[0]
-        for i, agent in enumerate(self.agents):
+        first = agents[0]
+        for i, agent in enumerate(agents):
             for name, got, expected in (
                 ("order", agent.order, first.order),
                 ("n", agent.n, first.n),
                 ("units[0]", units_of(agent)[0], units_of(first)[0]),
             ):
-                if got == expected:
-                    continue
-                raise checks.fail(
-                    f"Agents.agents[{i}].{name}", got, f"{expected!r}, as agents[0] has"
-                )
+                if got != expected:
+                    expected = f"{expected!r}, as agents[0] has"
+                    raise checks.fail(f"Agents.agents[{i}].{name}", got, expected)
+        check_dimensions("Agents", self)
 
     # --- the graph --------------------------------------------------------------------------------
 
@@ -118,19 +113,19 @@ class Agents(Plant):
         H = np.diag(adjacency.sum(axis=1) + np.asarray(self.leader)) - adjacency
         return tuple(tuple(row) for row in H.tolist())
 
-    def relative_positions(self, positions: Any) -> jax.Array:
+    def relative_positions(self, positions: ArrayLike) -> jax.Array:
         """The relative positions y = (H kron I) p, (..., N m), of the agents at p, (..., N, m)."""
         p = jnp.asarray(positions)
         rows = sparse.times(self.matrix, [p[..., i, :] for i in range(len(self.agents))])
         return jnp.concatenate(rows, axis=-1)
 
-    def positions(self, relative: Any) -> jax.Array:
+    def positions(self, relative: ArrayLike) -> jax.Array:
         """The positions p = (H kron I)^-1 y, (..., N, m), of the first level y, (..., N m), such as
         `run.q`.
         """
         return jnp.stack(self._positions(jnp.asarray(relative)), axis=-2)
 
-    def reference(self, leader: Reference, offsets: Any = 0.0) -> Leader:
+    def reference(self, leader: Reference, offsets: ArrayLike = 0.0) -> Leader:
         """The reference of y with which each agent follows the leader, p_i -> x_0 + offset_i.
 
         Args:
@@ -213,7 +208,12 @@ class Agents(Plant):
     def gain(self, t: jax.Array, x: jax.Array) -> jax.Array:
         """G, (order, n, n): (H kron I) diag(G_1 of the agents), and block-diagonal ones above."""
         states = self._states(x)
-        gains = [_full_gain(agent.gain(t, z)) for agent, z in zip(self.agents, states, strict=True)]
+        gains = []
+        for agent, z in zip(self.agents, states, strict=True):
+            gain = agent.gain(t, z)
+            if gain.ndim == 2:
+                gain = gain[:, :, None] * jnp.eye(gain.shape[1], dtype=gain.dtype)
+            gains.append(gain)
         first = []
         for row in self.matrix:
             blocks = [h * gain[0] for h, gain in zip(row, gains, strict=True)]
@@ -243,10 +243,18 @@ class Agents(Plant):
     def transposed_gain(self, level: int, t: jax.Array, x: jax.Array, s: jax.Array) -> jax.Array:
         """G_i^T s, (n,)."""
         if level == 1:
-            s = jnp.concatenate(sparse.times(_transposed(self.matrix), self._parts(s)))
+            transposed = tuple(zip(*self.matrix, strict=True))
+            s = jnp.concatenate(sparse.times(transposed, self._parts(s)))
         return jnp.concatenate(self._each(transposed_gain, level, t, x, s))
 
-    def _each(self, function: Callable, level: int, t: jax.Array, x: jax.Array, *vectors: Any):
+    def _each(
+        self,
+        function: Callable,
+        level: int,
+        t: jax.Array,
+        x: jax.Array,
+        *vectors: Any,
+    ):
         """A function of a plant and a level for each agent, in its own coordinates."""
         split = zip(*map(self._parts, vectors), strict=True)
         return [
@@ -355,7 +363,7 @@ class NeighbourModel(Plant):
         """As `Agents`."""
         return self.stack.component_names
 
-    def positions(self, relative: Any) -> jax.Array:
+    def positions(self, relative: ArrayLike) -> jax.Array:
         """As `Agents.positions`."""
         return self.stack.positions(relative)
 
@@ -446,7 +454,7 @@ def _as_agent(i: int, part: Any) -> Any:
         raise checks.fail(f"Agents.agents[{i}]", part, "a plant or a robot") from error
 
 
-def _weights(name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
+def _weights(name: str, value: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
     """The weights of a graph as an array; ValueError for others than finite numbers >= 0."""
     expected = f"finite numbers >= 0, shape {shape}, one for each of {shape[0]} agents"
     try:
@@ -475,23 +483,12 @@ def _check_reached(adjacency: np.ndarray, leader: np.ndarray) -> None:
 # --- small functions ------------------------------------------------------------------------------
 
 
-def _transposed(matrix: sparse.Rows) -> sparse.Rows:
-    return tuple(zip(*matrix, strict=True))
-
-
 def _joined(parts: list[jax.Array | None], axis: int) -> jax.Array | None:
     """The parts of all agents in one array; None where one is missing."""
     known = [part for part in parts if part is not None]
     if len(known) < len(parts):
         return None
     return jnp.concatenate(known, axis=axis)
-
-
-def _full_gain(gain: jax.Array) -> jax.Array:
-    """Gains as matrices, (order, m, m)."""
-    if gain.ndim == 3:
-        return gain
-    return gain[:, :, None] * jnp.eye(gain.shape[1], dtype=gain.dtype)
 
 
 def _units_by_component(agent: Plant) -> list[tuple[str, ...]]:

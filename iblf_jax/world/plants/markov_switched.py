@@ -71,7 +71,14 @@ class MarkovSwitched:
     def check(self) -> None:
         """Raises ValueError for parameters or rates that do not fit the plant or each other."""
         modes = fit_modes(self)
-        self._check_rates(modes)
+        name = "MarkovSwitched.rates"
+        checks.shape_is(name, self.rates, (modes, modes))
+        if checks.is_concrete(self.rates):
+            Q = np.asarray(self.rates)
+            is_zero = np.abs(Q.sum(axis=1)) <= ROUNDING * np.max(np.abs(Q))
+            if np.any(Q - np.diag(np.diag(Q)) < 0) or not np.all(is_zero):
+                expected = "q_ij >= 0 for i != j, and rows of sum 0"
+                raise checks.fail(name, Q, expected, "Such as [[-0.5, 0.5], [1.0, -1.0]].")
         checks.positive_integer("MarkovSwitched.switches", self.switches, most=MOST_SWITCHES)
         checks.positive_integer("MarkovSwitched.start", self.start, least=0, most=modes - 1)
         shape = (self.switches + 1,)
@@ -81,19 +88,6 @@ class MarkovSwitched:
                 object.__setattr__(self, name, jnp.full(shape, value, self.rates.dtype))
                 continue
             checks.shape_is(f"MarkovSwitched.{name}", given, shape)
-
-    def _check_rates(self, modes: int) -> None:
-        """Raises ValueError for `rates` that are no transition rate matrix."""
-        name = "MarkovSwitched.rates"
-        checks.shape_is(name, self.rates, (modes, modes))
-        if not checks.is_concrete(self.rates):
-            return
-        Q = np.asarray(self.rates)
-        others = Q - np.diag(np.diag(Q))
-        is_zero = np.abs(Q.sum(axis=1)) <= ROUNDING * np.max(np.abs(Q))
-        if np.any(others < 0) or not np.all(is_zero):
-            expected = "q_ij >= 0 for i != j, and rows of sum 0"
-            raise checks.fail(name, Q, expected, "Such as [[-0.5, 0.5], [1.0, -1.0]].")
 
     @property
     def nominal(self) -> Any:
@@ -131,10 +125,7 @@ class MarkovSwitched:
         # Written out, XLA repeats the earlier switches in the code of every later one.
         start = jnp.zeros((), Q.dtype), jnp.full((), self.start, Q.dtype)
         _, (times, sequence) = jax.lax.scan(switch, start, uniforms.astype(Q.dtype))
-        return self._with(times, sequence)
-
-    def _with(self, times: jax.Array, sequence: jax.Array) -> MarkovSwitched:
-        """A copy with another path, without checks: its numbers may be traced."""
+        # A copy without checks: its numbers may be traced.
         new = copy.copy(self)
         object.__setattr__(new, "times", times)
         object.__setattr__(new, "sequence", sequence)

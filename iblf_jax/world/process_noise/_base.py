@@ -54,7 +54,7 @@ class ProcessNoise(Part):
         """
 
 
-def check_structure(noise: Any) -> None:
+def check_structure(noise: ProcessNoise) -> None:
     """Raises ValueError for levels that are not increasing whole numbers >= 1, or `substeps` that
     is not a whole number from 1 to `MOST_SUBSTEPS`.
     """

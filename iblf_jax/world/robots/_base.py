@@ -164,7 +164,7 @@ class Robot(Dynamics):
         return coriolis + gravity + matvec(self.mass_matrix(q), acceleration)
 
 
-def is_robot(part: Any) -> TypeGuard[Robot]:
+def is_robot(part: object) -> TypeGuard[Robot]:
     """Whether an object has a mass matrix.  A class without the base class is adopted."""
     if isinstance(part, type) or not has_members(part, "n", "mass_matrix"):
         return False
@@ -237,7 +237,7 @@ def coriolis_from_mass_matrix(mass_matrix, q: jax.Array, v: jax.Array, u: jax.Ar
     return 0.5 * (matvec(M_along_v, u) + matvec(M_along_u, v) - energy_gradient)
 
 
-def joint_names(robot: Any, n: int) -> tuple[str, ...]:
+def joint_names(robot: Robot, n: int) -> tuple[str, ...]:
     """Names of the n joints of a robot: its `joints`, else "joint 0", "joint 1", ..."""
     n = checks.positive_integer("n", n, least=0, most=checks.MAX_JOINTS)
     if is_robot(robot) and len(robot.joints) == n:
@@ -325,7 +325,7 @@ def planar_skeleton(lengths: jax.Array, q: jax.Array) -> jax.Array:
     return jnp.concatenate([jnp.zeros((1, 2), steps.dtype), jnp.cumsum(steps, axis=0)])
 
 
-def broadcast_fields(robot: Any, names: Iterable[str], shape: tuple[int, ...]) -> None:
+def broadcast_fields(robot: object, names: Iterable[str], shape: tuple[int, ...]) -> None:
     """Repeats the scalars among some fields of a robot; raises ValueError for any other shape."""
     for name, value in attributes(robot, names).items():
         if value.ndim == 0:

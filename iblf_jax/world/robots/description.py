@@ -14,7 +14,6 @@ import os
 import re
 import xml.etree.ElementTree as ET
 from pathlib import Path
-from typing import Any
 from xml.parsers import expat
 
 from iblf_jax.core import checks
@@ -125,7 +124,7 @@ class _Reader:
             depth -= 1
             builder.end(tag)
 
-        def doctype(*_: Any) -> None:
+        def doctype(*_: object) -> None:
             raise fail(
                 "it declares a document type or entities",
                 "A robot needs none: remove <!DOCTYPE ...>.",

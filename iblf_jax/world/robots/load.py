@@ -12,9 +12,10 @@ import os
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from iblf_jax.core import checks, notices
 from iblf_jax.world.robots import description, mjcf, urdf
@@ -31,7 +32,7 @@ def load(
     tip: str | None = None,
     *,
     locked: Mapping[str, float] | None = None,
-    gravity: Any = None,
+    gravity: ArrayLike | None = None,
     repair: bool = False,
 ) -> Arm:
     """The serial arm of a URDF or MJCF file.
@@ -198,7 +199,7 @@ class _Chain(NamedTuple):
             seen.add(name)
         return offset + factor * at.get(name, 0.0)
 
-    def arm(self, gravity: Any, file: urdf.Urdf | mjcf.Mjcf, repairs: Repairs) -> Arm:
+    def arm(self, gravity: ArrayLike | None, file: urdf.Urdf | mjcf.Mjcf, repairs: Repairs) -> Arm:
         """The Arm, in which each body is welded to the link that carries it."""
         tree = self.tree
         g = tree.gravity
@@ -224,7 +225,7 @@ class _Chain(NamedTuple):
         )
 
 
-def locked_position(name: str, value: Any) -> float:
+def locked_position(name: str, value: object) -> float:
     """The checked position of a locked joint [rad or m]."""
     number = checks.as_floats(f"locked[{name!r}]", value)
     checks.check_values(f"locked[{name!r}]", number, None)

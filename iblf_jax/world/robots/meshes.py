@@ -8,11 +8,14 @@ fault only of those bodies that need it.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from iblf_jax.core import checks
 from iblf_jax.core.attributes import attributes
 from iblf_jax.world.robots.description import Shown, contents
+
+if TYPE_CHECKING:
+    import mujoco
 
 LARGEST_MESHES = 512 << 20
 """Largest total size of the meshes of a model [bytes]."""
@@ -38,7 +41,7 @@ class Meshes:
     the others.
     """
 
-    def __init__(self, spec: Any, folder: Path, bare: bool) -> None:
+    def __init__(self, spec: mujoco.MjSpec, folder: Path, bare: bool) -> None:
         """`spec` is the library's, parsed; the files lie in `folder`, under their bare names if
         `bare`.
         """
@@ -50,7 +53,7 @@ class Meshes:
         """Name of a file for the library -> its content."""
         self.problems: dict[str, ValueError | None] = {}
 
-    def problem(self, geom: Any) -> ValueError | None:
+    def problem(self, geom: mujoco.MjsGeom) -> ValueError | None:
         """Why a geom with a mesh cannot be weighed; None if it can, and then the mesh stays."""
         shape = repr(list(attributes(geom, OF_GEOM).values()))
         if shape not in self.problems:
@@ -73,7 +76,7 @@ class Meshes:
                 self.spec.delete(mesh)
         self.spec.assets = self.files
 
-    def _weigh(self, geom: Any) -> None:
+    def _weigh(self, geom: mujoco.MjsGeom) -> None:
         """Raises unless the library can weigh the geom."""
         if geom.hfieldname or geom.meshname not in self.meshes:
             got = geom.meshname
@@ -105,7 +108,7 @@ class Meshes:
                 f"mesh {mesh.name!r}", got, "a surface around a volume", f"{reason}. {REMEDY}"
             ) from None
 
-    def _open(self, mesh: Any) -> Path | None:
+    def _open(self, mesh: mujoco.MjsMesh) -> Path | None:
         """Reads the file of a mesh, if it has one."""
         if not mesh.file:
             return None

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -28,6 +28,9 @@ from iblf_jax.world.robots.description import (
 )
 from iblf_jax.world.robots.meshes import Meshes
 from iblf_jax.world.robots.repair import Fault, Weight, checked_weight, symmetric
+
+if TYPE_CHECKING:
+    import mujoco
 
 PLACE = "pos quat axisangle xyaxes zaxis euler"
 ACTUATOR = "name class joint gear ctrlrange ctrllimited forcerange forcelimited inheritrange"
@@ -109,7 +112,7 @@ class Mjcf(NamedTuple):
     speeds: dict[str, float] = {}  # noqa: RUF012
     """Joint -> its largest speed, which an MJCF does not have."""
 
-    def separate_weights(self, spec: Any) -> list[tuple[Any, Weight]]:
+    def separate_weights(self, spec: mujoco.MjSpec) -> list[tuple[Any, Weight]]:
         """Replaces every weight that the library would reject or cannot know by a valid one, and
         returns the weights of the file.
 
@@ -197,17 +200,13 @@ def _copy(source: ET.Element, target: ET.Element, section: str) -> None:
             kept = COUPLING
         attributes = {name: text for name, text in element.items() if name in kept.split()}
         for name, text in attributes.items():
-            if name not in WORDS.split() and text not in SWITCHES:
-                _check_numbers(f"{label(element)}: {name}", name, text)
+            if name in WORDS.split() or text in SWITCHES:
+                continue
+            count = 1 if name in SCALAR_ATTRIBUTES.split() else None
+            most = MAX_RANGE if name in RANGE_ATTRIBUTES.split() else LARGEST_NUMBER
+            longest = MAX_BYTES if name in LONG_ATTRIBUTES.split() else MAX_NUMBERS
+            floats(f"{label(element)}: {name}", text, count, most=most, longest=longest)
         _copy(element, ET.SubElement(target, tag, attributes), section or tag)
-
-
-def _check_numbers(where: str, name: str, text: str) -> None:
-    """Raises ValueError unless an attribute holds numbers within its limits."""
-    count = 1 if name in SCALAR_ATTRIBUTES.split() else None
-    most = MAX_RANGE if name in RANGE_ATTRIBUTES.split() else LARGEST_NUMBER
-    longest = MAX_BYTES if name in LONG_ATTRIBUTES.split() else MAX_NUMBERS
-    floats(where, text, count, most=most, longest=longest)
 
 
 def _tendons(root: ET.Element) -> Tendons:
@@ -223,7 +222,7 @@ def _tendons(root: ET.Element) -> Tendons:
     return ties
 
 
-def _explicit(body: Any, where: str, balanced: bool) -> Weight | None:
+def _explicit(body: mujoco.MjsBody, where: str, balanced: bool) -> Weight | None:
     """The weight in a body's <inertial>, zero if it has none; None if the library accepts it."""
     if not body.explicitinertial:
         return Weight()

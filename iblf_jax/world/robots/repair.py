@@ -17,7 +17,7 @@ mass m and the length L of the longest link of the chain: it becomes a compact b
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -47,7 +47,7 @@ class Fault(NamedTuple):
 
 
 def fault(
-    field: str, got: Any, expected: str, repaired: str = "", *, remedy: str = "", where: str = ""
+    field: str, got: object, expected: str, repaired: str = "", *, remedy: str = "", where: str = ""
 ) -> Fault:
     """A fault with its error.
 

@@ -6,7 +6,8 @@ Quantities are NumPy arrays in float64.  A pose is (position, rotation matrix).
 from __future__ import annotations
 
 import difflib
-from typing import Any
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,6 +17,9 @@ from iblf_jax.world.robots.links import Links, Pose
 from iblf_jax.world.robots.mjcf import Mjcf, Tendons
 from iblf_jax.world.robots.repair import Fault, Repairs, Weight, fault, second_moments
 from iblf_jax.world.robots.urdf import Urdf
+
+if TYPE_CHECKING:
+    import mujoco
 
 FREE, BALL, SLIDE, HINGE = range(4)
 KINDS = {HINGE: "revolute", SLIDE: "prismatic"}
@@ -39,7 +43,9 @@ def mujoco_package() -> Any:
 class Tree:
     """A compiled model whose bodies, joints and sites are found by name."""
 
-    def __init__(self, model: Any, mujoco: Any, root: str, weights: dict[int, Weight]):
+    def __init__(
+        self, model: mujoco.MjModel, mujoco: ModuleType, root: str, weights: dict[int, Weight]
+    ):
         self.model = model
         self.weights = weights
         """Body -> its mass and inertia in its inertial frame, where these are not the model's."""
@@ -349,7 +355,7 @@ class Tree:
             repairs.handle(fault(where, Shown(tied), "an open chain", repaired, remedy=remedy))
 
 
-def unknown(what: str, name: Any, expected: str, known: list[str]) -> ValueError:
+def unknown(what: str, name: str, expected: str, known: list[str]) -> ValueError:
     """An error that lists similar names, or the first names if none is similar."""
     known = list(dict.fromkeys(known))  # the root and a body of the file may have the same name
     near = difflib.get_close_matches(str(name), known, n=3) or known[:12]

@@ -8,7 +8,7 @@ only for the links and joints of the chain.
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -16,6 +16,9 @@ from iblf_jax.core import checks
 from iblf_jax.world.robots.description import MAX_BODIES, MAX_RANGE, Shown, floats, label
 from iblf_jax.world.robots.mjcf import Tendons
 from iblf_jax.world.robots.repair import Fault, Weight, checked_weight, fault, symmetric
+
+if TYPE_CHECKING:
+    import mujoco
 
 MOVABLE = ("revolute", "continuous", "prismatic")
 INERTIA = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
@@ -58,7 +61,7 @@ class Urdf(NamedTuple):
     tendons: Tendons = {}  # noqa: RUF012
     """Constraints on tendons; a URDF has none."""
 
-    def separate_weights(self, spec: Any) -> list[tuple[Any, Weight]]:
+    def separate_weights(self, spec: mujoco.MjSpec) -> list[tuple[Any, Weight]]:
         """The library's bodies with their weights.
 
         The copy does not contain them, because the library would also reject faults of bodies that

@@ -35,7 +35,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 
-from iblf_jax.deployment.ros2.node.c_law import FLAGS, CLaw, GainEntry, load_law, why_refused
+from iblf_jax.deployment.ros2.node.c_law import FLAGS, CLaw, load_law, why_refused
 from iblf_jax.deployment.ros2.node.monitor import LoopMonitor
 from iblf_jax.deployment.ros2.node.supervisor import (
     ARRIVAL_TIMEOUT,
@@ -44,6 +44,7 @@ from iblf_jax.deployment.ros2.node.supervisor import (
     UNKNOWN,
     Command,
     Configuration,
+    Fault,
     FaultKind,
     Mode,
     Sender,
@@ -71,7 +72,7 @@ class RefusedError(ValueError):
     """A parameter with which the node does not start."""
 
 
-def refused(field: str, value: Any, expected: str, remedy: str) -> RefusedError:
+def refused(field: str, value: object, expected: str, remedy: str) -> RefusedError:
     """An error that names the parameter, its value, the expected value and the remedy."""
     return RefusedError(f"{field}: got {value}, expected {expected}. {remedy}")
 
@@ -205,8 +206,12 @@ class LawNode(Node):  # type: ignore[misc]
         for gain in self.gains.values():
             values = self.law.gain(gain.path)
             default: Any = values[0] if gain.is_scalar else values
+            # The descriptor of an array has one range, which contains those of its numbers.
+            span = FloatingPointRange(from_value=min(gain.low), to_value=max(gain.high))
+            text = f"[{gain.unit}], from {list(gain.low)} to {list(gain.high)}"
+            descriptor = ParameterDescriptor(description=text, floating_point_range=[span])
             try:
-                value = self.declare_parameter(gain.path, default, _descriptor(gain)).value
+                value = self.declare_parameter(gain.path, default, descriptor).value
             except (InvalidParameterTypeException, InvalidParameterValueException) as error:
                 limits = f"values from {list(gain.low)} to {list(gain.high)} [{gain.unit}]"
                 raise refused(gain.path, error, limits, DECIMAL_POINT) from None
@@ -292,21 +297,17 @@ class LawNode(Node):  # type: ignore[misc]
 
     def _on_timer(self) -> None:
         """A command a period; the law computes new torques if a new state has arrived."""
-        missed = self._missed_periods()
-        self._catch_up()
-        command = self.supervisor.command(monotonic_ns(), self._clock_of_stamps())
-        if command is not None:
-            self._publish(command, missed)
-
-    def _missed_periods(self) -> int:
-        """Periods without a tick of the timer since the last tick."""
         now = monotonic_ns()
         # The timer keeps its own grid: what remains until the next tick gives the tick's place.
         place = now + self._timer.time_until_next_call()
         before, self._tick = self._tick, place
-        if before is None:
-            return 0
-        return max(round((place - before) / self._period) - 1, 0)
+        missed = 0
+        if before is not None:
+            missed = max(round((place - before) / self._period) - 1, 0)
+        self._catch_up()
+        command = self.supervisor.command(monotonic_ns(), self._clock_of_stamps())
+        if command is not None:
+            self._publish(command, missed)
 
     def _catch_up(self) -> None:
         """Takes the states that wait in the queue, if the last one is stale: this process may have
@@ -341,26 +342,22 @@ class LawNode(Node):  # type: ignore[misc]
     def _send(self, command: Command) -> None:
         self._efforts.data[:] = array("d", command.torque)
         self._publisher.publish(self._efforts)
-        if command.mode is not self._logged_mode:
-            self._log_mode(command.mode)
-
-    def _log_mode(self, mode: Mode) -> None:
-        """Logs a changed mode; a fault with its reason."""
+        mode = command.mode
+        if mode is self._logged_mode:
+            return
         self._logged_mode = mode
         fault = self.supervisor.last_fault
-        if mode is Mode.FAULT and fault is not None:
-            text = _fault_text(fault)
-            if fault.kind is FaultKind.PUBLISHER:
-                text += f" (publishers of joint_states: {', '.join(self._nodes_of_states())})"
-            policy = self.supervisor.configuration.on_fault
-            self.get_logger().error(f"{text}; torques by the policy {policy!r}.")
-        else:
+        if mode is not Mode.FAULT or fault is None:
             self.get_logger().info(f"The mode is {mode.value}.")
-
-    def _nodes_of_states(self) -> list[str]:
-        """The nodes that publish joint_states; the ended ones too, for some seconds."""
-        found = self.get_publishers_info_by_topic(self._states.topic_name)
-        return [f"{x.node_namespace.rstrip('/')}/{x.node_name}" for x in found]
+            return
+        text = _fault_text(fault)
+        if fault.kind is FaultKind.PUBLISHER:
+            # Nodes that have ended are among these for some seconds.
+            found = self.get_publishers_info_by_topic(self._states.topic_name)
+            nodes = [f"{x.node_namespace.rstrip('/')}/{x.node_name}" for x in found]
+            text += f" (publishers of joint_states: {', '.join(nodes)})"
+        policy = self.supervisor.configuration.on_fault
+        self.get_logger().error(f"{text}; torques by the policy {policy!r}.")
 
     def send_final_command(self) -> None:
         """Publishes the torques of the fault policy before the node ends."""
@@ -445,7 +442,7 @@ class LawNode(Node):  # type: ignore[misc]
         return DiagnosticStatus.WARN if is_warning else DiagnosticStatus.OK
 
 
-def _fault_text(fault: Any) -> str:
+def _fault_text(fault: Fault) -> str:
     return f"{fault.kind.value}: {fault.reason}"
 
 
@@ -495,7 +492,7 @@ def _numbers(value: Any) -> list[float]:
     return []
 
 
-def _why_refused_origin(value: Any) -> str:
+def _why_refused_origin(value: object) -> str:
     """Why a value of `time_origin` is refused; empty if it is valid."""
     if isinstance(value, float) and (math.isnan(value) or abs(value) < LARGEST_STAMP):
         return ""
@@ -506,13 +503,6 @@ def _why_refused_origin(value: Any) -> str:
 def _origin(seconds: float) -> int | None:
     """A stamp [ns] from seconds; None for NaN."""
     return None if math.isnan(seconds) else round(seconds * NANOSECONDS)
-
-
-def _descriptor(gain: GainEntry) -> ParameterDescriptor:
-    """The descriptor of a gain; an array has one range that contains those of its numbers."""
-    span = FloatingPointRange(from_value=min(gain.low), to_value=max(gain.high))
-    text = f"[{gain.unit}], from {list(gain.low)} to {list(gain.high)}"
-    return ParameterDescriptor(description=text, floating_point_range=[span])
 
 
 def _one_of(name: str, value: str, allowed: Sequence[str]) -> None:
@@ -540,7 +530,7 @@ def _spin(executor: Any) -> None:
     """Runs the callbacks of an executor until a signal asks the process to end."""
     ended = [False]
 
-    def end(*_: Any) -> None:
+    def end(*_: object) -> None:
         ended[0] = True
 
     for number in SIGNALS:

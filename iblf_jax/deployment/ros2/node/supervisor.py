@@ -174,9 +174,13 @@ class JointReader:
                 return fault
         if not self._places:
             return None
-        fault = self._wrong_lengths(len(names), len(position), len(velocity))
-        if fault is not None:
-            return fault
+        if len(position) != len(names):
+            reason = f"the state has {len(names)} names and {len(position)} positions"
+            return Fault(FaultKind.JOINTS, reason)
+        is_without = len(velocity) == 0 and not self.reads_velocity
+        if len(velocity) != len(names) and not is_without:
+            reason = f"the state has {len(names)} names and {len(velocity)} velocities"
+            return Fault(FaultKind.JOINTS, reason)
         q = tuple([position[i] for i in self._places])
         dq = None
         if len(velocity):
@@ -204,15 +208,6 @@ class JointReader:
             self._places = tuple(names.index(name) for name in self.joints)
         self._names = list(names)
         return None
-
-    def _wrong_lengths(self, names: int, positions: int, velocities: int) -> Fault | None:
-        if positions != names:
-            reason = f"the state has {names} names and {positions} positions"
-            return Fault(FaultKind.JOINTS, reason)
-        if velocities == names or (velocities == 0 and not self.reads_velocity):
-            return None
-        reason = f"the state has {names} names and {velocities} velocities"
-        return Fault(FaultKind.JOINTS, reason)
 
 
 class Supervisor:
@@ -339,9 +334,13 @@ class Supervisor:
         self._why_invalid = None
         spacing = MIN_STAMP_SPACING * self._period
         if last is not None:
-            self._check_gap(state.stamp - last)
+            gap = state.stamp - last
+            if gap > self._stamp_timeout + STAMP_TOLERANCE * self._period:
+                self._hold_position = None
+                reason = f"the stamps of two states are {gap / NANOSECONDS:g} s apart"
+                self._report(Fault(FaultKind.STALE, reason))
             # Of the states of a faster driver, the one closest to a whole period is answered.
-            spacing = max(spacing, self._period - (state.stamp - last) / 2)
+            spacing = max(spacing, self._period - gap / 2)
         due = self._due_stamp
         if due is not None and state.stamp - due < spacing:
             return False
@@ -349,13 +348,6 @@ class Supervisor:
             self.missed += max(round((state.stamp - due) / self._period) - 1, 0)
         self._due_stamp = state.stamp
         return True
-
-    def _check_gap(self, gap: int) -> None:
-        """A fault for states that are further apart than the longest age."""
-        if gap > self._stamp_timeout + STAMP_TOLERANCE * self._period:
-            self._hold_position = None
-            reason = f"the stamps of two states are {gap / NANOSECONDS:g} s apart"
-            self._report(Fault(FaultKind.STALE, reason))
 
     def _report(self, fault: Fault) -> None:
         """A fault of a state; it changes the mode only while torques depend on the states."""
@@ -439,7 +431,9 @@ class Supervisor:
             self.repeated += 1
             torque, status = self._law_result
             return list(torque), status
-        t = self._time_of_law(state)
+        if self.started_at is None:
+            raise RuntimeError("started_at: got None, expected a stamp while the law runs.")
+        t = (state.stamp - self.started_at) / NANOSECONDS
         torque, status = self.law.step(t, state.position, state.velocity)
         if status & NOT_FINITE:
             self._enter_fault(
@@ -454,12 +448,6 @@ class Supervisor:
         for i, x in enumerate(state.position):
             margin[i] = min(margin[i], x - lower[i], upper[i] - x)
         return torque, status
-
-    def _time_of_law(self, state: JointSample) -> float:
-        """The time of a state since the start of reference and bounds [s]."""
-        if self.started_at is None:
-            raise RuntimeError("started_at: got None, expected a stamp while the law runs.")
-        return (state.stamp - self.started_at) / NANOSECONDS
 
     def _torque_without_law(self, is_current: bool) -> list[float]:
         """The torques of the modes without the law.
@@ -483,22 +471,19 @@ class Supervisor:
             return torque
         if self._hold_position is None:
             self._hold_position = state.position
-        velocity = self._velocity(state)
+        # Without a measured velocity, the difference quotient of the last two states.
+        velocity: Sequence[float] | None = state.velocity
+        before = self._previous
+        if velocity is None:
+            velocity = self._zero
+            if before is not None and state.stamp > before.stamp:
+                duration = (state.stamp - before.stamp) / NANOSECONDS
+                pairs = zip(state.position, before.position, strict=True)
+                velocity = [(x - y) / duration for x, y in pairs]
         for i, q in enumerate(state.position):
             torque[i] += self.configuration.hold_stiffness[i] * (self._hold_position[i] - q)
             torque[i] -= self.configuration.hold_damping[i] * velocity[i]
         return torque
-
-    def _velocity(self, state: JointSample) -> Sequence[float]:
-        """The measured velocities, or the difference quotient of the last two states [rad/s]."""
-        if state.velocity is not None:
-            return state.velocity
-        before = self._previous
-        if before is None or state.stamp <= before.stamp:
-            return self._zero
-        duration = (state.stamp - before.stamp) / NANOSECONDS
-        pairs = zip(state.position, before.position, strict=True)
-        return [(x - y) / duration for x, y in pairs]
 
     def _limited(self, torque: list[float], status: int) -> Command:
         """The command with every torque within its limits; NaN becomes 0."""
