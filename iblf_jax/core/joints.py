@@ -24,13 +24,18 @@ from iblf_jax.core import checks
 Selection: TypeAlias = "tuple[int | str, ...] | None"
 """Indices, names, slices as text, or truth values; None for all joints."""
 
+Joints: TypeAlias = (
+    "int | str | slice | Sequence[int | str | slice | bool] | jax.Array | np.ndarray | None"
+)
+"""What users give for `joints=`."""
+
 EXPECTED = "indices, names or a slice of joints, or one truth value for each joint"
 WEIGHTS = "Weights have an argument of their own, weights=."
 SLICE = re.compile(r"(-?\d+)?:(-?\d+)?(?::(-?\d+)?)?")
 """A slice as text."""
 
 
-def selection(field: str, joints: Any) -> Selection:
+def selection(field: str, joints: Joints) -> Selection:
     """A user's selection as a hashable tuple, with all checks that do not need the robot.
 
     Args:
