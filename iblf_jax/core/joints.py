@@ -62,7 +62,7 @@ def selection(field: str, joints: Joints) -> Selection:
     return found
 
 
-def _entries(field: str, joints: Any) -> Sequence[Any]:
+def _entries(field: str, joints: object) -> Sequence[Any]:
     if isinstance(joints, bool | np.bool_):
         raise checks.fail(
             field, joints, EXPECTED, "Give one truth value for each joint, in a list."
@@ -79,7 +79,7 @@ def _entries(field: str, joints: Any) -> Sequence[Any]:
     raise checks.fail(field, joints, EXPECTED)
 
 
-def _entry(field: str, joints: Any, entry: Any) -> int | str:
+def _entry(field: str, joints: object, entry: object) -> int | str:
     if isinstance(entry, bool | np.bool_):
         return bool(entry)
     if isinstance(entry, int | np.integer):
