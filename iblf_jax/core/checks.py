@@ -79,7 +79,7 @@ def given(part: T | None) -> T:
     return part
 
 
-def is_concrete(value: Any) -> bool:
+def is_concrete(value: object) -> bool:
     """Whether every leaf of `value` is a number now, rather than a tracer or a placeholder."""
     if is_deep(value):
         return True
@@ -90,7 +90,7 @@ def is_concrete(value: Any) -> bool:
     return not any(isinstance(leaf, jax.core.Tracer) for leaf in leaves)
 
 
-def is_deep(value: Any) -> bool:
+def is_deep(value: object) -> bool:
     """Whether lists, tuples and dicts are nested more deeply than in any array or file of this
     package.
 
@@ -115,7 +115,7 @@ def _containers(values: Iterable[Any]) -> dict[int, Any]:
     return {id(x): x for x in values if isinstance(x, list | tuple | dict)}
 
 
-def flat_enough(name: str, value: Any) -> None:
+def flat_enough(name: str, value: object) -> None:
     """Raises for lists, tuples and dicts nested so deeply that JAX must not see them."""
     if is_deep(value):
         raise fail(name, value, f"at most {MAX_DEPTH} lists inside each other")
@@ -133,7 +133,7 @@ def one_line(text: str, part: str = "words") -> str:
     return text
 
 
-def shown(value: Any) -> str:
+def shown(value: object) -> str:
     """A value as an error message quotes it."""
     if not is_concrete(value):
         return "a value that JAX is tracing"
@@ -150,7 +150,7 @@ def shown(value: Any) -> str:
     return one_line(text, "value")
 
 
-def fail(field: str, got: Any, expected: str, remedy: str = "") -> ValueError:
+def fail(field: str, got: object, expected: str, remedy: str = "") -> ValueError:
     """The one form of error message: field, value, expectation and remedy, in one line."""
     text = f"{one_line(field, 'field')}: got {shown(got)}, expected {one_line(expected)}."
     if remedy:
@@ -158,7 +158,7 @@ def fail(field: str, got: Any, expected: str, remedy: str = "") -> ValueError:
     return ValueError(text)
 
 
-def nearest(name: Any, known: Iterable[str]) -> str:
+def nearest(name: object, known: Iterable[str]) -> str:
     """The remedy for a misspelt or a former word; nothing where no known word is near."""
     given, words = str(name)[: LONGEST_TEXT["value"]], list(map(str, known))
     present, form = former_names.ARGUMENTS.get(given, ("", ""))
@@ -168,7 +168,7 @@ def nearest(name: Any, known: Iterable[str]) -> str:
     return f"Did you mean {' or '.join(close)}?" if close else ""
 
 
-def did_you_mean(name: Any, known: Iterable[str]) -> str:
+def did_you_mean(name: object, known: Iterable[str]) -> str:
     """The remedy for a misspelt word: the nearest known ones, or all of them."""
     words = [str(word) for word in known]
     return nearest(name, words) or f"There are: {', '.join(words)}." if words else ""
@@ -269,7 +269,7 @@ def with_location(where: str | os.PathLike, error: Exception) -> ValueError:
     return ValueError(f"{one_line(name, 'field')}: {error}")
 
 
-def _is_number_like(value: Any, depth: int = 0) -> bool:
+def _is_number_like(value: object, depth: int = 0) -> bool:
     """Whether this is a number, an array, or nested lists and tuples of such."""
     if isinstance(value, list | tuple):
         return depth < MAX_DEPTH and all(_is_number_like(x, depth + 1) for x in value)
@@ -284,7 +284,7 @@ MAX_AXES = {
 """Shape of a leaf -> largest number of its axes, and what is expected."""
 
 
-def as_leaf(owner: str, field: dataclasses.Field, value: Any) -> Any:
+def as_leaf(owner: str, field: dataclasses.Field, value: object) -> Any:
     """Converts a user's value for a leaf field to a floating-point array and checks it.
 
     A field that was not declared with `leaf` is converted too if it holds numbers, and is otherwise
@@ -319,7 +319,7 @@ def as_leaf(owner: str, field: dataclasses.Field, value: Any) -> Any:
     return array
 
 
-def _with_equal_rows(name: str, value: Any) -> Any:
+def _with_equal_rows(name: str, value: object) -> Any:
     """The rows of a leaf of the shape "level", where some are single numbers and some have one
     number a joint: each with one number a joint.
     """
@@ -336,7 +336,7 @@ def _with_equal_rows(name: str, value: Any) -> Any:
         return jnp.stack([jnp.broadcast_to(row, shape) for row in rows])
 
 
-def as_floats(name: str, value: Any) -> jax.Array:
+def as_floats(name: str, value: object) -> jax.Array:
     """An array of floating-point numbers, or a ValueError that names the field."""
     flat_enough(name, value)
     try:
@@ -351,7 +351,7 @@ def as_floats(name: str, value: Any) -> jax.Array:
     raise fail(name, value, "real numbers", f"Its type is {array.dtype}.")
 
 
-def _as_array(value: Any) -> jax.Array:
+def _as_array(value: object) -> jax.Array:
     """The array of a value.  `jnp.asarray` compiles a program for every new shape, 20 ms each, so
     numbers of the host are put on the device as they are.
     """
@@ -391,7 +391,7 @@ SIGNS_TO_CHECK = {
 """Declared sign of a leaf -> the entries of `SIGNS` that its numbers must satisfy."""
 
 
-def check_values(name: str, array: Any, sign: str | None) -> None:
+def check_values(name: str, array: object, sign: str | None) -> None:
     """Raises if a concrete array has a NaN, an infinity or a number of the wrong sign."""
     if array is None or isinstance(array, jax.core.Tracer):
         return
@@ -402,7 +402,7 @@ def check_values(name: str, array: Any, sign: str | None) -> None:
             raise fail(name, array, expected, remedy)
 
 
-def structural(owner: str, name: str, value: Any) -> None:
+def structural(owner: str, name: str, value: object) -> None:
     """Raises if the value of a static field is an array or cannot be hashed."""
     try:
         if isinstance(value, jax.Array | np.ndarray):
@@ -426,7 +426,7 @@ PUBLIC_MODULES = {
 """Module with the base class of a family -> where users find it."""
 
 
-def conforms(name: str, value: Any, base: type, remedy: str = "") -> None:
+def conforms(name: str, value: object, base: type, remedy: str = "") -> None:
     """Raises unless `value` is an object that JAX can flatten and that has what the family `base`
     requires; its class is then adopted by the family.
     """
@@ -451,7 +451,7 @@ def conforms(name: str, value: Any, base: type, remedy: str = "") -> None:
     adopt(type(value), base)
 
 
-def _is_plain(value: Any) -> bool:
+def _is_plain(value: object) -> bool:
     """Whether this is None, a word, a container of Python's, or numbers: no object with members."""
     return (
         value is None
@@ -460,7 +460,9 @@ def _is_plain(value: Any) -> bool:
     )
 
 
-def offers(name: str, value: Any, members: Sequence[str], expected: str, remedy: str = "") -> None:
+def offers(
+    name: str, value: object, members: Sequence[str], expected: str, remedy: str = ""
+) -> None:
     """Raises unless `value` is an object, not a class, an array or a word, that has these methods
     or fields.
     """
@@ -496,7 +498,7 @@ TRACED = (
 )
 
 
-def positive_number(name: str, value: Any, unit: str, zero: bool = False) -> float:
+def positive_number(name: str, value: object, unit: str, zero: bool = False) -> float:
     """A finite positive Python float (or 0, if that may be) from a user's argument, or a
     ValueError.
     """
@@ -509,7 +511,7 @@ def positive_number(name: str, value: Any, unit: str, zero: bool = False) -> flo
     return number
 
 
-def _as_float(value: Any) -> float:
+def _as_float(value: object) -> float:
     """A real number, or an array of one, as a Python float; NaN for everything else."""
     if isinstance(value, np.generic | np.ndarray | jax.Array):
         is_real = jnp.issubdtype(value.dtype, np.number) and not jnp.iscomplexobj(value)
@@ -523,7 +525,7 @@ def _as_float(value: Any) -> float:
 
 
 def number_between(
-    name: str, value: Any, least: float, most: float, unit: str, remedy: str = ""
+    name: str, value: object, least: float, most: float, unit: str, remedy: str = ""
 ) -> float:
     """A Python float from `least` >= 0 to `most` from a user's argument, or a ValueError."""
     number = math.nan
@@ -534,7 +536,7 @@ def number_between(
     return number
 
 
-def time_span(name: str, value: Any, zero: bool = False) -> float:
+def time_span(name: str, value: object, zero: bool = False) -> float:
     """A duration, period or delay [s] from a user's argument, or a ValueError.
 
     It lies between the shortest and the longest that a robot has.
@@ -545,7 +547,7 @@ def time_span(name: str, value: Any, zero: bool = False) -> float:
     return number_between(name, seconds, SHORTEST_TIME, LONGEST_TIME, "s", "Times are in seconds.")
 
 
-def _is_integer(value: Any) -> bool:
+def _is_integer(value: object) -> bool:
     """Whether this is a whole number of Python or NumPy, and no truth value."""
     return isinstance(value, numbers.Integral) and not isinstance(value, bool | np.bool_)
 
@@ -605,7 +607,7 @@ def memory() -> int:
         return 16 * 2**30
 
 
-def boolean(name: str, value: Any, optional: bool = False) -> Any:
+def boolean(name: str, value: object, optional: bool = False) -> Any:
     """True or False (or None, if that may be) from a user's argument, or a ValueError."""
     if value is None and optional:
         return None
@@ -614,21 +616,21 @@ def boolean(name: str, value: Any, optional: bool = False) -> Any:
     return bool(value)
 
 
-def string(name: str, value: Any, what: str) -> str:
+def string(name: str, value: object, what: str) -> str:
     """A string from a user's argument, or a ValueError."""
     if not isinstance(value, str):
         raise fail(name, value, what)
     return value
 
 
-def mapping(name: str, value: Any, example: str) -> Mapping[str, Any]:
+def mapping(name: str, value: object, example: str) -> Mapping[str, Any]:
     """`value` if it is a mapping from words, else a ValueError."""
     if not isinstance(value, Mapping) or not all(isinstance(key, str) for key in value):
         raise fail(name, value, f"a mapping from words such as {example}")
     return value
 
 
-def nonempty_list(name: str, value: Any, example: str) -> list[Any]:
+def nonempty_list(name: str, value: object, example: str) -> list[Any]:
     """The entries of a list or tuple that has some, else a ValueError."""
     if not isinstance(value, list | tuple) or not value:
         raise fail(name, value, f"a list such as {example}")
@@ -673,7 +675,7 @@ def file_path(name: str, value: Any, what: str = "a file") -> Path:
     return Path(text)
 
 
-def file_to_read(name: str, value: Any, what: str = "a file") -> Path:
+def file_to_read(name: str, value: object, what: str = "a file") -> Path:
     """The path of a file that is there, or a ValueError; a MissingFileError where nothing is."""
     path = file_path(name, value, what)
     expected = f"the path of {what}"
@@ -702,7 +704,7 @@ class MissingFileError(FileNotFoundError, ValueError):
     """
 
 
-def file_to_write(name: str, value: Any, what: str = "a file") -> Path:
+def file_to_write(name: str, value: object, what: str = "a file") -> Path:
     """A path where a file can be written, or a ValueError; a MissingFileError where its folder does
     not exist.
     """
@@ -718,7 +720,7 @@ def file_to_write(name: str, value: Any, what: str = "a file") -> Path:
     return path
 
 
-def folder_to_write(name: str, value: Any) -> Path:
+def folder_to_write(name: str, value: object) -> Path:
     """The path of a folder that is there or can be made, or a ValueError.
 
     Files can be written there.
@@ -748,7 +750,7 @@ def _can_be_written(name: str, path: Path, folder: Path, expected: str) -> None:
         raise UnwritableError(fail(name, str(path), expected, remedy)) from None
 
 
-def whole_steps(duration: Any, dt: Any, *, dt_is_free: bool = True) -> int:
+def whole_steps(duration: object, dt: object, *, dt_is_free: bool = True) -> int:
     """The number of steps of size `dt` in `duration`, or a ValueError that proposes a duration, or
     a dt if that is free.
     """
@@ -769,7 +771,7 @@ def whole_steps(duration: Any, dt: Any, *, dt_is_free: bool = True) -> int:
     return steps
 
 
-def recorded_every(value: Any, steps: int) -> int:
+def recorded_every(value: object, steps: int) -> int:
     """The interval of the recorded samples in steps, as an int32 of the compiled loops.
 
     All numbers beyond the last step have the same effect: only the first instant is recorded. A

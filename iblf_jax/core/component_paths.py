@@ -67,7 +67,7 @@ def _token(match: re.Match | None) -> str | int | None:
         return None
 
 
-def resolve(part: Any, path: str) -> tuple[list[str | int], Any]:
+def resolve(part: object, path: str) -> tuple[list[str | int], Any]:
     """Fields and indices of the path of a leaf of a component, and the value there.
 
     The names of wrapped components are inserted, and the name of a row becomes an index.
@@ -96,7 +96,7 @@ def resolve(part: Any, path: str) -> tuple[list[str | int], Any]:
     return found, value
 
 
-def steps_of(part: Any, tokens: list[str | int]) -> tuple[list[str | int], list[str | int]]:
+def steps_of(part: object, tokens: list[str | int]) -> tuple[list[str | int], list[str | int]]:
     """The fields and indices of the first tokens of a path in a component, and the tokens that are
     left.
     """
@@ -127,7 +127,7 @@ def steps_of(part: Any, tokens: list[str | int]) -> tuple[list[str | int], list[
     return [token], tokens[1:]
 
 
-def rows_of(part: Any, names: Sequence[str]) -> list[list[Any]]:
+def rows_of(part: object, names: Sequence[str]) -> list[list[Any]]:
     """The steps to each row of a stack of leaves, of which the last one has several rows; none if
     the component does not have it.
     """
@@ -163,7 +163,16 @@ def member_of(part: Any, step: str | int) -> Any:
 def replaced(part: Any, tokens: list[str | int], value: Any, path: str, sign: str | None) -> Any:
     """A copy of `part` with the leaf at `tokens` replaced: checked, and of the same structure."""
     if not tokens or isinstance(part, NUMBERS):
-        return _new_value(part, tokens, value, path, sign)
+        old = jnp.asarray(part)
+        index = tuple(t for t in tokens if isinstance(t, int))
+        shape = old[index].shape if index else old.shape
+        new = checks.as_floats(path, value)
+        if new.shape not in ((), shape):
+            expected = f"one number or shape {shape}"
+            raise checks.fail(path, value, expected, f"Its shape is {new.shape}.")
+        checks.check_values(path, new, sign)
+        new = jnp.broadcast_to(new, shape).astype(old.dtype)
+        return old.at[index].set(new) if index else new
     head, rest = tokens[0], tokens[1:]
     if modules.is_module(part):
         entry = replaced(member_of(part, head), rest, value, path, None)
@@ -177,18 +186,3 @@ def replaced(part: Any, tokens: list[str | int], value: Any, path: str, sign: st
     member = replaced(vars(part)[head], rest, value, path, sign)
     object.__setattr__(changed, head, member)
     return changed
-
-
-def _new_value(
-    old: Any, tokens: list[str | int], value: Any, path: str, sign: str | None
-) -> jax.Array:
-    """The new array of a leaf of which all, or one entry, is replaced."""
-    old = jnp.asarray(old)
-    index = tuple(t for t in tokens if isinstance(t, int))
-    shape = old[index].shape if index else old.shape
-    new = checks.as_floats(path, value)
-    if new.shape not in ((), shape):
-        raise checks.fail(path, value, f"one number or shape {shape}", f"Its shape is {new.shape}.")
-    checks.check_values(path, new, sign)
-    new = jnp.broadcast_to(new, shape).astype(old.dtype)
-    return old.at[index].set(new) if index else new

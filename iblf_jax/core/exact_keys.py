@@ -63,7 +63,7 @@ class Identity:
 
     __slots__ = ("value",)
 
-    def __init__(self, value: Any) -> None:
+    def __init__(self, value: object) -> None:
         self.value = value
 
     def __eq__(self, other: object) -> bool:
@@ -73,7 +73,7 @@ class Identity:
         return object.__hash__(self.value)
 
 
-def exact_key(value: Any) -> Hashable:
+def exact_key(value: object) -> Hashable:
     """The key of a static value (head of this module)."""
     return _Keys().of(value, None)
 
@@ -84,7 +84,7 @@ class _Keys:
     def __init__(self) -> None:
         self._described: dict[types.FunctionType, int] = {}
 
-    def of(self, value: Any, module: str | None) -> Hashable:
+    def of(self, value: object, module: str | None) -> Hashable:
         """The key of a value.
 
         Args:
@@ -114,7 +114,9 @@ class _Keys:
         if isinstance(value, CUSTOM_RULES):
             rules = [x for x in vars(value).values() if callable(x)]
             return Identity(value), self.of(tuple(rules), module)
-        if dataclasses.is_dataclass(value) and not isinstance(value, type) and _is_value(kind):
+        # Two objects of other classes are never equal, or no keys.
+        is_value = kind.__eq__ is not object.__eq__ and kind.__hash__ is not None
+        if is_value and dataclasses.is_dataclass(value) and not isinstance(value, type):
             fields = [getattr(value, field.name) for field in dataclasses.fields(value)]
             return kind, self.of(tuple(fields), module)
         return Identity(value)
@@ -130,11 +132,15 @@ class _Keys:
             return Identity(function), self.of(tuple(filter(_is_of_a_user, inside)), module)
         if module not in (None, home):
             return Identity(function)
+        # The global variables that it names, other than modules, are part of it.
+        known = function.__globals__
+        names = [name for name in _names_of(function.__code__) if name in known]
+        variables = [(name, known[name]) for name in names]
         parts = (
             function.__defaults__,
             tuple(sorted((function.__kwdefaults__ or {}).items())),
             tuple([_content(cell) for cell in function.__closure__ or ()]),
-            tuple(_globals_of(function)),
+            tuple([x for x in variables if not isinstance(x[1], types.ModuleType)]),
         )
         return Identity(function), function.__code__, self.of(parts, home)
 
@@ -155,18 +161,13 @@ def _is_written_exactly(values: tuple) -> bool:
     )
 
 
-def _is_value(cls: type) -> bool:
-    """Whether two objects of a class can be equal, and be keys."""
-    return cls.__eq__ is not object.__eq__ and cls.__hash__ is not None
-
-
 def _is_installed(function: types.FunctionType) -> bool:
     """Whether a function belongs to this package or to an installed one."""
     home = function.__globals__.get("__name__", "")
     return is_of_a_library(home) or function.__code__.co_filename.startswith(INSTALLED)
 
 
-def _is_of_a_user(value: Any) -> bool:
+def _is_of_a_user(value: object) -> bool:
     """Whether a value is a function of a user, wraps one, or is a tuple with one."""
     if isinstance(value, tuple):
         return any(map(_is_of_a_user, value))
@@ -186,14 +187,6 @@ def _content(cell: types.CellType) -> Any:
         return cell.cell_contents
     except ValueError:
         return cell
-
-
-def _globals_of(function: types.FunctionType) -> Iterator[tuple[str, Any]]:
-    """The global variables that a function names, other than modules."""
-    known = function.__globals__
-    for name in _names_of(function.__code__):
-        if name in known and not isinstance(known[name], types.ModuleType):
-            yield name, known[name]
 
 
 def _names_of(code: types.CodeType) -> Iterator[str]:
@@ -224,7 +217,7 @@ def behaviour_of(cls: type) -> Hashable:
     return tuple(parts) or None
 
 
-def _functions_in(attribute: Any) -> Any:
+def _functions_in(attribute: object) -> Any:
     """The functions of an attribute of a class."""
     if isinstance(attribute, staticmethod | classmethod):
         return attribute.__func__

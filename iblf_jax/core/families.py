@@ -41,7 +41,7 @@ else:
             self.__doc__ = value.__doc__
             self.__isabstractmethod__ = getattr(value, "__isabstractmethod__", False)
 
-        def __get__(self, part: Any, owner: type | None = None) -> Any:
+        def __get__(self, part: object, owner: type | None = None) -> Any:
             return self if part is None else self.value(part)
 
 
@@ -68,7 +68,7 @@ class Part(metaclass=abc.ABCMeta):  # noqa: B024 (the families have abstract met
         """The units of leaves that depend on other fields, by name."""
         return NO_NAMES
 
-    def symbols_of_part(self, field: str, index: int, symbols: Any) -> Any:
+    def symbols_of_part(self, field: str, index: int, symbols: object) -> Any:
         """The units of the symbols in a part, from those of the symbols in this component."""
         return symbols
 
@@ -80,7 +80,7 @@ class _Nothing(Part):
 _NOTHING = _Nothing()
 
 
-def statements_of(part: Any) -> Part:
+def statements_of(part: object) -> Part:
     """What a part states about itself: the part, or the defaults if it is no component."""
     return part if isinstance(part, Part) else _NOTHING
 
@@ -112,7 +112,7 @@ class Default:
         return member.__get__(part, cls) if hasattr(member, "__get__") else member
 
 
-def contract_of(part: Any, of_x: type[X], of_robot: type[R]) -> type[X] | type[R]:
+def contract_of(part: object, of_x: type[X], of_robot: type[R]) -> type[X] | type[R]:
     """The contract that a part is meant to fit: that of parts of the state x, or that of parts of q
     and q'.
 
@@ -133,7 +133,12 @@ def adopt(cls: type, base: type) -> None:
     if not issubclass(base, Part) or issubclass(cls, base):
         return
     with _ADOPTING:
-        own = {name for name in (*dir(cls), *_annotated(cls)) if not _yields(cls, name, base)}
+        own = set()
+        for name in (*dir(cls), *_annotated(cls)):
+            # The default of a class that `base` refines gives way.
+            known = inspect.getattr_static(cls, name, None)
+            if not (isinstance(known, Default) and issubclass(base, known.base)):
+                own.add(name)
         for owner in _lines_of(base):
             for name, member in vars(owner).items():
                 if name not in own and not _is_of_python(name) and not _is_abstract(member):
@@ -142,8 +147,8 @@ def adopt(cls: type, base: type) -> None:
         if cls.__reduce__ is object.__reduce__:
             # Another process that imports the class by its name adopts it, too.
             cls.__reduce__ = _reduced  # type: ignore[assignment, method-assign]
-        known = getattr(cls, _BASES, ())
-        setattr(cls, _BASES, (*(x for x in known if x is not base), base))
+        earlier = getattr(cls, _BASES, ())
+        setattr(cls, _BASES, (*(x for x in earlier if x is not base), base))
         base.register(cls)  # type: ignore[attr-defined]
 
 
@@ -160,7 +165,7 @@ _BASES = "_adopted_by"
 """Attribute of a class with the base classes that have adopted it."""
 
 
-def is_default(method: Any, default: Any) -> bool:
+def is_default(method: object, default: object) -> bool:
     """Whether the method of a part is that of its base class, `is_default(plant.at, Plant.at)`."""
     return getattr(method, "__func__", None) is default
 
@@ -173,7 +178,7 @@ def required_members(base: type) -> tuple[str, ...]:
     return tuple(sorted(abstract | without_value))
 
 
-def _reduced(part: Any) -> tuple:
+def _reduced(part: object) -> tuple:
     cls = type(part)
     return _restored, (cls, getattr(cls, _BASES)), part.__getstate__()
 
@@ -183,12 +188,6 @@ def _restored(cls: type, bases: tuple[type, ...]) -> Any:
     for base in bases:
         adopt(cls, base)
     return object.__new__(cls)
-
-
-def _yields(cls: type, name: str, base: type) -> bool:
-    """Whether what a class has under a name is the default of a class that `base` refines."""
-    known = inspect.getattr_static(cls, name, None)
-    return isinstance(known, Default) and issubclass(base, known.base)
 
 
 def _lines_of(base: type) -> Iterator[type]:
@@ -205,5 +204,5 @@ def _is_of_python(name: str) -> bool:
     return name.startswith("__") or name == "_abc_impl"
 
 
-def _is_abstract(member: Any) -> bool:
+def _is_abstract(member: object) -> bool:
     return bool(vars(member).get("__isabstractmethod__")) if hasattr(member, "__dict__") else False

@@ -24,13 +24,18 @@ from iblf_jax.core import checks
 Selection: TypeAlias = "tuple[int | str, ...] | None"
 """Indices, names, slices as text, or truth values; None for all joints."""
 
+Joints: TypeAlias = (
+    "int | str | slice | Sequence[int | str | slice | bool] | jax.Array | np.ndarray | None"
+)
+"""What users give for `joints=`."""
+
 EXPECTED = "indices, names or a slice of joints, or one truth value for each joint"
 WEIGHTS = "Weights have an argument of their own, weights=."
 SLICE = re.compile(r"(-?\d+)?:(-?\d+)?(?::(-?\d+)?)?")
 """A slice as text."""
 
 
-def selection(field: str, joints: Any) -> Selection:
+def selection(field: str, joints: Joints) -> Selection:
     """A user's selection as a hashable tuple, with all checks that do not need the robot.
 
     Args:
@@ -57,7 +62,7 @@ def selection(field: str, joints: Any) -> Selection:
     return found
 
 
-def _entries(field: str, joints: Any) -> Sequence[Any]:
+def _entries(field: str, joints: object) -> Sequence[Any]:
     if isinstance(joints, bool | np.bool_):
         raise checks.fail(
             field, joints, EXPECTED, "Give one truth value for each joint, in a list."
@@ -74,7 +79,7 @@ def _entries(field: str, joints: Any) -> Sequence[Any]:
     raise checks.fail(field, joints, EXPECTED)
 
 
-def _entry(field: str, joints: Any, entry: Any) -> int | str:
+def _entry(field: str, joints: object, entry: object) -> int | str:
     if isinstance(entry, bool | np.bool_):
         return bool(entry)
     if isinstance(entry, int | np.integer):

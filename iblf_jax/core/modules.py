@@ -44,7 +44,7 @@ class ConstantArray(NamedTuple):
     shape: tuple[int, ...]
 
     @staticmethod
-    def of(array: Any) -> ConstantArray:
+    def of(array: object) -> ConstantArray:
         """The value of an array."""
         values = np.asarray(array)
         return ConstantArray(values.tobytes(), values.dtype.str, values.shape)
@@ -60,7 +60,7 @@ class ConstantArray(NamedTuple):
 class Structure:
     """A pytree without leaves that holds one hashable value, compared by its exact key."""
 
-    def __init__(self, value: Any) -> None:
+    def __init__(self, value: object) -> None:
         self.value = value
 
     def tree_flatten(self) -> tuple[tuple, Any]:
@@ -73,7 +73,7 @@ class Structure:
         return cls(aux[1])
 
 
-def is_component(value: Any) -> bool:
+def is_component(value: object) -> bool:
     """Whether this is an object of a class that `component` was applied to."""
     return "_registered_component" in vars(type(value))
 
@@ -82,7 +82,9 @@ def is_module(value: Any) -> bool:
     """Whether a field holds a module: a pytree of another library, or a container of arrays."""
     if value is None or is_component(value) or isinstance(value, (str, *NUMBERS)):
         return False
-    if _declares_leaves(value):
+    # A class that a user registered by hand may declare fields with `leaf`.
+    fields = dataclasses.fields(value) if dataclasses.is_dataclass(value) else ()
+    if any(field.metadata.get("leaf") for field in fields):
         return False
     if checks.is_deep(value):
         return False
@@ -94,22 +96,20 @@ def is_module(value: Any) -> bool:
         return False
 
 
-def _declares_leaves(value: Any) -> bool:
-    """Whether a class that a user registered by hand declares fields with `leaf`."""
-    if not dataclasses.is_dataclass(value):
-        return False
-    return any(field.metadata.get("leaf") for field in dataclasses.fields(value))
-
-
-def entries(part: Any) -> dict[str | int, Any]:
+def entries(part: object) -> dict[str | int, Any]:
     """Token of a path -> entry of a module; empty for what JAX does not take apart by names.
 
     The order is that of the leaves.
     """
-    return {_token(path[0]): value for path, value in _one_level(part)[0] if _is_named(path)}
+    # A path has one key, which is more than a position without a name.
+    return {
+        _token(path[0]): value
+        for path, value in _one_level(part)[0]
+        if len(path) == 1 and not isinstance(path[0], jax.tree_util.FlattenedIndexKey)
+    }
 
 
-def entry(part: Any, token: str | int) -> Any:
+def entry(part: object, token: str | int) -> Any:
     """The entry of a module at a token of a path.
 
     Raises:
@@ -118,7 +118,7 @@ def entry(part: Any, token: str | int) -> Any:
     return entries(part)[_from_the_start(part, token)]
 
 
-def with_entry(part: Any, token: str | int, value: Any) -> Any:
+def with_entry(part: object, token: str | int, value: object) -> Any:
     """A copy of a module with one entry, which it must have, replaced."""
     pairs, structure = _one_level(part)
     values = {_token(path[0]): old for path, old in pairs}
@@ -126,24 +126,19 @@ def with_entry(part: Any, token: str | int, value: Any) -> Any:
     return jax.tree.unflatten(structure, values.values())
 
 
-def _from_the_start(part: Any, token: str | int) -> str | int:
+def _from_the_start(part: object, token: str | int) -> str | int:
     """The token, with a negative index of a list or tuple counted from its start."""
     if isinstance(part, tuple | list) and isinstance(token, int) and token < 0:
         return token + len(part)
     return token
 
 
-def _one_level(part: Any) -> Any:
+def _one_level(part: object) -> Any:
     """The direct entries of a pytree with their keys, and its structure."""
     return jax.tree_util.tree_flatten_with_path(part, is_leaf=lambda x: x is not part)
 
 
-def _is_named(path: tuple) -> bool:
-    """Whether a path has one key, and one that is more than a position without a name."""
-    return len(path) == 1 and not isinstance(path[0], jax.tree_util.FlattenedIndexKey)
-
-
-def _token(key: Any) -> str | int:
+def _token(key: object) -> str | int:
     """The token of a path for a key of JAX."""
     if isinstance(key, jax.tree_util.GetAttrKey):
         return key.name
@@ -160,12 +155,12 @@ def is_float_array(value: Any) -> bool:
     return is_array and jnp.issubdtype(value.dtype, jnp.floating)
 
 
-def has_structure(module: Any) -> bool:
+def has_structure(module: object) -> bool:
     """Whether a module contains anything besides numbers that can be leaves."""
     return not all(map(_can_be_leaf, jax.tree.leaves(module)))
 
 
-def _can_be_leaf(value: Any) -> bool:
+def _can_be_leaf(value: object) -> bool:
     if isinstance(value, jax.core.Tracer):
         return True
     is_number = isinstance(value, float | int) and not isinstance(value, bool)
@@ -182,7 +177,7 @@ class Division(NamedTuple):
     is_structure: tuple[bool, ...]
 
     @staticmethod
-    def of(module: Any) -> Division:
+    def of(module: object) -> Division:
         """The division of a module that holds numbers."""
         values, treedef = jax.tree.flatten(module, is_leaf=lambda x: x is None)
         return Division(treedef, tuple(not _is_leaf(x) for x in values))
@@ -193,44 +188,38 @@ class Division(NamedTuple):
         """
         return _division_from, (self.treedef.unflatten(self.is_structure),)
 
-    def with_nodes(self, module: Any) -> Any:
+    def with_nodes(self, module: object) -> Any:
         """The module with its structure in nodes that have no leaves."""
+        nodes = []
         values = self.treedef.flatten_up_to(module)
-        pairs = zip(values, self.is_structure, strict=True)
-        return self.treedef.unflatten([_as_node(x) if fixed else x for x, fixed in pairs])
+        for value, is_structure in zip(values, self.is_structure, strict=True):
+            if is_structure and isinstance(value, jax.Array | np.ndarray):
+                value = ConstantArray.of(value)
+            nodes.append(Structure(value) if is_structure else value)
+        return self.treedef.unflatten(nodes)
 
-    def without_nodes(self, module: Any) -> Any:
+    def without_nodes(self, module: object) -> Any:
         """The inverse of `with_nodes`."""
         values = self.treedef.flatten_up_to(module)
-        return self.treedef.unflatten([_from_node(x) for x in values])
+        for i, node in enumerate(values):
+            if isinstance(node, Structure):
+                held = node.value
+                values[i] = held.array() if isinstance(held, ConstantArray) else held
+        return self.treedef.unflatten(values)
 
 
-def _division_from(module: Any) -> Division:
+def _division_from(module: object) -> Division:
     """The division of which a module with truth values is the pickled form."""
     values, treedef = jax.tree.flatten(module)
     return Division(treedef, tuple(values))
 
 
-def _is_leaf(value: Any) -> bool:
+def _is_leaf(value: object) -> bool:
     """Whether an entry of a module that holds functions is a leaf."""
     return is_float_array(value) or isinstance(value, jax.core.Tracer)
 
 
-def _as_node(value: Any) -> Structure:
-    if isinstance(value, jax.Array | np.ndarray):
-        return Structure(ConstantArray.of(value))
-    return Structure(value)
-
-
-def _from_node(value: Any) -> Any:
-    if not isinstance(value, Structure):
-        return value
-    if isinstance(value.value, ConstantArray):
-        return value.value.array()
-    return value.value
-
-
-def as_module(name: str, value: Any) -> Any:
+def as_module(name: str, value: object) -> Any:
     """A user's module as a field: arrays of NumPy and lists of numbers become arrays of JAX.
 
     Raises:
@@ -261,19 +250,19 @@ def _with_arrays(name: str, value: Any) -> Any:
     return type(value)(_with_arrays(f"{name}[{i}]", x) for i, x in enumerate(value))
 
 
-def is_list_of_numbers(value: Any) -> bool:
+def is_list_of_numbers(value: object) -> bool:
     """Whether this is a list or tuple of numbers, or of such lists, that stands for one array."""
     if not isinstance(value, list | tuple):
         return False
     return bool(value) and all(_is_number(x) or is_list_of_numbers(x) for x in value)
 
 
-def _is_number(value: Any) -> bool:
+def _is_number(value: object) -> bool:
     is_scalar = isinstance(value, jax.Array | np.ndarray) and value.ndim == 0
     return is_scalar or (isinstance(value, numbers.Number) and not isinstance(value, bool))
 
 
-def _checked_entry(name: str, value: Any, has_functions: bool) -> Any:
+def _checked_entry(name: str, value: object, has_functions: bool) -> Any:
     """An entry of a module as a leaf or as structure."""
     if isinstance(value, jax.core.Tracer):
         return value
@@ -306,7 +295,7 @@ def _checked_array(name: str, value: Any) -> Any:
     return value
 
 
-def _hides_arrays(value: Any) -> bool:
+def _hides_arrays(value: object) -> bool:
     """Whether an object that JAX does not take apart has arrays among its attributes."""
     if isinstance(value, functools.partial):
         inside: Any = (value.args, value.keywords)
@@ -318,7 +307,7 @@ def _hides_arrays(value: Any) -> bool:
     return any(isinstance(x, jax.Array | np.ndarray) for x in leaves)
 
 
-def number_of_leaves(module: Any) -> tuple[int, int]:
+def number_of_leaves(module: object) -> tuple[int, int]:
     """How many arrays and how many numbers a module has as leaves."""
     arrays = list(filter(_is_leaf, jax.tree.leaves(module)))
     return len(arrays), sum(int(np.size(x)) for x in arrays)

@@ -59,22 +59,16 @@ def _levels_to_the_user() -> int:
     """
     level = 1
     frame: FrameType | None = sys._getframe(1)
-    while frame is not None and _is_of_the_package(frame):
-        if not _is_skipped(frame):
+    while frame is not None:
+        package = str(frame.f_globals.get("__name__", "")).partition(".")[0]
+        if package not in NOT_THE_USER:
+            break
+        # `warnings.warn` does not count the frames of the import system.
+        filename = frame.f_code.co_filename
+        if "importlib" not in filename or "_bootstrap" not in filename:
             level += 1
         frame = frame.f_back
     return level
-
-
-def _is_of_the_package(frame: FrameType) -> bool:
-    """Whether a frame belongs to a package or module of `NOT_THE_USER`."""
-    return str(frame.f_globals.get("__name__", "")).partition(".")[0] in NOT_THE_USER
-
-
-def _is_skipped(frame: FrameType) -> bool:
-    """Whether `warnings.warn` does not count a frame, being one of the import system."""
-    filename = frame.f_code.co_filename
-    return "importlib" in filename and "_bootstrap" in filename
 
 
 def each_warning_once(function: F) -> F:

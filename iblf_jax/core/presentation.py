@@ -37,7 +37,7 @@ PRESENTATIONS = {
 """Name of a presentation -> the module and the function that makes it."""
 
 
-def present(name: str, result: Any, *args: Any, **options: Any) -> Any:
+def present(name: str, result: object, *args: Any, **options: Any) -> Any:
     """Makes one presentation of a result.
 
     Args:

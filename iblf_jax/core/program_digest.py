@@ -49,7 +49,7 @@ def hash_constants(found: Any, function: Any) -> None:
         found.update(f"{array.dtype} {array.shape} ".encode() + array.tobytes())
 
 
-def _numbers(constant: Any) -> np.ndarray:
+def _numbers(constant: object) -> np.ndarray:
     """A constant as an array of NumPy; of a key of random numbers, its data."""
     if isinstance(constant, jax.Array) and jax.dtypes.issubdtype(
         constant.dtype, jax.dtypes.prng_key

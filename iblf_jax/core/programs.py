@@ -161,19 +161,15 @@ class StructuredFunction:
         others = [x for i, x in enumerate(args) if i not in self._static_argnums]
         named = {name: x for name, x in kwargs.items() if name not in self._static_argnames}
         leaves, structure = jax.tree.flatten((others, named))
-        options = self._compiler_options(leaves)
+        # JAX accepts options for XLA only where it neither transforms the function nor makes it a
+        # part of another program.
+        options = None
+        if not self._optimised and devices.platform() == "cpu":
+            traced = any(isinstance(x, jax.core.Tracer) for x in (jax.device_put(ZERO), *leaves))
+            options = None if traced else UNOPTIMISED
         shapes = tuple([getattr(x, "shape", ()) for x in leaves])
         key = (self._function, options is None, tuple(static), structure, shapes)
         return self._programs.get(key, partial(self._copy, options))
-
-    def _compiler_options(self, leaves: list) -> dict[str, Any] | None:
-        """Options for XLA.  JAX accepts them only where it neither transforms the function nor
-        makes it a part of another program.
-        """
-        if self._optimised or devices.platform() != "cpu":
-            return None
-        traced = any(isinstance(x, jax.core.Tracer) for x in (jax.device_put(ZERO), *leaves))
-        return None if traced else UNOPTIMISED
 
     def _copy(self, options: dict[str, Any] | None) -> Any:
         """A copy of the function, to be compiled by JAX for one structure."""

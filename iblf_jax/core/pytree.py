@@ -42,7 +42,11 @@ Leaf: TypeAlias = Any
 
 
 def leaf(
-    unit: str, *, sign: str | None = None, shape: str = "joint", default: Any = dataclasses.MISSING
+    unit: str,
+    *,
+    sign: str | None = None,
+    shape: str = "joint",
+    default: object = dataclasses.MISSING,
 ) -> Any:
     """Declares a field that holds an array of numbers, which can be perturbed, swept, tuned and
     differentiated.
@@ -60,7 +64,7 @@ def leaf(
     return dataclasses.field(default=default, metadata=metadata)
 
 
-def static(*, default: Any = dataclasses.MISSING) -> Any:
+def static(*, default: object = dataclasses.MISSING) -> Any:
     """Declares a structural field: hashable, not differentiable, part of what is compiled."""
     return dataclasses.field(default=default, metadata={"static": True})
 
@@ -131,7 +135,7 @@ def _keep_required(cls: type) -> None:
             setattr(cls, name, dataclasses.field())
 
 
-def _as_leaf_or_module(cls: type, field: dataclasses.Field, value: Any) -> Any:
+def _as_leaf_or_module(cls: type, field: dataclasses.Field, value: object) -> Any:
     """A user's value of a field that is not static, converted and checked."""
     # `is_module` comes first: it is False for lists that are nested without end.
     holds_module = not is_leaf_field(field) and modules.is_module(value)
@@ -208,7 +212,7 @@ def register_component(cls: type[T]) -> type[T]:
     return cls
 
 
-def note_code(tree: Any) -> None:
+def note_code(tree: object) -> None:
     """Notes the methods of the users' classes in a pytree as they are now.
 
     A program is compiled again if a method has been replaced, or what it captures has changed.
@@ -217,7 +221,7 @@ def note_code(tree: Any) -> None:
     jax.tree.map(lambda x: None, tree, is_leaf=_noted)
 
 
-def _noted(part: Any) -> bool:
+def _noted(part: object) -> bool:
     """False, so that JAX goes on to the parts of this one."""
     cls = type(part)
     if vars(cls).get(_BEHAVIOUR) is not None:
@@ -234,7 +238,7 @@ _REGISTERED = "_registered_component"
 """Attribute of a class that `register_component` has registered."""
 
 
-def is_component_class(value: Any) -> bool:
+def is_component_class(value: object) -> bool:
     """Whether this is a class that `component` was applied to."""
     return isinstance(value, type) and _REGISTERED in vars(value)
 
@@ -255,12 +259,12 @@ Absent: TypeAlias = tuple[()]
 """The type of an optional part of a pytree that is absent: `()`, which has no leaves."""
 
 
-def is_absent(x: Any) -> TypeIs[Absent]:
+def is_absent(x: object) -> TypeIs[Absent]:
     """Whether an optional part of a pytree is absent."""
     return isinstance(x, tuple) and not x
 
 
-def layers(part: Any) -> list[Any]:
+def layers(part: object) -> list[Any]:
     """A component and the components that it wraps, outermost first. The class attribute `wraps`
     is the name of the field that holds the wrapped component.
     """
@@ -270,12 +274,12 @@ def layers(part: Any) -> list[Any]:
     return found
 
 
-def wrapped_field(part: Any) -> str | None:
+def wrapped_field(part: object) -> str | None:
     """The name of the field that holds the wrapped component; None if there is none."""
     return statements_of(part).wraps
 
 
-def unwrapped(part: Any) -> Any:
+def unwrapped(part: object) -> Any:
     """The innermost of the `layers` of a component."""
     return layers(part)[-1]
 

@@ -87,7 +87,7 @@ class Table(NamedTuple):
         return as_html(self.heading, self.rows, self.bold) + notes
 
 
-def for_json(value: Any) -> Any:
+def for_json(value: object) -> Any:
     """A value for strict JSON: arrays as lists, NumPy numbers as Python's, and None for a number
     that is not finite.
     """
@@ -104,7 +104,7 @@ def for_json(value: Any) -> Any:
     return for_json(np.asarray(value).tolist())
 
 
-def as_script_data(value: Any) -> str:
+def as_script_data(value: object) -> str:
     r"""A value as JSON for a script element of an HTML page, whatever its strings hold.
 
     A browser looks for "</script" and "<!--" before it reads the script, inside strings too.  So

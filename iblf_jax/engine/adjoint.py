@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -49,15 +49,18 @@ from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.time_step import TimeStep
 from iblf_jax.kernels import Packed, Program, Shapes
 
+if TYPE_CHECKING:
+    from jax.tree_util import PyTreeDef
+
 
 class Form(NamedTuple):
     """The structure of the carry of one run; hashable."""
 
-    treedef: Any
+    treedef: PyTreeDef
     shapes: Shapes
 
     @staticmethod
-    def of(carry: Any) -> Form:
+    def of(carry: object) -> Form:
         """Of a carry with a leading run axis."""
         leaves, treedef = jax.tree.flatten(carry)
         return Form(treedef, Shapes.of(leaves, 1))
@@ -69,7 +72,7 @@ class Form(NamedTuple):
         ]
         return jax.tree.unflatten(self.treedef, structs)
 
-    def as_floats(self, dtype: Any) -> Shapes:
+    def as_floats(self, dtype: np.dtype) -> Shapes:
         """The shapes of the leaves, all of them floats."""
         return Shapes(tuple((shape, np.dtype(dtype)) for shape, _ in self.shapes.items))
 
@@ -327,7 +330,9 @@ class ReverseRun(NamedTuple):
 
         def of_segment(after: Packed, number: jax.Array | int, count: int) -> Packed:
             first = number * segment
-            start = _packed(form.shapes, stored.carries[number])
+            numbers = stored.carries[number]  # as a `RecordingStep` has recorded them
+            is_float = np.asarray([kind == "f" for kind in form.shapes.kinds()])
+            start = Packed(numbers[is_float], numbers[~is_float].astype(jnp.int32))
             _, (series,) = run(recording, start, count, 1, first=first)
             if records:
                 series = jnp.concatenate([series, self._of_records(records, first, count)], axis=1)
@@ -367,9 +372,3 @@ class Stored(NamedTuple):
     """After the last step."""
     carries: jax.Array
     """Before the first step of every segment, (segments, numbers, runs)."""
-
-
-def _packed(shapes: Shapes, numbers: jax.Array) -> Packed:
-    """The rows of carries that a `RecordingStep` has recorded, (numbers, runs)."""
-    is_float = np.asarray([kind == "f" for kind in shapes.kinds()])
-    return Packed(numbers[is_float], numbers[~is_float].astype(jnp.int32))

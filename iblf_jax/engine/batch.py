@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -29,11 +29,14 @@ from iblf_jax.simulation.noise import NOISE_NAME, realised
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.stability import resolved_jacobian
 
+if TYPE_CHECKING:
+    from jax.tree_util import PyTreeDef
+
 
 class Leaves(NamedTuple):
     """The leaves of a pytree in two groups: shared by all runs, and different for each run."""
 
-    treedef: Any
+    treedef: PyTreeDef
     is_per_run: tuple[bool, ...]
     """Whether each leaf of the pytree differs between runs."""
     shared: list[jax.Array]
@@ -41,7 +44,7 @@ class Leaves(NamedTuple):
     """The leaves that differ, with a leading batch axis."""
 
     @staticmethod
-    def of(treedef: Any, is_per_run: Sequence[bool], leaves: Sequence[jax.Array]) -> Leaves:
+    def of(treedef: PyTreeDef, is_per_run: Sequence[bool], leaves: Sequence[jax.Array]) -> Leaves:
         """From all leaves of a pytree, in the order of the pytree."""
         groups: dict[bool, list[jax.Array]] = {False: [], True: []}
         for leaf, differs in zip(leaves, is_per_run, strict=True):

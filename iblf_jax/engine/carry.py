@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,9 @@ from iblf_jax.simulation.closed_loop import (
 )
 from iblf_jax.simulation.noise import distances
 from iblf_jax.simulation.scenario import Scenario
-from iblf_jax.simulation.signals import Sample
+
+if TYPE_CHECKING:
+    from iblf_jax.simulation.metrics import Fold
 
 
 class Inputs(NamedTuple):
@@ -30,7 +32,7 @@ class Inputs(NamedTuple):
     """
 
     scenario: Scenario
-    folds: Any
+    folds: tuple[Fold, ...]
     dt: jax.Array
     steps: jax.Array
     """(), a float: integers are not leaves of a scalar program."""
@@ -93,7 +95,8 @@ def start(inputs: Inputs, method: str, jacobian: jax.Array) -> Carry:
       jacobian: what a `LinearizationStep` has found at the start.
     """
     state, zero = initial_state(inputs.scenario), jnp.zeros_like(inputs.dt)
-    sample = _blank_sample(inputs, state)
+    shapes = jax.eval_shape(evaluate, inputs.scenario, inputs.dt, state, inputs.dt)[1]
+    sample = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
     blank = begun(inputs.folds, sample)
     constant, jacobian = jax.lax.stop_gradient((state, jacobian))
     growth = error_growth.begin(inputs.scenario, constant, jacobian)
@@ -116,9 +119,3 @@ def start_without_accuracy(inputs: Inputs, method: str) -> Carry:
     """As `start`, without a linearization: its estimate of the accuracy has no meaning."""
     size = error_estimate.watched_indices(initial_state(inputs.scenario)).size
     return start(inputs, method, jnp.zeros((size, size), inputs.dt.dtype))
-
-
-def _blank_sample(inputs: Inputs, state: LoopState) -> Sample:
-    """A sample of zeros."""
-    shapes = jax.eval_shape(evaluate, inputs.scenario, inputs.dt, state, inputs.dt)[1]
-    return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)

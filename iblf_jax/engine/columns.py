@@ -11,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -32,6 +32,10 @@ from iblf_jax.engine.step_pieces import MetricSample
 from iblf_jax.engine.time_step import Advanced, TimeStep, samples_of_step
 from iblf_jax.simulation import error_estimate
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
+
+if TYPE_CHECKING:
+    from iblf_jax.simulation.metrics import Fold
+
 
 ACCURACY = tuple(name for name, _ in error_estimate.ACCURACY_UNITS)
 """Metrics whose derivatives are zero."""
@@ -65,7 +69,7 @@ def _moved(inputs: Inputs, places: Places, eps: jax.Array) -> Inputs:
     return inputs._replace(scenario=jax.tree.unflatten(treedef, leaves))
 
 
-def floats_of(tree: Any) -> list[jax.Array]:
+def floats_of(tree: object) -> list[jax.Array]:
     """The leaves that are floats."""
     return [x for x in jax.tree.leaves(tree) if jnp.issubdtype(x.dtype, jnp.floating)]
 
@@ -144,25 +148,6 @@ def _metrics(inputs: Inputs, carry: Carry | WithTangent, places: Places) -> dict
     return jax.jvp(of, (zero, floats), (jnp.ones_like(zero), carry.tangent))[1]
 
 
-def _directed(batch: Batch, directions: list[list[Any]]) -> tuple[Batch, list[int]]:
-    """A run for every column of every run of a batch; and how many columns each derivative has.
-
-    `directions`: for each derivative, of each of its leaves the tangents, (P, *shape of the leaf).
-    """
-    leaves, runs = batch.leaves, batch.runs or 1
-    sizes = [len(level[0]) for level in directions]
-    per_run = [jnp.repeat(x, math.prod(sizes), axis=0) for x in leaves.per_run]
-
-    def beside_others(k: int, column: jax.Array) -> jax.Array:
-        """Columns of derivative k, each beside every column of the others, for every run."""
-        repeated = jnp.repeat(column, math.prod(sizes[k + 1 :]), axis=0)
-        return jnp.tile(repeated, (runs * math.prod(sizes[:k]), *[1] * (column.ndim - 1)))
-
-    added = [[beside_others(k, x) for x in level] for k, level in enumerate(directions)]
-    repeated = batch._replace(leaves=leaves._replace(per_run=per_run))
-    return _with_directions(repeated, added)._replace(runs=runs * math.prod(sizes)), sizes
-
-
 def _with_directions(batch: Batch, added: list[list[jax.Array]]) -> Batch:
     """A batch with a direction of each derivative for each run, (R, *shape of the leaf)."""
     leaves = batch.leaves
@@ -181,11 +166,6 @@ def _units(shapes: list[tuple[int, ...]], dtype) -> list[jax.Array]:
     return [jnp.asarray(x.reshape(len(x), *shape)) for x, shape in zip(parts, shapes, strict=True)]
 
 
-def _scenario_shapes(batch: Batch) -> list[tuple[int, ...]]:
-    """Shapes of the leaves of one run's scenario."""
-    return [jnp.shape(x) for x in jax.tree.leaves(batch.leaves.first.scenario)]
-
-
 def _stepped(
     loop: StepLoop,
     batch: Batch,
@@ -193,10 +173,25 @@ def _stepped(
     directions: list[list[Any]],
     request: RunRequest,
 ) -> tuple[list[jax.Array], Any]:
-    """The derivatives of what a step records and of the metrics, (R, P, ...)."""
-    wide, sizes = _directed(batch, directions)
+    """The derivatives of what a step records and of the metrics, (R, P, ...).
+
+    `directions`: for each derivative, of each of its leaves the tangents, (P, *shape of the leaf).
+    """
+    # A run is made for every column of every run of the batch.
+    leaves, runs = batch.leaves, batch.runs or 1
+    sizes = [len(level[0]) for level in directions]
+    per_run = [jnp.repeat(x, math.prod(sizes), axis=0) for x in leaves.per_run]
+
+    def beside_others(k: int, column: jax.Array) -> jax.Array:
+        """Columns of derivative k, each beside every column of the others, for every run."""
+        repeated = jnp.repeat(column, math.prod(sizes[k + 1 :]), axis=0)
+        return jnp.tile(repeated, (runs * math.prod(sizes[:k]), *[1] * (column.ndim - 1)))
+
+    added = [[beside_others(k, x) for x in level] for k, level in enumerate(directions)]
+    repeated = batch._replace(leaves=leaves._replace(per_run=per_run))
+    wide = _with_directions(repeated, added)._replace(runs=runs * math.prod(sizes))
     return jax.tree.map(
-        lambda x: x.reshape(batch.runs or 1, *sizes, *x.shape[1:]), _made(loop, wide, step, request)
+        lambda x: x.reshape(runs, *sizes, *x.shape[1:]), _made(loop, wide, step, request)
     )
 
 
@@ -229,7 +224,7 @@ def columns(
       Of each float that is recorded (R, P, T, ...), or (R, P, Q, T, ...), and by name of each
       metric that is a float (R, P, ...).
     """
-    shapes = _scenario_shapes(batch)
+    shapes = [jnp.shape(x) for x in jax.tree.leaves(batch.leaves.first.scenario)]
     directions = [_units([shapes[place] for place in level], batch.dtype) for level in places]
     return _stepped(loop, batch, TangentStep(TimeStep.of(request), places), directions, request)
 
@@ -255,12 +250,12 @@ def along_direction(
     return _made(loop, _with_directions(batch, [moves]), step, request)
 
 
-def outer_vectors(folds: Any, found: Advanced) -> list[jax.Array]:
+def outer_vectors(folds: tuple[Fold, ...], found: Advanced) -> list[jax.Array]:
     """Of the curvature matrices, what has tangents."""
     return [outer.vector for outer in outers_of_step(folds, found)]
 
 
-def _weights(folds: Any, found: Advanced) -> list[jax.Array]:
+def _weights(folds: tuple[Fold, ...], found: Advanced) -> list[jax.Array]:
     """And their weights."""
     return [outer.weight for outer in outers_of_step(folds, found)]
 

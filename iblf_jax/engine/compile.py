@@ -18,7 +18,7 @@ import contextlib
 import dataclasses
 import itertools
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -47,6 +47,13 @@ from iblf_jax.kernels import (
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
 from iblf_jax.simulation.noise import needs_key, realised
 from iblf_jax.simulation.scenario import Scenario
+
+if TYPE_CHECKING:
+    from jax.tree_util import PyTreeDef
+
+    from iblf_jax.engine.carry import Step
+    from iblf_jax.simulation.metrics import Fold
+
 
 T = TypeVar("T")
 
@@ -111,7 +118,11 @@ def _attempted(attempt: Callable[[Executor], T], executor: Executor) -> T:
 
 
 def inputs_of(
-    scenario: Scenario, folds: Any, dt: jax.Array, request: RunRequest, noise: Any = None
+    scenario: Scenario,
+    folds: tuple[Fold, ...],
+    dt: jax.Array,
+    request: RunRequest,
+    noise: jax.Array | None = None,
 ) -> Inputs:
     """The inputs of a run; `noise` is the key of its random numbers."""
     key: Any = ()
@@ -170,7 +181,7 @@ class StepProgram(NamedTuple):
     steps: int
 
     @staticmethod
-    def of(step: Any, batch: Batch, carry: Any, steps: int) -> StepProgram:
+    def of(step: Step, batch: Batch, carry: Any, steps: int) -> StepProgram:
         """The program of a step of a batch; raises UnsupportedError if it cannot be lowered."""
         shared, per_run = batch.leaves.shared, batch.leaves.per_run
         return StepProgram(
@@ -186,13 +197,6 @@ def time_step_program(batch: Batch, request: RunRequest) -> StepProgram:
     """The program of a time step."""
     carry = carry_shapes(batch, request.method)
     return StepProgram.of(TimeStep.of(request), batch, carry, request.instants)
-
-
-def _linearization_program(batch: Batch, request: RunRequest) -> StepProgram:
-    """The program that linearizes the closed loop at the start and at the end of a run."""
-    batch, carry = linearization_batch(batch, request.method)
-    steps = linearization_steps(batch.leaves.first.scenario)
-    return StepProgram.of(LinearizationStep(), batch, carry, steps)
 
 
 def start_build(executor: Executor, program: StepProgram) -> None:
@@ -219,10 +223,10 @@ def run_by_executor(
 class _Static:
     """A value without arrays, as the output of a traced function."""
 
-    value: Any
+    value: object
 
 
-def on_shapes(function: Callable[..., T], shapes: Any) -> T:
+def on_shapes(function: Callable[..., T], shapes: object) -> T:
     """The value of a function that depends only on the shapes of its arrays.
 
     Args:
@@ -237,7 +241,7 @@ def shapes_of(leaves: list) -> tuple:
     return tuple((x.shape, x.dtype) for x in leaves)
 
 
-def _tree_of_shapes(structure: Any, shapes: tuple) -> Any:
+def _tree_of_shapes(structure: PyTreeDef, shapes: tuple) -> Any:
     return jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(*shape) for shape in shapes])
 
 
@@ -258,7 +262,7 @@ def structural_part(request: RunRequest) -> RunRequest:
 
 @CACHE.memoised(64)
 def compiled_plan(
-    request: RunRequest, machine: Machine, structure: Any, shapes: tuple
+    request: RunRequest, machine: Machine, structure: PyTreeDef, shapes: tuple
 ) -> ExecutionPlan:
     """The plan of a batch with only the first executor that can run it, whose kernels are built.
 
@@ -281,7 +285,11 @@ def compiled_plan(
         scenario, varied, folds, dt = arguments
         inputs = inputs_of(scenario, folds, dt, request)
         batch = Batch.of(inputs, varied, request.constants)
-        return _linearization_program(batch, request), time_step_program(batch, request)
+        # A run is linearized at its start and at its end.
+        twice, carry = linearization_batch(batch, request.method)
+        steps = linearization_steps(twice.leaves.first.scenario)
+        linearization = StepProgram.of(LinearizationStep(), twice, carry, steps)
+        return linearization, time_step_program(batch, request)
 
     def build(executor: Executor) -> tuple[str, ...]:
         linearization, step = on_shapes(programs, arguments)
@@ -314,7 +322,7 @@ def single_batch(inputs: Inputs, request: RunRequest) -> Batch:
 
 @CACHE.memoised(256)
 def plan_of_single_run(
-    request: RunRequest, machine: Machine, structure: Any, shapes: tuple
+    request: RunRequest, machine: Machine, structure: PyTreeDef, shapes: tuple
 ) -> SingleRunPlan:
     """The plan of one run; the first executor has started to build the kernel of the step.
 

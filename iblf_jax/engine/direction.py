@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -29,11 +29,14 @@ from iblf_jax.engine.registry import Executor
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.kernels import UnsupportedError, is_zero, new_primitive, without_symbol
 
+if TYPE_CHECKING:
+    from jax.tree_util import PyTreeDef
+
 
 class TracedRuns(NamedTuple):
     """Runs of lists of leaves inside a transformation of JAX; static."""
 
-    treedef: Any
+    treedef: PyTreeDef
     """Of the `Inputs`."""
     request: RunRequest
     backend: str

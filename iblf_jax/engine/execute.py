@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Collection, Mapping
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -59,11 +59,14 @@ from iblf_jax.engine.time_step import TimeStep, positions
 from iblf_jax.simulation.closed_loop import LoopState
 from iblf_jax.simulation.scenario import Scenario
 
+if TYPE_CHECKING:
+    from iblf_jax.simulation.metrics import Fold
+
 
 def run_batch(
     scenario: Scenario,
     varied: Mapping[str, jax.Array],
-    folds: Any,
+    folds: tuple[Fold, ...],
     dt: jax.Array,
     request: RunRequest,
 ) -> Outcome:
@@ -119,7 +122,11 @@ class CompiledBatch(NamedTuple):
         return self.execution.backend
 
     def __call__(
-        self, scenario: Scenario, varied: Mapping[str, jax.Array], folds: Any, dt: jax.Array
+        self,
+        scenario: Scenario,
+        varied: Mapping[str, jax.Array],
+        folds: tuple[Fold, ...],
+        dt: jax.Array,
     ) -> Outcome:
         """Runs a scenario once for every entry of `varied`, as `run_batch` does.
 
@@ -167,7 +174,7 @@ def compile_batch(
     request: RunRequest,
     scenario: Scenario,
     varied: Mapping[str, Any],
-    folds: Any,
+    folds: tuple[Fold, ...],
     dt: jax.Array,
 ) -> CompiledBatch:
     """Builds the kernels of a batch with the first executor that can run it.
@@ -190,7 +197,7 @@ def run_batch_jvp(
     scenario: Scenario,
     varied: Mapping[str, jax.Array],
     directions: Mapping[str, Any],
-    folds: Any,
+    folds: tuple[Fold, ...],
     dt: jax.Array,
     request: RunRequest,
 ) -> Tangents:
@@ -262,7 +269,7 @@ def run_batch_vjp(
     varied: Mapping[str, jax.Array],
     by: Collection[str],
     metrics: Collection[str],
-    folds: Any,
+    folds: tuple[Fold, ...],
     dt: jax.Array,
     request: RunRequest,
 ) -> tuple[Outcome, Pullback]:

@@ -17,7 +17,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -32,6 +32,10 @@ from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.paths import get, parameters, with_parameters
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.stability import jacobian, period_map
+
+if TYPE_CHECKING:
+    from iblf_jax.simulation.results import Rollout
+
 
 NUMBER_OF_SCALES = 14
 """Scales 2^(-k/2) that are tried, down to 1/128."""
@@ -85,7 +89,7 @@ def _two_digits(x: float, rounding: Callable[[float], int]) -> float:
     return float(f"{rounding(x / unit) * unit:.2g}")
 
 
-def limiting_term(run: Any) -> Limit | None:
+def limiting_term(run: Rollout) -> Limit | None:
     """The term that limits the loop of a run; None if the loop is stable, or no single term does.
 
     Args:
@@ -139,7 +143,7 @@ def _scaled(scenario: Scenario, term: Term, scale: float) -> Scenario:
 
 
 def _relative_to_limit(
-    scenario: Scenario, run: Any
+    scenario: Scenario, run: Rollout
 ) -> Callable[[Scenario, jax.Array, LoopState], float]:
     """A function that rates a loop at some instants, 1 at its limit of stability.
 
@@ -177,7 +181,7 @@ def _jacobians(scenario: Scenario, times: jax.Array, states: LoopState) -> jax.A
     return jax.vmap(lambda t, state: jacobian(scenario, t, state))(times, states)
 
 
-def _instants(scenario: Scenario, run: Any) -> Iterator[tuple[jax.Array, LoopState]]:
+def _instants(scenario: Scenario, run: Rollout) -> Iterator[tuple[jax.Array, LoopState]]:
     """Two groups of times and states: the start and along the reference, and where the run was
     nearest to its bounds.
 

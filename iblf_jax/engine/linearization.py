@@ -152,7 +152,7 @@ def fastest_mode(scenario: Scenario, found: Linearization) -> jax.Array:
 
 
 def linearization_at(
-    time: jax.Array, state: Any, watched: int, unresolved: error_estimate.UnresolvedSignals
+    time: jax.Array, state: LoopState, watched: int, unresolved: error_estimate.UnresolvedSignals
 ) -> Linearization:
     """The carry of a `LinearizationStep` at a state, as `perturbed_state` gives it, of which
     `error_estimate` watches so many numbers.

@@ -31,7 +31,7 @@ from iblf_jax.kernels import (
 
 
 def scan(
-    step: Any, batch: Batch, carry: Any, steps: int, every: int | None, *, rolled: bool = False
+    step: Step, batch: Batch, carry: Any, steps: int, every: int | None, *, rolled: bool = False
 ) -> tuple[Any, Any]:
     """All steps of all runs by `jax.lax.scan`, for any scenario and device; differentiable in
     forward and reverse mode.  `rolled`: whether the stages of the integrator are a loop.
@@ -79,7 +79,7 @@ def _scan_run(step: Callable, carry: Any, steps: int, every: int | None) -> tupl
 
 
 def checkpointed(
-    step: Any, batch: Batch, carry: Any, steps: int, every: int | None, *, rolled: bool = False
+    step: Step, batch: Batch, carry: Any, steps: int, every: int | None, *, rolled: bool = False
 ) -> tuple[Any, Any]:
     """As `scan` without records, for reverse mode: about 3 T^(1/3) states are in memory at a time.
 
@@ -110,7 +110,7 @@ def checkpointed(
 
 
 @CACHE.memoised(64)
-def _on_leaves(step: Any, treedef, is_per_run: tuple[bool, ...], carry_treedef) -> Callable:
+def _on_leaves(step: Step, treedef, is_per_run: tuple[bool, ...], carry_treedef) -> Callable:
     """The step as a function of lists of leaves.  `compile_step` caches by the function object, so
     the same structure gives the same object.  A step that reads a series has one more argument.
     """
@@ -166,7 +166,9 @@ def kernel_loop(executor: Executor, **options: Any) -> StepLoop:
       options: further arguments of `executor.run`.
     """
 
-    def loop(step: Any, batch: Batch, carry: Any, steps: int, every: int | None) -> tuple[Any, Any]:
+    def loop(
+        step: Step, batch: Batch, carry: Any, steps: int, every: int | None
+    ) -> tuple[Any, Any]:
         compiled = program_of(step, batch, carry)
         runs = batch.runs or 1
         flat, treedef = jax.tree.flatten(carry)

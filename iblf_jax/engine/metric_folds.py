@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -16,13 +16,18 @@ import jax.numpy as jnp
 from iblf_jax.kernels import jaxprs
 from iblf_jax.simulation.signals import Sample
 
+if TYPE_CHECKING:
+    from iblf_jax.simulation.metrics import Fold
 
-def begun(folds: Any, sample: Sample) -> tuple:
+
+def begun(folds: tuple[Fold, ...], sample: Sample) -> tuple:
     """The accumulators before a first sample."""
     return tuple(fold.init(sample) for fold in folds)
 
 
-def begun_at(index: jax.Array, folds: Any, sample: Sample, accumulators: tuple) -> tuple:
+def begun_at(
+    index: jax.Array, folds: tuple[Fold, ...], sample: Sample, accumulators: tuple
+) -> tuple:
     """The accumulators before an instant: begun with its sample if it is the first.
 
     What does not depend on the sample was begun by `start`, and costs no choice in every step.
@@ -44,7 +49,7 @@ def begun_at(index: jax.Array, folds: Any, sample: Sample, accumulators: tuple) 
     )
 
 
-def updated(folds: Any, accumulators: tuple, sample: Sample) -> tuple:
+def updated(folds: tuple[Fold, ...], accumulators: tuple, sample: Sample) -> tuple:
     """The accumulators after a sample."""
     return tuple(fold.update(acc, sample) for fold, acc in zip(folds, accumulators, strict=True))
 
@@ -54,7 +59,7 @@ def weighed(sample: Sample, t: jax.Array, weight: jax.Array, step: jax.Array) ->
     return dataclasses.replace(sample, t=t, dt=weight, step=step)
 
 
-def split_floats(tree: Any) -> tuple[list[jax.Array], Callable]:
+def split_floats(tree: object) -> tuple[list[jax.Array], Callable]:
     """The floating-point numbers of a tree, and the function that puts others in their place."""
     leaves, treedef = jax.tree.flatten(tree)
     places = [i for i, x in enumerate(leaves) if jnp.issubdtype(jnp.result_type(x), jnp.floating)]
@@ -68,7 +73,7 @@ def split_floats(tree: Any) -> tuple[list[jax.Array], Callable]:
     return [leaves[i] for i in places], replaced
 
 
-def finished(folds: Any, accumulators: tuple) -> dict[str, jax.Array]:
+def finished(folds: tuple[Fold, ...], accumulators: tuple) -> dict[str, jax.Array]:
     """The results of all folds."""
     found: dict[str, jax.Array] = {}
     for fold, acc in zip(folds, accumulators, strict=True):
@@ -76,7 +81,7 @@ def finished(folds: Any, accumulators: tuple) -> dict[str, jax.Array]:
     return found
 
 
-def folded(folds: Any, samples: Sample) -> dict[str, jax.Array]:
+def folded(folds: tuple[Fold, ...], samples: Sample) -> dict[str, jax.Array]:
     """The results of all folds over a run that is over, its samples with time first."""
     first = jax.tree.map(lambda x: x[0], samples)
     return finished(

@@ -86,7 +86,12 @@ def simulate(
     Source: design of this package; the closed loop is Zhang & Yan 2024, section 3.
     """
     runs = Runs(duration, dt, method, backend, seed)
-    every = _checked_record(record_every, runs.steps)
+    every = checks.recorded_every(record_every, runs.steps)
+    if runs.steps // every > MAX_SAMPLES:
+        fewest = checks.ceil_div(runs.steps, MAX_SAMPLES)
+        expected = f"an interval with at most {MAX_SAMPLES} recorded samples in {runs.steps} steps"
+        remedy = f"Take record_every={fewest} or more; metrics cover every step all the same."
+        raise checks.fail("record_every", every, expected, remedy)
     throw = checks.boolean("throw", throw)
     scenario = fitted_to_step(canonical(scenario), dt)
     request = runs.request(scenario, record_every=every)
@@ -98,21 +103,6 @@ def simulate(
     if checks.is_concrete(result) and result.status.ndim == 0:
         report(result, request.steps, throw)
     return result
-
-
-def _checked_record(record_every: int, steps: int) -> int:
-    """The interval of the recorded samples; raises ValueError if there are too many samples."""
-    record_every = checks.recorded_every(record_every, steps)
-    if steps // record_every <= MAX_SAMPLES:
-        return record_every
-    fewest = checks.ceil_div(steps, MAX_SAMPLES)
-    remedy = f"Take record_every={fewest} or more; metrics cover every step all the same."
-    raise checks.fail(
-        "record_every",
-        record_every,
-        f"an interval with at most {MAX_SAMPLES} recorded samples in {steps} steps",
-        remedy,
-    )
 
 
 def run_rollout(

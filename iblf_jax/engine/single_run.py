@@ -14,7 +14,7 @@ results are the same.
 from __future__ import annotations
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -44,13 +44,23 @@ from iblf_jax.engine.waiting import wait_until_ready
 from iblf_jax.kernels import StoppedError, ToolchainError
 from iblf_jax.simulation.scenario import Scenario
 
+if TYPE_CHECKING:
+    from jax.tree_util import PyTreeDef
+
+    from iblf_jax.simulation.metrics import Fold
+
+
 FAILED_BUILDS = "failed builds"
 """Topic of `CACHE` for kernels that could not be built, by executor, structure and shapes; this
 process does not try to build them again."""
 
 
 def run_one(
-    scenario: Scenario, folds: Any, dt: jax.Array, request: RunRequest, noise: Any = None
+    scenario: Scenario,
+    folds: tuple[Fold, ...],
+    dt: jax.Array,
+    request: RunRequest,
+    noise: jax.Array | None = None,
 ) -> Outcome:
     """Runs a scenario once; the caller must not batch or differentiate it.
 
@@ -97,7 +107,7 @@ class Parts(NamedTuple):
 
     backend: str
     """Name of the executor."""
-    structure: Any
+    structure: PyTreeDef
     """Tree structure of the `Inputs`."""
 
     def batch(self, leaves: list, request: RunRequest) -> Batch:
@@ -119,21 +129,16 @@ def _run_by_executor(parts: Parts, nodes: int, request: RunRequest, leaves: list
     """One run by an executor; `nodes` are those of the scalar program of its step."""
     without_steps = request._replace(steps=0, record_every=None)
     carry, at_start = _initialize(parts, without_steps, leaves)
-    length = _steps_per_call(parts.executor, nodes, request)
+    max_nodes = parts.executor.limits.single_run_nodes or nodes
+    is_short = request.instants * max_nodes <= thresholds.OPERATIONS_PER_CALL
+    length = request.instants
+    if parts.executor.accepts_first_step and not is_short:
+        length = thresholds.steps_per_call(nodes, request.instants, request.record_every)
     if length >= request.instants:
         carry, records = _all_steps(parts, request, leaves, carry)
     else:
         carry, records = _steps_in_calls(parts, request, leaves, carry, length)
     return _finalize(parts, without_steps, leaves, carry, at_start)._replace(records=records)
-
-
-def _steps_per_call(executor: Executor, nodes: int, request: RunRequest) -> int:
-    """Steps that the executor makes in one call."""
-    max_nodes = executor.limits.single_run_nodes or nodes
-    is_short = request.instants * max_nodes <= thresholds.OPERATIONS_PER_CALL
-    if is_short or not executor.accepts_first_step:
-        return request.instants
-    return thresholds.steps_per_call(nodes, request.instants, request.record_every)
 
 
 @programs.jit(static_argnums=(0, 1), optimised=False)
@@ -190,6 +195,6 @@ def _finalize(
 
 
 @programs.jit(static_argnums=(0, 1, 2))
-def _run_by_scan(structure: Any, rolled: bool, request: RunRequest, leaves: list) -> Outcome:
+def _run_by_scan(structure: PyTreeDef, rolled: bool, request: RunRequest, leaves: list) -> Outcome:
     batch = Batch.of(jax.tree.unflatten(structure, leaves), None)
     return run_all(partial(scan, rolled=rolled), batch, request)

@@ -35,7 +35,7 @@ class MetricSample(NamedTuple):
     before: tuple
     """The accumulators of the metrics before the sample."""
     sample: Sample
-    counts: Any
+    counts: jax.Array | bool
     """Whether the step has this sample, () bool; True for the sample of the instant."""
 
 
@@ -46,7 +46,7 @@ class StepTimes(NamedTuple):
     division: discontinuities.Division
     previous_piece_length: jax.Array
     """Length of the last piece of the previous step, () [s]; 0 at the first instant."""
-    restarts: Any
+    restarts: jax.Array | None
     """Whether a jump lies in this step or in earlier ones that its error estimate uses, () bool;
     None in scenarios without jump times."""
 
@@ -133,19 +133,6 @@ class LoopAlongStep(NamedTuple):
         return with_process_noise(scenario, time, state, rate, piece.noise_rate), sample
 
 
-def _commands_at_stages(
-    along: LoopAlongStep, piece: discontinuities.Piece, method: str
-) -> list[jax.Array] | None:
-    """The commands that arrive at the stages of a piece, (n,) each; None without a delay."""
-    if not along.arriving:
-        return None
-    times = [
-        discontinuities.stage_time(piece, piece.begin + c * piece.length)
-        for c in integrators.tableau(method).c
-    ]
-    return along.arriving.at_stages(times, piece.length)  # type: ignore[no-any-return]
-
-
 def integrated(
     along: LoopAlongStep,
     piece: discontinuities.Piece,
@@ -153,7 +140,14 @@ def integrated(
     method: str,
     options: StepOptions,
 ) -> integrators.StepResult:
-    """One step of the integrator over a piece."""
+    """One step of the integrator over a piece, with the commands that arrive at its stages."""
+    commands = None
+    if along.arriving:
+        times = [
+            discontinuities.stage_time(piece, piece.begin + c * piece.length)
+            for c in integrators.tableau(method).c
+        ]
+        commands = along.arriving.at_stages(times, piece.length)
     return integrators.step(
         method,
         lambda t, x, *command: along.at(piece, t, x, *command),
@@ -161,7 +155,7 @@ def integrated(
         moved,
         piece.length,
         rolled=options.rolled,
-        inputs=_commands_at_stages(along, piece, method),
+        inputs=commands,
     )
 
 
@@ -220,7 +214,7 @@ class LaterPieces(NamedTuple):
     parts: list[tuple[jax.Array, list]]
     """Length [s] of each piece, and the slopes of its stages."""
     metric_samples: tuple[MetricSample, ...]
-    status: Any
+    status: jax.Array | None
     """The flags that its samples raise, () int32; None where there are none."""
 
 

@@ -325,7 +325,9 @@ def _find_part(
             and float(jnp.max(jnp.abs(q - before) / width)) <= RECOMMENDED_ERROR
         ):
             return coarser
-        before, poor_before, coarser, parts = q, poor, float(dt), _next_round(parts)
+        before, poor_before, coarser = q, poor, float(dt)
+        lead = int(str(parts)[0])
+        parts = parts // lead * {1: 2, 2: 5, 5: 10}[lead]
     problem = "makes this run accurate: the loop may magnify every error."
     notices.warn(f"No step down to {coarser:g} s {problem}")
     return coarser
@@ -339,9 +341,3 @@ def _can_be_tried(duration: float, dt: float) -> None:
             "Longer runs are not tried: give a time after which the motion repeats or has settled."
         )
         raise checks.fail("duration", duration, expected, remedy)
-
-
-def _next_round(parts: int) -> int:
-    """The next of 1, 2, 5, 10, 20 ..."""
-    lead = int(str(parts)[0])
-    return parts // lead * {1: 2, 2: 5, 5: 10}[lead]

@@ -35,7 +35,7 @@ Sources: (J.1) M. A. Aizerman, F. R. Gantmacher, Quart. J. Mech. Appl. Math. 11 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -46,6 +46,8 @@ from iblf_jax.simulation.closed_loop import LoopState
 from iblf_jax.simulation.integrators import StepResult, stage_states, tableau
 from iblf_jax.simulation.levels import estimate
 from iblf_jax.simulation.scenario import Scenario
+
+T = TypeVar("T")
 
 SURFACE_CLEARANCE = 1e-4
 """Smallest distance from a surface at which a rate is evaluated, relative to the distance by which
@@ -174,7 +176,13 @@ def with_hybrid_derivative(
     if start is None or start.size == 0:
         return stepped.state, sums
     end: Any = surfaces(loop.scenario, t + dt, stepped.state)
-    touched = _touched(loop.scenario, method, t, before, dt, stepped, start > 0)
+    # A surface is touched where a stage of the integrator lies on its other side.
+    above = start > 0
+    touched = jnp.zeros_like(above)
+    stages = stage_states(method, before, dt, stepped.slopes)
+    for c, state in zip(tableau(method).c[1:], stages, strict=True):
+        side: Any = surfaces(loop.scenario, t + c * dt, state)
+        touched |= (side > 0) != above
     signs = jax.lax.stop_gradient(Signs(start, end, touched))
 
     def in_pieces(after):
@@ -186,27 +194,8 @@ def with_hybrid_derivative(
     return _with_derivative_of(after, jax.lax.cond(reached, in_pieces, lambda same: same, after))
 
 
-def _touched(
-    scenario: Scenario,
-    method: str,
-    t: jax.Array,
-    before: LoopState,
-    dt: jax.Array,
-    stepped: StepResult,
-    above: jax.Array,
-) -> jax.Array:
-    """Whether a stage of the integrator lies on the other side of each surface than the start of
-    the step, (m,) bool.
-    """
-    touched = jnp.zeros_like(above)
-    stages = stage_states(method, before, dt, stepped.slopes)
-    for c, state in zip(tableau(method).c[1:], stages, strict=True):
-        touched |= (surfaces(scenario, t + c * dt, state) > 0) != above  # type: ignore[operator]
-    return touched
-
-
 @jax.custom_jvp
-def _with_derivative_of(value: Any, other: Any) -> Any:
+def _with_derivative_of(value: T, other: T) -> T:
     """`value`, whose derivative is that of `other`."""
     return value
 
@@ -358,7 +347,7 @@ def _filippov_weight(arriving: jax.Array, leaving: jax.Array) -> jax.Array:
     return jnp.where(slides, leaving, 0.0) / jnp.where(slides, leaving - arriving, 1.0)
 
 
-def _mixed(weight: jax.Array, old: Any, new: Any) -> Any:
+def _mixed(weight: jax.Array, old: T, new: T) -> T:
     """The term a (f- - f+) of (J.3), for a rate of the state or of the accumulators."""
     return jax.tree.map(lambda a, b: weight * (a - b), old, new)
 
@@ -387,7 +376,7 @@ def _moved(state: LoopState, time: jax.Array, rate: LoopState) -> LoopState:
     return jax.tree.map(lambda x, dx: x + time * dx, state, rate)
 
 
-def _sum(one: Any, other: Any) -> Any:
+def _sum(one: T, other: T) -> T:
     return jax.tree.map(jnp.add, one, other)
 
 

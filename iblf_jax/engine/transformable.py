@@ -18,7 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -47,9 +47,16 @@ from iblf_jax.engine.structural_constants import constants_of
 from iblf_jax.engine.time_step import recorded
 from iblf_jax.simulation.scenario import Scenario
 
+if TYPE_CHECKING:
+    from iblf_jax.simulation.metrics import Fold
+
 
 def run_transformable(
-    scenario: Scenario, folds: Any, dt: jax.Array, request: RunRequest, noise: Any = None
+    scenario: Scenario,
+    folds: tuple[Fold, ...],
+    dt: jax.Array,
+    request: RunRequest,
+    noise: jax.Array | None = None,
 ) -> Outcome:
     """One run that may be batched and differentiated from outside.
 

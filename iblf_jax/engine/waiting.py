@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from typing import Any
 
 import jax
 
@@ -13,7 +12,7 @@ LONGEST_PAUSE = 0.02
 """Longest time between two queries [s]."""
 
 
-def wait_until_ready(outputs: Any) -> None:
+def wait_until_ready(outputs: object) -> None:
     """Waits for arrays that XLA computes in its own threads.
 
     `jax.block_until_ready` raises KeyboardInterrupt only after the arrays are complete.  This

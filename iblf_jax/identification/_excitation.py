@@ -50,18 +50,18 @@ class Basis(NamedTuple):
     waypoints.
     """
 
-    t: Any
-    position: Any
-    velocity: Any
-    acceleration: Any
+    t: jax.Array
+    position: jax.Array
+    velocity: jax.Array
+    acceleration: jax.Array
 
 
 class DriveLimits(NamedTuple):
     """Limits of the drives, which a motion satisfies besides the scenario's bounds."""
 
-    speed: Any
+    speed: jax.Array
     """(n,) [rad/s]."""
-    torque: Any
+    torque: jax.Array
     """(n,) [N m]."""
 
 
@@ -114,26 +114,22 @@ def excitation(
             _basis(times, SAMPLES_PER_WAYPOINT * count),
             _basis(times, CHECK_DENSITY * SAMPLES_PER_WAYPOINT * count),
         )
-        drive, centre = _drive_limits(plant), _centre_motion(plant, times)
-        guess = _random_motion(plant, times, centre, seed)
+        limits = (plant.plant.speed, plant.plant.effort)
+        speed, torque = (jnp.broadcast_to(jnp.asarray(drive_limit(x)), (plant.n,)) for x in limits)
+        drive = DriveLimits((1.0 - BOUND_MARGIN) * speed, TORQUE_SHARE * torque)
+        centre = _centre_motion(plant, times)
+        # The search begins at random waypoints about a feasible motion.
+        lower, upper = _bounds(plant, jnp.asarray(times), jnp.asarray(centre))
+        width = np.asarray(upper - lower)
+        width = np.where(np.isfinite(width), width, 2.0)
+        shares = np.random.default_rng(seed).uniform(-1.0, 1.0, centre.shape)
+        guess = centre + FIRST_SHARE * 0.5 * width * shares
+        guess[[0, -1]] = centre[[0, -1]]
         guess = _scaled_to_fit(plant, dense, drive, centre, guess)
         objective = _scaled_objective(plant, basis, drive, c, guess)
         best = _minimum(objective, centre, guess, iterations)
         best = _scaled_to_fit(plant, dense, drive, centre, best)
     return WaypointSpline(times, np.asarray(best, dtype))
-
-
-def _random_motion(
-    scenario: Scenario, times: tuple[float, ...], centre: np.ndarray, seed: int
-) -> np.ndarray:
-    """Random waypoints about a feasible motion."""
-    rng = np.random.default_rng(seed)
-    lower, upper = _bounds(scenario, jnp.asarray(times), jnp.asarray(centre))
-    width = np.asarray(upper - lower)
-    width = np.where(np.isfinite(width), width, 2.0)
-    guess = centre + FIRST_SHARE * 0.5 * width * rng.uniform(-1.0, 1.0, centre.shape)
-    guess[[0, -1]] = centre[[0, -1]]
-    return guess
 
 
 def _scaled_objective(
@@ -192,14 +188,6 @@ def _bounds(scenario: Scenario, t: jax.Array, q: jax.Array) -> tuple[jax.Array, 
     if limits is None:
         return lower, upper
     return jnp.maximum(lower, limits.lower), jnp.minimum(upper, limits.upper)
-
-
-def _drive_limits(scenario: Scenario) -> DriveLimits:
-    speed, torque = (
-        jnp.broadcast_to(jnp.asarray(drive_limit(limit)), (scenario.n,))
-        for limit in (scenario.plant.speed, scenario.plant.effort)
-    )
-    return DriveLimits((1.0 - BOUND_MARGIN) * speed, TORQUE_SHARE * torque)
 
 
 def _centre_motion(scenario: Scenario, times: tuple[float, ...]) -> np.ndarray:
@@ -279,7 +267,12 @@ def _objective(
     return jax.value_and_grad(objective)(waypoints)
 
 
-def _minimum(objective: Any, centre: np.ndarray, guess: np.ndarray, iterations: int) -> np.ndarray:
+def _minimum(
+    objective: Callable[[jax.Array], tuple[jax.Array, jax.Array]],
+    centre: np.ndarray,
+    guess: np.ndarray,
+    iterations: int,
+) -> np.ndarray:
     from scipy.optimize import minimize
 
     def with_ends(inner):

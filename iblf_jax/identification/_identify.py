@@ -120,13 +120,13 @@ class Options(NamedTuple):
     torque: Any
     delay: Any
     loss: str
-    widths: Any
+    widths: bool
     limits: Any
     priors: Any
-    iterations: Any
+    iterations: int
 
 
-def _checked(options: Options, log: Any) -> Options:
+def _checked(options: Options, log: object) -> Options:
     """The options with their defaults; ValueError for one that is invalid."""
     torque, delay = options.torque, options.delay
     if torque is None:
@@ -156,7 +156,7 @@ def _checked(options: Options, log: Any) -> Options:
     )
 
 
-def _by_path(name: str, given: Any, example: str) -> Mapping[str, Any]:
+def _by_path(name: str, given: object, example: str) -> Mapping[str, Any]:
     """A mapping from paths that may be left out."""
     if given is None:
         return {}
@@ -164,7 +164,7 @@ def _by_path(name: str, given: Any, example: str) -> Mapping[str, Any]:
 
 
 def _problem(
-    given: Scenario, log: Any, paths: list[str], held_out: Any, options: Options
+    given: Scenario, log: object, paths: list[str], held_out: Any, options: Options
 ) -> IdentificationProblem:
     """What is identified, from which data; ValueError for logs that are too short."""
     start = canonical(astype(given, "float64"))
@@ -174,7 +174,11 @@ def _problem(
     logs, held_back = _logs(log, held_out, start)
     fitted_windows = windows(logs, options.window, held_back, hold)
     _check_size(fitted_windows, len(c.x), logs, options.window)
-    fronts = [_front(one, 1.0 - share) for one, share in zip(logs, held_back, strict=True)]
+    fronts = []
+    for one, share in zip(logs, held_back, strict=True):
+        count = round((1.0 - share) * len(one.t))  # the rest is held back
+        dq = None if one.dq is None else one.dq[:count]
+        fronts.append(Log(one.name, one.t[:count], one.q[:count], one.tau[:count], dq))
     return IdentificationProblem(
         start=start,
         simulated=simulated,
@@ -218,7 +222,11 @@ class _Search(NamedTuple):
     """Scales of z, (p + 1,)."""
 
     def refine(
-        self, x: np.ndarray, z: np.ndarray, free: FreeTorques, rms_limit: Any = np.inf
+        self,
+        x: np.ndarray,
+        z: np.ndarray,
+        free: FreeTorques,
+        rms_limit: np.ndarray | float = np.inf,
     ) -> Refinement:
         """The fit from z on, with these free torques.
 
@@ -286,7 +294,7 @@ class _Search(NamedTuple):
         return chosen._replace(steps=free_fit.steps + law_fit.steps), ratio
 
 
-def _logs(log: Any, held_out: Any, start: Scenario) -> tuple[list[Log], list[float]]:
+def _logs(log: object, held_out: Any, start: Scenario) -> tuple[list[Log], list[float]]:
     """The logs, and the share of each that is held back."""
     joints = plants.declared_joints(start.plant)
     logs = read(log, start.n, joints=joints)
@@ -296,13 +304,6 @@ def _logs(log: Any, held_out: Any, start: Scenario) -> tuple[list[Log], list[flo
         return logs, [float(held_out)] * len(logs)
     others = read(held_out, start.n, "held_out", joints)
     return logs + others, [0.0] * len(logs) + [1.0] * len(others)
-
-
-def _front(log: Log, share: float) -> Log:
-    """The first share of a log."""
-    count = round(share * len(log.t))
-    dq = None if log.dq is None else log.dq[:count]
-    return Log(log.name, log.t[:count], log.q[:count], log.tau[:count], dq)
 
 
 def _check_size(w: Windows, p: int, logs: list[Log], length: float) -> None:

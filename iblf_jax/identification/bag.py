@@ -100,7 +100,17 @@ def read_bag_log(
       ValueError: invalid options, or a recording that is damaged or lacks what is read.
       ImportError: the extra `ros` is not installed.
     """
-    options = _checked_options(options)
+    checks.one_of("times", options.times, TIMES)
+    checks.string("joint_states", options.joint_states, 'a topic, such as "joint_states"')
+    if options.efforts is not None:
+        checks.string("efforts", options.efforts, 'a topic, such as "efforts"')
+    duration, time_origin = options.duration, options.time_origin
+    if duration is not None:
+        duration = checks.time_span("duration", duration)
+    if time_origin is not None:
+        time_origin = checks.number_between("time_origin", time_origin, 0.0, LATEST_ORIGIN, "s")
+    start = checks.time_span("start", options.start, zero=True)
+    options = options._replace(start=start, duration=duration, time_origin=time_origin)
     names = _requested_names(n, joints, options.joints)
     recording = _recording(path, names, n, options)
     index, is_known = np.arange(len(recording.q)), np.ones(len(recording.q), bool)
@@ -121,7 +131,14 @@ def read_bag_log(
         found["dq"] = recording.dq[is_known]
     rows = _selected(found["t"], options.start, options.duration, path)
     found = {name: x[rows] for name, x in found.items()}
-    _check_finite(found, path)
+    for name, x in found.items():
+        broken = ~np.isfinite(x).reshape(len(x), -1).all(axis=1)
+        if not broken.any():
+            continue
+        first = found["t"][int(np.argmax(broken))]
+        came = checks.Words(f"{int(broken.sum())} of {len(x)} rows, the first at t = {first:.9g} s")
+        remedy = "Select a part of the recording with start and duration."
+        raise checks.fail(f"{path}: {name} that is not finite", came, "finite numbers", remedy)
     return found
 
 
@@ -269,34 +286,7 @@ def _selected(t: np.ndarray, start: float, duration: float | None, path: Path) -
     raise checks.fail(f"{path}: stamps", came, "times that increase", remedy)
 
 
-def _check_finite(found: dict[str, np.ndarray], path: Path) -> None:
-    """Raises ValueError for numbers that are not finite."""
-    for name, x in found.items():
-        broken = ~np.isfinite(x).reshape(len(x), -1).all(axis=1)
-        if not broken.any():
-            continue
-        first = found["t"][int(np.argmax(broken))]
-        came = checks.Words(f"{int(broken.sum())} of {len(x)} rows, the first at t = {first:.9g} s")
-        remedy = "Select a part of the recording with start and duration."
-        raise checks.fail(f"{path}: {name} that is not finite", came, "finite numbers", remedy)
-
-
 # --- options -------------------------------------------------------------------------------------
-
-
-def _checked_options(options: BagOptions) -> BagOptions:
-    """The options with numbers as floats; ValueError for one that is invalid."""
-    checks.one_of("times", options.times, TIMES)
-    checks.string("joint_states", options.joint_states, 'a topic, such as "joint_states"')
-    if options.efforts is not None:
-        checks.string("efforts", options.efforts, 'a topic, such as "efforts"')
-    duration, origin = options.duration, options.time_origin
-    if duration is not None:
-        duration = checks.time_span("duration", duration)
-    if origin is not None:
-        origin = checks.number_between("time_origin", origin, 0.0, LATEST_ORIGIN, "s")
-    start = checks.time_span("start", options.start, zero=True)
-    return options._replace(start=start, duration=duration, time_origin=origin)
 
 
 def _requested_names(
@@ -341,7 +331,9 @@ def _messages(path: Path, options: BagOptions) -> Iterator[tuple[bool, int, Any]
         with _damage_reported(path):
             reader = stack.enter_context(library.Reader(path))
             topics = {name: topic.msgtype for name, topic in reader.topics.items()}
-        read = _topics(options, topics, path)
+        read = {_topic("joint_states", options.joint_states, STATE_TYPE, topics, path): STATE_TYPE}
+        if options.efforts is not None:
+            read[_topic("efforts", options.efforts, EFFORT_TYPE, topics, path)] = EFFORT_TYPE
         connections = [x for x in reader.connections if x.topic in read]
         missing = sum(x.msgcount for x in connections)
         with _damage_reported(path):
@@ -417,15 +409,6 @@ def _damaged(path: Path, reason: str) -> ValueError:
     return checks.fail(str(path), checks.Words(reason), "a complete rosbag2 recording", remedy)
 
 
-def _topics(options: BagOptions, topics: dict[str, str | None], path: Path) -> dict[str, str]:
-    """The names of the topics to be read, and the types of their messages."""
-    state = _topic("joint_states", options.joint_states, STATE_TYPE, topics, path)
-    if options.efforts is None:
-        return {state: STATE_TYPE}
-    effort = _topic("efforts", options.efforts, EFFORT_TYPE, topics, path)
-    return {state: STATE_TYPE, effort: EFFORT_TYPE}
-
-
 def _topic(
     field: str, name: str, message_type: str, topics: dict[str, str | None], path: Path
 ) -> str:
@@ -482,8 +465,9 @@ class _StateReader:
         if self.has_stamps:
             stamp = message.header.stamp.sec * NANOSECONDS + message.header.stamp.nanosec
         q = self._values("position", message.position, key, places)
-        if self._is_repeated(stamp, q):
-            return
+        is_first = not self.has_stamps or not self.stamp
+        if not is_first and stamp == self.stamp[-1] and np.array_equal(q, self.q[-1]):
+            return  # the state before is published again
         dq = None
         if len(message.velocity):
             dq = self._values("velocity", message.velocity, key, places)
@@ -493,12 +477,6 @@ class _StateReader:
         self.received.append(received)
         self.q.append(q)
         self.dq.append(dq)
-
-    def _is_repeated(self, stamp: int, q: np.ndarray) -> bool:
-        """Whether a state is the one before, published again."""
-        if not self.has_stamps or not self.stamp:
-            return False
-        return stamp == self.stamp[-1] and np.array_equal(q, self.q[-1])
 
     def _entries(self, key: tuple[str, ...]) -> list[int] | None:
         """The entries of the scenario's joints in messages with these names."""

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -29,6 +29,10 @@ from iblf_jax.identification.replay import LeafSlice
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.scenario import Scenario, with_parts
 from iblf_jax.studies.draws import check_paths, paths_overlap
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
 
 MIN_POSITIVE_FACTOR = 1e-3
 """Default lower limit of a number that must be positive, by its start."""
@@ -98,7 +102,7 @@ WIDTHS = {"friction": "friction_width", "coulomb": "width"}
 """Leaf of Coulomb friction -> leaf of its width, the speed over which it changes its sign."""
 
 
-def with_widths(scenario: Scenario, given: Any) -> Any:
+def with_widths(scenario: Scenario, given: object) -> Any:
     """The paths, and the path of the width for each Coulomb friction among them."""
     if not isinstance(given, list | tuple) or not all(isinstance(path, str) for path in given):
         return given
@@ -141,7 +145,7 @@ def _check_robot(scenario: Scenario) -> None:
 
 
 def coordinates(
-    scenario: Scenario, given: Any, limits: Mapping[str, Any]
+    scenario: Scenario, given: object, limits: Mapping[str, Any]
 ) -> tuple[Scenario, Coordinates]:
     """The scenario to replay, and the coordinates of a list of paths.
 
@@ -155,7 +159,13 @@ def coordinates(
         the plant, or limits that exclude the start.
     """
     _check_robot(scenario)
-    requested = _checked_paths(scenario, given)
+    requested = checks.nonempty_list("paths", given, '["plant.mass", "plant.damping"]')
+    requested = [checks.string("paths", path, "a path") for path in requested]
+    if DELAY_PATH in requested and scenario.sampling is None:
+        expected = "a scenario with a sampling, which has this leaf"
+        remedy = "Leave it out: the delay is estimated in any case."
+        raise checks.fail("paths", DELAY_PATH, expected, remedy)
+    check_paths(scenario, requested, "paths")
     scenario, plant_paths = scenario_of_plant(scenario, requested)
     for path in limits:
         if path not in requested:
@@ -193,21 +203,6 @@ def coordinates(
         high=high,
         has_delay_path=DELAY_PATH in requested,
     )
-
-
-def _checked_paths(scenario: Scenario, given: Any) -> list[str]:
-    """The paths; ValueError for an unknown or overlapping one."""
-    found = checks.nonempty_list("paths", given, '["plant.mass", "plant.damping"]')
-    found = [checks.string("paths", path, "a path") for path in found]
-    if DELAY_PATH in found and scenario.sampling is None:
-        raise checks.fail(
-            "paths",
-            DELAY_PATH,
-            "a scenario with a sampling, which has this leaf",
-            "Leave it out: the delay is estimated in any case.",
-        )
-    check_paths(scenario, found, "paths")
-    return found
 
 
 def is_inertia(scenario: Scenario, path: str, value: np.ndarray) -> bool:
@@ -270,7 +265,7 @@ def _default_lower_limit(path: str, value: np.ndarray, sign: str | None) -> np.n
     return np.full_like(value, -np.inf)
 
 
-def _limit(name: str, given: Any, default: np.ndarray) -> np.ndarray:
+def _limit(name: str, given: object, default: np.ndarray) -> np.ndarray:
     """One limit of all entries of a leaf."""
     if given is None:
         return default
@@ -341,22 +336,16 @@ def scales(c: Coordinates, scenario: Scenario, by_x: np.ndarray, torque: np.ndar
         if unit in ("kg", "kg m^2") and start[i] > 0:
             scale[i] = start[i]
         elif unit == "m":
-            length = _mean_link_length(scenario)
-            if length > 0:
-                scale[i] = min(by_torque[i], length)
+            joints = scenario.plant.skeleton(scenario.initial.q)
+            if joints is not None and len(joints) > 1:
+                links = np.linalg.norm(np.diff(np.asarray(joints), axis=0), axis=1)
+                length = float(np.mean(links))
+                scale[i] = min(by_torque[i], length) if length > 0 else scale[i]
     for first in c.bodies:
         scale[first : first + 6] = np.sum(c.x[first : first + 3])
     return scale
 
 
-def _mean_link_length(scenario: Scenario) -> float:
-    """The mean distance between joints [m]; 0 for a robot without a skeleton."""
-    joints = scenario.plant.skeleton(scenario.initial.q)
-    if joints is None or len(joints) < 2:
-        return 0.0
-    return float(np.mean(np.linalg.norm(np.diff(np.asarray(joints), axis=0), axis=1)))
-
-
-def drive_limit(limit: Any) -> np.ndarray:
+def drive_limit(limit: ArrayLike | None) -> np.ndarray:
     """The largest speed or torque of a robot's joints; infinite if unknown."""
     return np.asarray(np.inf if limit is None else limit)

@@ -73,7 +73,7 @@ class Log(NamedTuple):
         ]
 
 
-def read(log: Any, n: int, what: str = "log", joints: Sequence[str] = ()) -> list[Log]:
+def read(log: object, n: int, what: str = "log", joints: Sequence[str] = ()) -> list[Log]:
     """The logs that a user gave, checked.
 
     Args:

@@ -23,7 +23,8 @@ Source: H. White, Econometrica 50 (1982) 1-25, and K.-Y. Liang, S. L. Zeger, Bio
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections.abc import Iterable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -212,17 +213,17 @@ def _inverse(A: np.ndarray) -> np.ndarray:
     )
 
 
-def _least_squares(design: _Design, chosen: Any) -> np.ndarray:
+def _least_squares(design: _Design, chosen: Iterable[int]) -> np.ndarray:
     X = design.columns[:, list(chosen)]
     return _inverse(X.T @ X) @ (X.T @ design.residuals)
 
 
-def _residual(design: _Design, chosen: Any) -> np.ndarray:
+def _residual(design: _Design, chosen: Iterable[int]) -> np.ndarray:
     chosen = list(chosen)
     return design.residuals - design.columns[:, chosen] @ _least_squares(design, chosen)
 
 
-def _errors(design: _Design, chosen: Any) -> np.ndarray:
+def _errors(design: _Design, chosen: Iterable[int]) -> np.ndarray:
     """Cluster-robust standard errors of the chosen columns."""
     chosen = list(chosen)
     X, residuals = design.columns[:, chosen], _residual(design, chosen)
@@ -321,7 +322,7 @@ def describe_finding(finding: Finding, joint: str, remedy: str) -> str:
     )
 
 
-def remedy_for(finding: Finding, available: Any, names: tuple[str, ...]) -> str:
+def remedy_for(finding: Finding, available: Iterable[str], names: tuple[str, ...]) -> str:
     """Which leaf to add to the paths.
 
     Args:

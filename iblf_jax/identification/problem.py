@@ -56,6 +56,12 @@ class IdentificationProblem(NamedTuple):
           x: parameters at which the steps of the integrator are chosen.
           free: torques that are free near standstill.
         """
+        motion = self.motion
+        points = [jnp.asarray(a) for a in (motion.t, motion.q, motion.dq, motion.tau)]
+        sensitivities = inverse_dynamics_for_torque(
+            self.simulated, jnp.asarray(x), *points, places=self.coordinates.places
+        )
+        shortest = min(log.step for log in self.logs)
         return ShootingProblem(
             self.simulated,
             self.coordinates,
@@ -63,15 +69,6 @@ class IdentificationProblem(NamedTuple):
             self.logs,
             self.zero_order_hold,
             self.loss,
-            self._substeps(x),
+            substeps_for(sensitivities, shortest),
             free,
         )
-
-    def _substeps(self, x: np.ndarray) -> int:
-        """Number of integrator steps between two samples."""
-        motion = self.motion
-        points = [jnp.asarray(a) for a in (motion.t, motion.q, motion.dq, motion.tau)]
-        sensitivities = inverse_dynamics_for_torque(
-            self.simulated, jnp.asarray(x), *points, places=self.coordinates.places
-        )
-        return substeps_for(sensitivities, min(log.step for log in self.logs))

@@ -17,7 +17,7 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -39,6 +39,10 @@ from iblf_jax.identification.levenberg_marquardt import (
 from iblf_jax.identification.replay import InverseDynamics, inverse_dynamics
 from iblf_jax.identification.smoothing import SmoothedMotion
 from iblf_jax.world.robots import joint_names
+
+if TYPE_CHECKING:
+    from iblf_jax.simulation.scenario import Scenario
+
 
 WEIGHT_UPDATES, STEPS_PER_UPDATE = 3, 12
 """Estimates of the joints' weights, and steps of the search for each of them."""
@@ -80,7 +84,10 @@ class InitialEstimate(NamedTuple):
 
 
 def initial_estimate(
-    scenario: Any, c: Coordinates, motion: SmoothedMotion, limits: tuple[np.ndarray, np.ndarray]
+    scenario: Scenario,
+    c: Coordinates,
+    motion: SmoothedMotion,
+    limits: tuple[np.ndarray, np.ndarray],
 ) -> InitialEstimate:
     """The parameters from which the search starts.
 
@@ -126,7 +133,7 @@ def initial_estimate(
 class _Regression(NamedTuple):
     """The least-squares problem of the torques for given weights of the joints."""
 
-    scenario: Any
+    scenario: Scenario
     coordinates: Coordinates
     motion: SmoothedMotion
     start: np.ndarray
@@ -176,7 +183,7 @@ def coordinate_scales(c: Coordinates, scale: np.ndarray) -> np.ndarray:
 
 
 def inverse_dynamics_along(
-    scenario: Any, c: Coordinates, x: np.ndarray, motion: SmoothedMotion
+    scenario: Scenario, c: Coordinates, x: np.ndarray, motion: SmoothedMotion
 ) -> InverseDynamics:
     """The torques that a smoothed motion needs with parameters x, and their derivatives."""
     points: list[Any] = [jnp.asarray(a) for a in (x, motion.t, motion.q, motion.dq, motion.ddq)]
@@ -199,7 +206,7 @@ def _unexplained_share(residual: np.ndarray, tau: np.ndarray) -> float:
 # ----------------------------------------------------------------- checks of the log
 
 
-def _check_motion(scenario: Any, motion: SmoothedMotion) -> None:
+def _check_motion(scenario: Scenario, motion: SmoothedMotion) -> None:
     """Raises ValueError for a robot at standstill, or for a motion that is impossible."""
     speed = np.sqrt(np.mean(motion.dq**2, axis=0))
     _check_speed(motion, float(np.sqrt(np.sum(speed**2))))
@@ -242,7 +249,7 @@ def _check_speed(motion: SmoothedMotion, speed: float) -> None:
     )
 
 
-def _check_positions(scenario: Any, motion: SmoothedMotion, names: tuple[str, ...]) -> None:
+def _check_positions(scenario: Scenario, motion: SmoothedMotion, names: tuple[str, ...]) -> None:
     """Raises ValueError for positions outside the ranges of the joints."""
     kinds = scenario.plant.kinds or ("revolute",) * scenario.n
     for range_name, limits in _ranges(scenario).items():
@@ -264,7 +271,7 @@ def _check_positions(scenario: Any, motion: SmoothedMotion, names: tuple[str, ..
             )
 
 
-def _ranges(scenario: Any) -> dict[str, np.ndarray]:
+def _ranges(scenario: Scenario) -> dict[str, np.ndarray]:
     """The ranges of the joints, (n, 2) each: the arm's limits, if it has any, and the bounds with a
     margin of 8 times their width.
     """
@@ -282,7 +289,7 @@ def _ranges(scenario: Any) -> dict[str, np.ndarray]:
     return found
 
 
-def _check_torque_size(scenario: Any, modelled: Any, motion: SmoothedMotion) -> None:
+def _check_torque_size(scenario: Scenario, modelled: Any, motion: SmoothedMotion) -> None:
     """Raises ValueError for torques in another unit; `modelled` are those of the scenario's
     robot.
     """
@@ -336,7 +343,7 @@ def _check_masses(c: Coordinates, x: np.ndarray) -> None:
 
 
 def _check_explained(
-    scenario: Any, c: Coordinates, motion: SmoothedMotion, residual: np.ndarray
+    scenario: Scenario, c: Coordinates, motion: SmoothedMotion, residual: np.ndarray
 ) -> None:
     """Raises ValueError if other columns or units explain the torques, or if nothing does."""
     unexplained = _unexplained_share(residual, motion.tau)

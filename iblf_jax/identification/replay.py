@@ -40,32 +40,32 @@ class LeafSlice(NamedTuple):
 class WindowInputs(NamedTuple):
     """Initial states and torques of W windows of a log, of K steps each."""
 
-    t: Any
+    t: np.ndarray | jax.Array
     """Times of the samples, (W, K + 1) [s]."""
-    q: Any
+    q: np.ndarray | jax.Array
     """Initial positions, (W, n) [rad]."""
-    dq: Any
+    dq: np.ndarray | jax.Array
     """(W, n) [rad/s]."""
-    tau: Any
+    tau: np.ndarray | jax.Array
     """Torque of each step, (W, K, n) [N m]."""
 
 
 class InverseDynamics(NamedTuple):
     """The torque e that a motion needs, and its derivatives, at P points."""
 
-    torque: Any
+    torque: np.ndarray | jax.Array
     """e, (P, n) [N m]."""
-    mass: Any
+    mass: np.ndarray | jax.Array
     """M, (P, n, n)."""
-    by_q: Any
+    by_q: np.ndarray | jax.Array
     """(P, n, n)."""
-    by_dq: Any
+    by_dq: np.ndarray | jax.Array
     """(P, n, n)."""
-    by_x: Any
+    by_x: np.ndarray | jax.Array
     """(P, n, p)."""
 
 
-def values_by_path(places: tuple[LeafSlice, ...], x: Any) -> Mapping[str, Any]:
+def values_by_path(places: tuple[LeafSlice, ...], x: np.ndarray | jax.Array) -> Mapping[str, Any]:
     """The values of the leaves, by path, from x (p,)."""
     return {
         place.path: x[place.start : place.start + place.size].reshape(place.shape)

@@ -27,7 +27,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from functools import cached_property, partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -49,6 +49,10 @@ from iblf_jax.identification.replay import (
 )
 from iblf_jax.identification.smoothing import local_polynomial
 from iblf_jax.identification.standstill import NO_FRICTION_WIDTH, FreeTorques
+
+if TYPE_CHECKING:
+    from iblf_jax.simulation.scenario import Scenario
+
 
 HUBER = 1.345
 """Standard deviations beyond which the Huber loss is linear: 95 % efficiency for normal noise."""
@@ -234,7 +238,7 @@ class Penalty(NamedTuple):
 class ShootingProblem:
     """The least-squares problem that the docstring of this module states."""
 
-    scenario: Any
+    scenario: Scenario
     c: Coordinates
     w: Windows
     logs: list[Log]
@@ -305,12 +309,12 @@ class ShootingProblem:
     def refine(
         self,
         z: np.ndarray,
-        limits: Any,
+        limits: tuple[np.ndarray, np.ndarray],
         scale: np.ndarray,
         sigma: np.ndarray,
         prior: Prior,
         max_steps: int,
-        rms_limit: Any = np.inf,
+        rms_limit: np.ndarray | float = np.inf,
     ) -> Refinement:
         """The minimum, by Gauss-Newton steps that alternate with estimates of sigma.
 

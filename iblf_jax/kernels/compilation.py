@@ -6,7 +6,7 @@ import contextlib
 import gc
 import math
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -29,6 +29,9 @@ from iblf_jax.kernels.program import (
     finished,
     kind_of,
 )
+
+if TYPE_CHECKING:
+    from jax.extend import core
 
 
 class CompiledStep(NamedTuple):
@@ -104,7 +107,7 @@ def compile_step(
 
 
 def _lowered(
-    jaxpr: Any,
+    jaxpr: core.ClosedJaxpr,
     carried: int,
     shared: Shapes,
     per_run: Shapes,
@@ -125,7 +128,12 @@ def _lowered(
     series_ids = _inputs(b, series, lambda i, kind: b.input("series", i, kind))
     carry_ids = _inputs(b, carry, lambda i, kind: b.input("carry", i, kind), of_carry=True)
     index_id = np.asarray(b.input("index", 0, "i"), np.int64)
-    _mark_constant_carry(b, jaxprs.opened(jaxpr)[0], carry_ids)
+    # The inputs of the jaxpr end with the carry and the index of the step.
+    opened = jaxprs.opened(jaxpr)[0]
+    inputs = opened.invars[-1 - len(carry_ids) : -1]
+    for before, after, ids in zip(inputs, opened.outvars, carry_ids, strict=False):
+        if after is before:
+            b.constant_carry.update(ids.ravel().tolist())
     out = closed(b, jaxpr, [*shared_ids, *per_run_ids, *series_ids, *carry_ids, index_id])
     carry_out, recorded = out[:carried], out[carried:]
     if Shapes.of(jaxpr.out_avals[:carried]).kinds() != carry.kinds():
@@ -168,15 +176,6 @@ def _inputs(
         arrays.append(np.asarray(ids, np.int64).reshape(shape))
         first += len(ids)
     return arrays
-
-
-def _mark_constant_carry(b: Builder, jaxpr: Any, carry: Sequence[Ids]) -> None:
-    """Marks the carried numbers that a step returns unchanged (`Builder.constant_carry`)."""
-    # The inputs of the jaxpr end with the carry and the index of the step.
-    inputs = jaxpr.invars[-1 - len(carry) : -1]
-    for before, after, ids in zip(inputs, jaxpr.outvars, carry, strict=False):
-        if after is before:
-            b.constant_carry.update(ids.ravel().tolist())
 
 
 def _shared(b: Builder, number: int, known: tuple[Known | None, ...]) -> int:

@@ -206,7 +206,13 @@ class _Emitter:
             return self.calls.results[i]
         args = [names[a] for a in node.args]
         if i in self.in_place:
-            return self._overwritten(i, args)
+            # The carried number is overwritten where the selection takes another one.
+            condition, yes, no = args
+            if node.args[2] == self.in_place[i]:
+                self.lines.append(f"  if (AT({condition}, 0)) {no} = {yes};")
+                return no
+            self.lines.append(f"  if (!AT({condition}, 0)) {yes} = {no};")
+            return yes
         if node.op == "call":
             self.lines += self.calls.statements(i, args)
             return "called"
@@ -214,26 +220,12 @@ class _Emitter:
             text = f"f_lookup({self.tables[i]}, {len(node.value)}, {args[0]})"
         else:
             kinds = [self.program.nodes[a].kind for a in node.args]
-            text = self._expression(node, args, kinds)
+            if node.op in self.target.in_c and kinds[0] == "f":
+                text = self.target.in_c[node.op].format(*args)
+            else:
+                text = expression(node, args, kinds)
         self.lines.append(f"  {c_type(node)} v{i} = {text};")
         return f"v{i}"
-
-    def _expression(self, node: Node, args: list[str], kinds: list[str]) -> str:
-        """The C of one operation, the target's own where it has one."""
-        if node.op in self.target.in_c and kinds[0] == "f":
-            return self.target.in_c[node.op].format(*args)
-        return expression(node, args, kinds)
-
-    def _overwritten(self, i: int, args: list[str]) -> str:
-        """Adds a statement that overwrites a carried number where a selection takes another one;
-        returns the number's name.
-        """
-        condition, yes, no = args
-        if self.program.nodes[i].args[2] == self.in_place[i]:
-            self.lines.append(f"  if (AT({condition}, 0)) {no} = {yes};")
-            return no
-        self.lines.append(f"  if (!AT({condition}, 0)) {yes} = {no};")
-        return yes
 
     def _sines(self, sines: list[int], names: dict[int, str], stored: Mapping[int, str]) -> None:
         """Adds statements for sines and cosines whose angles are computed: one test decides
@@ -628,7 +620,11 @@ class _Segments:
         needed = self.e.needed(self.names, outputs)
         computed = [i for i in needed if nodes[i].op not in ("const", "result")]
         part = {i: k // self.size for k, i in enumerate(computed)}
-        last = self._last_reading_part(part, outputs)
+        # the last function that reads each node; the parts are in order
+        last = dict.fromkeys(part, -1)
+        for i, number in part.items():
+            last |= {a: number for a in nodes[i].args if a in part}
+        last |= dict.fromkeys(outputs, len(part))
         read_last = defaultdict[int, list[int]](list)
         for i in computed:
             if nodes[i].op != "call":
@@ -639,26 +635,12 @@ class _Segments:
             here = computed[first : first + self.size]
             outlive = [i for i in here if last[i] > number and nodes[i].op != "call"]
             calls.append(self._one(here, outlive, own))
-            if not kept:
-                self._free_places(read_last[number])
+            if kept:
+                continue
+            for place in [self.names[i] for i in read_last[number] if i in self.names]:
+                self.free[place[0]].append(place)
         self.names |= {i: self.e.calls.results[i] for i in needed if nodes[i].op == "result"}
         return calls
-
-    def _last_reading_part(self, part: dict[int, int], outputs: list[int]) -> dict[int, int]:
-        """Node -> the last function that reads it, of the nodes of `part`, node -> function."""
-        last = dict.fromkeys(part, -1)
-        for i, number in part.items():
-            for a in self.e.program.nodes[i].args:
-                if a in part:
-                    last[a] = number  # the parts are in order
-        return last | dict.fromkeys(outputs, len(part))
-
-    def _free_places(self, nodes: list[int]) -> None:
-        """Makes the places of nodes free for others."""
-        for i in nodes:
-            if i in self.names:
-                place = self.names[i]
-                self.free[place[0]].append(place)
 
     @property
     def declarations(self) -> str:
@@ -671,32 +653,21 @@ class _Segments:
         """
         nodes = self.e.program.nodes
         inner = dict(self.names)
-        stored = {i: own[i] if i in own else self._free_place(nodes[i]) for i in outlive}
+        stored = {}
+        for i in outlive:
+            array = {"F": "x", "I": "y"}[c_type(nodes[i])]
+            if i in own:
+                stored[i] = own[i]
+            elif self.free[array]:
+                stored[i] = self.free[array].pop()
+            else:
+                stored[i] = f"{array}[{self.sizes[array]}]"
+                self.sizes[array] += 1
         self.e.statements(inner, here, stored)
         self.names |= stored | {i: inner[i] for i in here if nodes[i].op == "call"}
         name = f"{self.name}_{len(self.functions)}"
         self.functions.append(self.e.function(self.head.format(name)))
         return f"{name}{self.arguments};"
-
-    def _free_place(self, node: Node) -> str:
-        """A free place for a number, a new one if there is none."""
-        array = {"F": "x", "I": "y"}[c_type(node)]
-        if self.free[array]:
-            return self.free[array].pop()
-        self.sizes[array] += 1
-        return f"{array}[{self.sizes[array] - 1}]"
-
-
-def _read_by_outputs(e: _Emitter, names: dict[int, str], carried: list[int]) -> list[int]:
-    """The nodes computed for the carried numbers that are also outputs of the program, or that the
-    nodes needed for outputs alone read.
-    """
-    computed = set(e.needed(names, carried))
-    outputs = e.program.outputs
-    read = {
-        a for i in e.needed(names, outputs) if i not in computed for a in e.program.nodes[i].args
-    }
-    return sorted(computed & {*outputs, *read})
 
 
 def _advance_in_segments(e: _Emitter, layout: Layout, segment: int) -> str:
@@ -719,7 +690,10 @@ def _advance_in_segments(e: _Emitter, layout: Layout, segment: int) -> str:
     once = frontier(program, e.classes, PER_RUN, lambda k: k == PER_RUN | TIME)
     before = segments.add(once, kept=True)
     carried = sorted({after for _, after in program.carry})
-    read = _read_by_outputs(e, segments.names, carried)
+    # Nodes of the carried numbers may also be outputs, or be read by nodes for outputs alone.
+    computed = set(e.needed(segments.names, carried))
+    for_outputs = [i for i in e.needed(segments.names, program.outputs) if i not in computed]
+    read = computed & {*program.outputs, *(a for i in for_outputs for a in nodes[i].args)}
     within = segments.add(sorted({*carried, *read}), kept=False)
     signs = [f"  {places[c]} = -{places[c]};" for c in layout.ints if program.kinds[c] == "b"]
     names_after = dict(segments.names)

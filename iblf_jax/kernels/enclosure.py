@@ -110,7 +110,9 @@ def compiled(function: Callable, dimension: int, shapes: tuple[tuple[int, ...], 
     lowered = interval_program(function, dimension, shapes)
     constants = sum(map(math.prod, shapes))
     # By their digits: 0.0 and -0.0 are equal, and each has its place.
-    literals = tuple({value.hex(): value for value in _literals(lowered.program)}.values())
+    nodes = lowered.program.nodes
+    floats = [node.value for node in nodes if node.op == "const" and node.kind == "f"]
+    literals = tuple({value.hex(): value for value in floats}.values())
     source = _source(lowered.program, dimension, constants, literals, lowered.sizes[0])
     return Compiled(*lowered, literals, source)
 
@@ -150,11 +152,6 @@ def interval_program(
         if program.nodes[output].kind != "f":
             raise UnsupportedError("an output that is no floating-point number")
     return Lowered(program, tuple(ids.size for ids in results), tuple(x.shape for x in out))
-
-
-def _literals(program: Program) -> list[float]:
-    """The floating-point constants of a program."""
-    return [node.value for node in program.nodes if node.op == "const" and node.kind == "f"]
 
 
 class _Emitter:
@@ -488,7 +485,7 @@ def pointer(array: np.ndarray) -> ctypes.c_void_p:
 
 
 def enclose(
-    function: Callable, lower: Any, upper: Any, constants: Sequence[Any] = ()
+    function: Callable, lower: np.ndarray, upper: np.ndarray, constants: Sequence[Any] = ()
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Bounds of a function on boxes, rounded outward.
 

@@ -8,7 +8,7 @@ scans are unrolled. A primitive without a rule raises `UnsupportedError`.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,6 +16,10 @@ from iblf_jax.kernels import jaxprs
 from iblf_jax.kernels.functions import apply
 from iblf_jax.kernels.program import Builder, Ids, UnsupportedError, constants
 from iblf_jax.kernels.rules import RULES
+
+if TYPE_CHECKING:
+    from jax.extend import core
+
 
 MAX_REINTERPRETED = 50
 """Equations up to which an inner function is interpreted at each call: a cache would not be
@@ -56,7 +60,8 @@ def interpret(b: Builder, jaxpr: Any, consts: Sequence[Ids], inputs: Sequence[Id
         elif name in RULES:
             for v in eqn.outvars:
                 _check_float(b, v.aval.dtype, eqn)
-            results = _several(RULES[name](b, eqn, *operands))
+            found = RULES[name](b, eqn, *operands)
+            results = found if isinstance(found, list | tuple) else [found]
         else:
             raise UnsupportedError(f"the primitive {name!r} is not lowered")
         for v, ids in zip(eqn.outvars, results, strict=True):
@@ -70,20 +75,13 @@ def interpret(b: Builder, jaxpr: Any, consts: Sequence[Ids], inputs: Sequence[Id
     return [read(v) for v in jaxpr.outvars]
 
 
-def _several(found: Any) -> list[Ids | None]:
-    """The results of a rule, of which a single one is an array or a NumPy scalar."""
-    if isinstance(found, list | tuple):
-        return list(found)
-    return [found]
-
-
 def _check_float(b: Builder, dtype, eqn) -> None:
     """Refuses floats of another type than the program's, except constants, which are rounded."""
     if np.issubdtype(dtype, np.floating) and dtype != b.dtype and eqn.invars:
         raise UnsupportedError(f"it mixes {dtype} with {b.dtype} ({eqn.primitive.name})")
 
 
-def closed(b: Builder, function: Any, operands: Sequence[Ids]) -> list[Ids]:
+def closed(b: Builder, function: core.ClosedJaxpr, operands: Sequence[Ids]) -> list[Ids]:
     """The outputs of a function, given its operands as node numbers."""
     jaxpr, values = jaxprs.opened(function)
     return interpret(b, jaxpr, [constants(b, value) for value in values], operands)
@@ -123,34 +121,23 @@ def _cond(b: Builder, eqn, operands, used):
     value = b.value(which)
     if value is not None:
         return closed(b, branches[min(max(int(value), 0), len(branches) - 1)], rest)
-    results = _last(b, branches, which, rest, used)
+    is_truth = b.nodes[which].kind == "b"
+    if b.is_shared(which):
+        # All runs take the same branch: the last one is computed only in steps that take it.
+        taken = which
+        if not is_truth:
+            taken = b.emit("ge", which, b.constant(len(branches) - 1, "i"), kind="b")
+        results = apply(b, branches[-1], rest, used, [used], closed, taken)
+    else:
+        results = list(closed(b, branches[-1], rest))
     for i in reversed(range(len(branches) - 1)):
-        condition = _is_at_most(b, which, i)
+        if is_truth:
+            condition = b.emit("not", which, kind="b")
+        else:
+            condition = b.emit("le", which, b.constant(i, "i"), kind="b")
         others = closed(b, branches[i], rest)
         results = [choose(b, condition, yes, no) for yes, no in zip(others, results, strict=True)]
     return results
-
-
-def _is_at_most(b: Builder, which: int, branch: int) -> int:
-    """The node of "the index of the branch is at most `branch`"."""
-    if b.nodes[which].kind == "b":
-        return b.emit("not", which, kind="b")
-    return b.emit("le", which, b.constant(branch, "i"), kind="b")
-
-
-def _last(
-    b: Builder, branches: Sequence[Any], which: int, operands: Sequence[Ids], used: tuple[bool, ...]
-) -> list[Ids | None]:
-    """The used results of the last branch.
-
-    If all runs take the same branch, the last one is computed only in steps that take it.
-    """
-    if not b.is_shared(which):
-        return list(closed(b, branches[-1], operands))
-    taken = which
-    if b.nodes[which].kind != "b":
-        taken = b.emit("ge", which, b.constant(len(branches) - 1, "i"), kind="b")
-    return apply(b, branches[-1], operands, used, [used], closed, taken)
 
 
 def _while(b: Builder, eqn, operands, used):

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -28,11 +28,14 @@ from iblf_jax.kernels.program import (
     Builder,
     Ids,
     LoweringLimits,
-    Node,
     Program,
     finished,
     needed,
 )
+
+if TYPE_CHECKING:
+    from jax.extend import core
+
 
 Uses = tuple[bool, ...]
 """Which results of a function are used."""
@@ -41,12 +44,12 @@ Uses = tuple[bool, ...]
 class Called(NamedTuple):
     """An inner function and the properties of its operands on which its program depends."""
 
-    jaxpr: Any
+    jaxpr: core.Jaxpr
     pattern: tuple
     """The pattern of its operands, number by number (`_pattern`)."""
     shapes: tuple[tuple[int, ...], ...]
     """The shapes of its operands."""
-    dtype: Any
+    dtype: np.dtype
     sparse: bool
     limits: LoweringLimits
     exact: bool
@@ -80,7 +83,7 @@ class Split(NamedTuple):
 
 def apply(
     b: Builder,
-    jaxpr: Any,
+    jaxpr: core.Jaxpr,
     operands: Sequence[Ids],
     used: Uses,
     all_uses: Sequence[Uses],
@@ -114,7 +117,11 @@ def apply(
     limit = b.limits.written_out
     if condition is not None:
         limit = b.limits.under_condition
-    if _operations_on_state(template.program) <= limit:
+    on_state = sum(
+        bool(c & PER_RUN) and node.op not in INPUTS
+        for c, node in zip(template.program.classes(), template.program.nodes, strict=True)
+    )
+    if on_state <= limit:
         program = template.program
         known = _known_inputs(program, flat)
     else:
@@ -148,19 +155,13 @@ def _pattern(b: Builder, operands: list[int]) -> tuple:
         if i == b.absent:
             pattern.append((node.kind, None))
         elif node.op == "const":
-            pattern.append((node.kind, _hashable_value(node)))
+            # The digits of a float also distinguish NaN and the sign of zero.
+            pattern.append((node.kind, node.value.hex() if node.kind == "f" else node.value))
         else:
             pattern.append(
                 (node.kind, first.setdefault(i, place), b.depends_on_state(i), i in b.known_finite)
             )
     return tuple(pattern)
-
-
-def _hashable_value(constant: Node) -> Any:
-    """The value of a constant in a form that also distinguishes NaN and the sign of zero."""
-    if constant.kind == "f":
-        return constant.value.hex()
-    return constant.value
 
 
 @CACHES.function(maxsize=16)
@@ -207,14 +208,6 @@ def _template(called: Called) -> Template:
 def _with_reciprocals(called: Called) -> Program:
     """The program of a function, with products instead of divisions."""
     return with_reciprocals(_template(called).program)
-
-
-def _operations_on_state(program: Program) -> int:
-    """The number of operations that depend on the state."""
-    return sum(
-        bool(c & PER_RUN) and node.op not in INPUTS
-        for c, node in zip(program.classes(), program.nodes, strict=True)
-    )
 
 
 def _samples(program: Program, results: list[Ids], used: Uses) -> list[int]:

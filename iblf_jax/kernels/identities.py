@@ -220,7 +220,10 @@ def _is_finite(b: Builder, args, kind):
     parts = _of_sum(b, args[0])
     if not any(b.nodes[i].op == "log1p" for i in parts):
         return None
-    rest, logarithms = _without_logarithms(b, parts)
+    known: dict[int, Terms] = {}
+    for i in parts:
+        known[i] = _terms_of(b, i, known)
+    rest, logarithms = known[parts[-1]]
     found = []
     if rest is not None:
         found.append(b.emit("is_finite", rest, kind="b"))
@@ -260,14 +263,6 @@ def _of_sum(b: Builder, total: int) -> list[int]:
 
 Terms = tuple[int | None, list[int]]
 """A sum without its terms log1p(x), None if it has no other terms, and these x."""
-
-
-def _without_logarithms(b: Builder, parts: list[int]) -> Terms:
-    """The last of `parts` (`_of_sum`) without its logarithms, and their arguments."""
-    known: dict[int, Terms] = {}
-    for i in parts:
-        known[i] = _terms_of(b, i, known)
-    return known[parts[-1]]
 
 
 def _terms_of(b: Builder, i: int, known: dict[int, Terms]) -> Terms:

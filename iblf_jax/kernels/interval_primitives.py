@@ -25,18 +25,15 @@ def _primitive(name: str) -> Any:
 
     def batch(arguments, axes):
         size = next(x.shape[a] for x, a in zip(arguments, axes, strict=True) if a is not None)
-        moved = [_batch_axis_first(x, axis, size) for x, axis in zip(arguments, axes, strict=True)]
-        return primitive.bind(*moved), 0
+        return primitive.bind(
+            *(
+                jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
+                for x, axis in zip(arguments, axes, strict=True)
+            )
+        ), 0
 
     primitive = new_primitive(name, first, shapes=first, jvp=jvp, batch=batch)
     return primitive
-
-
-def _batch_axis_first(x: jax.Array, axis: int | None, size: int) -> jax.Array:
-    """An argument with the axis of the batch in front."""
-    if axis is None:
-        return jnp.broadcast_to(x, (size, *x.shape))
-    return jnp.moveaxis(x, axis, 0)
 
 
 _UPPER = _primitive("upper")

@@ -28,7 +28,7 @@ CALLED = {
 """Primitive that calls an inner function once -> the parameter that holds its jaxpr."""
 
 
-def called(equation: Any) -> Any:
+def called(equation: core.JaxprEqn) -> Any:
     """The function that an equation calls; None for an equation that calls none, or by rules of its
     own (a loop, a branch).
     """
@@ -38,12 +38,12 @@ def called(equation: Any) -> Any:
     return equation.params[CALLED[name]]
 
 
-def opened(function: Any) -> tuple[Any, Sequence[Any]]:
+def opened(function: core.ClosedJaxpr | core.Jaxpr) -> tuple[Any, Sequence[Any]]:
     """The equations of a function, with their variables, and the values of its constants."""
     return getattr(function, "jaxpr", function), getattr(function, "consts", ())
 
 
-def is_variable(atom: Any) -> bool:
+def is_variable(atom: core.Var | core.Literal) -> bool:
     """Whether an operand or an output is a variable; otherwise it is a literal with its `val`."""
     return isinstance(atom, core.Var)
 
@@ -56,24 +56,24 @@ def scan_sizes(params: dict[str, Any]) -> tuple[int, int]:
     return len(consts), len(carry)
 
 
-def count_operations(function: Any) -> int:
+def count_operations(function: core.ClosedJaxpr) -> int:
     """The number of operations of a function and of its inner functions, each counted once."""
     return sum(len(jaxpr.eqns) for jaxpr, _ in nested(function))
 
 
-def count_executed_operations(function: Any) -> int:
+def count_executed_operations(function: core.ClosedJaxpr) -> int:
     """The number of operations of a function, with those of an inner function at each of its calls
     in the place of the call.
     """
     # By `id`: the function holds all of its inner ones, so none of them ends meanwhile.
     counts: dict[int, int] = {}
 
-    def count(jaxpr: Any) -> int:
+    def count(jaxpr: core.Jaxpr) -> int:
         if id(jaxpr) not in counts:
             counts[id(jaxpr)] = sum(map(count_of, jaxpr.eqns))
         return counts[id(jaxpr)]
 
-    def count_of(equation: Any) -> int:
+    def count_of(equation: core.JaxprEqn) -> int:
         bodies = list(core.jaxprs_in_params(equation.params))
         if not bodies:
             return 1
@@ -82,7 +82,7 @@ def count_executed_operations(function: Any) -> int:
     return count(opened(function)[0])
 
 
-def needed(function: Any) -> set[Any]:
+def needed(function: core.ClosedJaxpr | core.Jaxpr) -> set[Any]:
     """The variables that the outputs depend on."""
     jaxpr, _ = opened(function)
     found = {x for x in jaxpr.outvars if is_variable(x)}
@@ -92,7 +92,7 @@ def needed(function: Any) -> set[Any]:
     return found
 
 
-def depend_on_last(function: Any, count: int) -> list[bool]:
+def depend_on_last(function: core.ClosedJaxpr, count: int) -> list[bool]:
     """Which outputs depend on the last `count` inputs."""
     jaxpr, _ = opened(function)
     found = set(jaxpr.invars[len(jaxpr.invars) - count :])
@@ -102,7 +102,7 @@ def depend_on_last(function: Any, count: int) -> list[bool]:
     return [is_variable(x) and x in found for x in jaxpr.outvars]
 
 
-def entry_of_stack(function: Any, index: int) -> Any:
+def entry_of_stack(function: core.ClosedJaxpr, index: int) -> Any:
     """A Python function that returns one entry of the array that a traced function stacks along its
     first axis at its end, without the computation of the others; None if it does not do so.
     """
@@ -117,14 +117,14 @@ def entry_of_stack(function: Any, index: int) -> Any:
     return lambda *operands: evaluate(*operands)[0]
 
 
-def inner_functions(equation: Any) -> Iterator[Any]:
+def inner_functions(equation: core.JaxprEqn) -> Iterator[Any]:
     """The functions among the parameters of an equation, with their constants."""
     for value in equation.params.values():
         parts = value if isinstance(value, tuple | list) else (value,)
         yield from (x for x in parts if isinstance(x, core.Jaxpr | core.ClosedJaxpr))
 
 
-def nested(function: Any) -> Iterator[tuple[Any, Sequence[Any]]]:
+def nested(function: core.ClosedJaxpr | core.Jaxpr) -> Iterator[tuple[Any, Sequence[Any]]]:
     """A function and all functions inside it, as `opened`, in the order of their first calls.
 
     A function that is called several times occurs once: a chain of n functions, each of which calls
@@ -133,7 +133,7 @@ def nested(function: Any) -> Iterator[tuple[Any, Sequence[Any]]]:
     # The values keep what the keys are the identities of: nothing else can get one of these.
     found: dict[tuple[int, ...], Any] = {}
 
-    def visit(function: Any) -> Iterator[tuple[Any, Sequence[Any]]]:
+    def visit(function: core.ClosedJaxpr | core.Jaxpr) -> Iterator[tuple[Any, Sequence[Any]]]:
         jaxpr, constants = opened(function)
         key = (id(jaxpr), *map(id, constants))
         if key in found:
@@ -147,12 +147,12 @@ def nested(function: Any) -> Iterator[tuple[Any, Sequence[Any]]]:
     return visit(function)
 
 
-def primitives(function: Any) -> set[str]:
+def primitives(function: core.ClosedJaxpr) -> set[str]:
     """The names of all primitives of a function."""
     return {equation.primitive.name for jaxpr, _ in nested(function) for equation in jaxpr.eqns}
 
 
-def constants(function: Any) -> Iterator[Any]:
+def constants(function: core.ClosedJaxpr) -> Iterator[Any]:
     """The values of all constants and literals of a function."""
     for jaxpr, values in nested(function):
         yield from values

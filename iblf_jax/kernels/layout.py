@@ -187,17 +187,13 @@ class FunctionCalls:
             place_of[call] = places(results, "r", "s", free)
             self.size = self.size.largest(free.after(results))
             # The next call may overwrite the results that the program does not read.
-            free = free.after(results[: self._number_of_read_results(call)])
+            read = [n.value for n in self.nodes if n.op == "result" and n.args[0] == call]
+            free = free.after(results[: max(read, default=-1) + 1])
         return {
             i: place_of[node.args[0]][node.value]
             for i, node in enumerate(self.nodes)
             if node.op == "result"
         }
-
-    def _number_of_read_results(self, call: int) -> int:
-        """The number of results of a call up to the last one that the program reads."""
-        read = [n.value for n in self.nodes if n.op == "result" and n.args[0] == call]
-        return max(read, default=-1) + 1
 
     @property
     def declarations(self) -> str:

@@ -62,24 +62,20 @@ def written_out(program: Program) -> Program:
 
     def rule(b: Builder, node, args, i):
         if node.op == "call":
-            results[i] = _inlined(b, node.value, args[len(args) - len(arguments_of(node)) :])
+            arguments = args[len(args) - len(arguments_of(node)) :]
+            new: list[int] = []
+            for inner in node.value.nodes:
+                if inner.op == "argument":
+                    new.append(arguments[inner.value])
+                else:
+                    new.append(b.copy(inner, [new[a] for a in inner.args]))
+            results[i] = [new[output] for output in node.value.outputs]
             return -1
         if node.op == "result":
             return results[node.args[0]][node.value]
         return None
 
     return rebuilt(program, rule)
-
-
-def _inlined(b: Builder, function: Program, arguments: tuple[int, ...]) -> list[int]:
-    """The nodes of the results of a function."""
-    new: list[int] = []
-    for node in function.nodes:
-        if node.op == "argument":
-            new.append(arguments[node.value])
-        else:
-            new.append(b.copy(node, [new[a] for a in node.args]))
-    return [new[output] for output in function.outputs]
 
 
 def with_reciprocals(program: Program) -> Program:

@@ -47,7 +47,7 @@ def new_primitive(
     return primitive
 
 
-def is_zero(tangent: Any) -> bool:
+def is_zero(tangent: object) -> bool:
     """Whether a tangent or a cotangent is the symbol of zeros."""
     return isinstance(tangent, ad.Zero)
 

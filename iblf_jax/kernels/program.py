@@ -221,9 +221,11 @@ class Builder:
         nodes = [self.nodes[a] for a in args]
         # The first argument decides most cases, without a generator.
         if nodes[0].op == "const" and all(node.op == "const" for node in nodes):
-            folded = self._folded(op, nodes, kind)
-            if folded is not None:
-                return self.constant(folded, kind)
+            values = [node.value for node in nodes]
+            if not self.exact or is_exact(op, values, kind):
+                folded = fold(op, values, [node.kind for node in nodes], kind, self.dtype)
+                if folded is not None:
+                    return self.constant(folded, kind)
         simpler = simplify(self, op, args, kind)
         if simpler is not None:
             return simpler
@@ -233,13 +235,6 @@ class Builder:
         if kind == "f" and self.known_finite and all(map(self._is_finite, args)):
             self.known_finite.add(new)
         return new
-
-    def _folded(self, op: str, nodes: Sequence[Node], kind: str):
-        """The value of an operation on constants; None if it is not computed here."""
-        values = [node.value for node in nodes]
-        if self.exact and not is_exact(op, values, kind):
-            return None
-        return fold(op, values, [node.kind for node in nodes], kind, self.dtype)
 
     def lookup(self, table: tuple[float, ...], index: int) -> int:
         """The node of table[index], for an index that is unknown at compile time."""

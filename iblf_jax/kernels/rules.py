@@ -37,7 +37,10 @@ def power(b: Builder, eqn, x: Ids, exponent: int) -> Ids:
     which does not lose that its factors are equal.
     """
     if b.exact and abs(exponent) > 2:
-        return _power_of_interval(b, eqn, x, exponent)
+        power = each(b, "pow", eqn, x, np.full(x.shape, b.constant(abs(exponent), "f")))
+        if exponent < 0:
+            return each(b, "div", eqn, np.full(x.shape, b.constant(1, "f")), power)
+        return power
     result, square, left = None, x, abs(exponent)
     kind = kind_of(eqn.outvars[0].aval.dtype)
     while left:
@@ -51,14 +54,6 @@ def power(b: Builder, eqn, x: Ids, exponent: int) -> Ids:
         return one
     if exponent < 0:
         return each(b, "div", eqn, one, result)
-    return result
-
-
-def _power_of_interval(b: Builder, eqn, x: Ids, exponent: int) -> Ids:
-    """x^exponent for an integer exponent as the operation "pow", inverted if it is negative."""
-    result = each(b, "pow", eqn, x, np.full(x.shape, b.constant(abs(exponent), "f")))
-    if exponent < 0:
-        return each(b, "div", eqn, np.full(x.shape, b.constant(1, "f")), result)
     return result
 
 

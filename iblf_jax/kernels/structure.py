@@ -160,9 +160,16 @@ def _gather(b: Builder, eqn, x: Ids, index: Ids) -> Ids:
 
     A gather that fills entries outside with a given number is refused.
     """
-    filled = eqn.params["mode"] == jax.lax.GatherScatterMode.FILL_OR_DROP
-    if filled and not _is_inside(b, eqn, x, index):
-        raise UnsupportedError("a gather that fills what lies outside; index with mode='clip'")
+    if eqn.params["mode"] == jax.lax.GatherScatterMode.FILL_OR_DROP:
+        starts = eqn.params["dimension_numbers"].start_index_map
+        sizes = eqn.params["slice_sizes"]
+        places = [[b.value(i) for i in row] for row in index.reshape(-1, len(starts)).tolist()]
+        if not all(
+            v is not None and 0 <= v <= x.shape[a] - sizes[a]
+            for place in places
+            for a, v in zip(starts, place, strict=True)
+        ):
+            raise UnsupportedError("a gather that fills what lies outside; index with mode='clip'")
 
     def at(values):
         params = dict(eqn.params, fill_value=None, mode=jax.lax.GatherScatterMode.CLIP)
@@ -187,18 +194,6 @@ def _gather(b: Builder, eqn, x: Ids, index: Ids) -> Ids:
         one = np.moveaxis(_chosen(b, x, here, at), axes, range(len(axes)))[row]
         np.moveaxis(result, axes, range(len(axes)))[row] = one
     return result
-
-
-def _is_inside(b: Builder, eqn, x: Ids, index: Ids) -> bool:
-    """Whether all places of a gather are known and inside."""
-    axes = eqn.params["dimension_numbers"].start_index_map
-    sizes = eqn.params["slice_sizes"]
-    rows = [[b.value(i) for i in row] for row in index.reshape(-1, len(axes)).tolist()]
-    return all(
-        v is not None and 0 <= v <= x.shape[a] - sizes[a]
-        for row in rows
-        for a, v in zip(axes, row, strict=True)
-    )
 
 
 def _window(starts, shape: Sequence[int], sizes: Sequence[int]) -> tuple[slice, ...]:

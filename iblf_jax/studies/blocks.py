@@ -76,26 +76,6 @@ def _without_inadmissible(admissible: jax.Array, x: jax.Array) -> jax.Array:
     return jnp.where(mask, x, jnp.asarray(mark, x.dtype))
 
 
-def _block(program: StudyProgram, shared: SharedInputs, inputs: CaseInputs) -> BlockResults:
-    """Draws and runs one block."""
-    varied, drawn, admissible = drawn_leaves(program.targets, shared, inputs)
-    outcome = program.batch(shared.uncertain.scenario, varied, shared.folds, shared.dt)
-    metrics = {name: _without_inadmissible(admissible, x) for name, x in outcome.metrics.items()}
-    status = jnp.where(admissible, outcome.status, flag(~admissible, Status.INADMISSIBLE_DRAW))
-    mode = _without_inadmissible(admissible, outcome.fastest_mode)
-    return BlockResults(metrics, status, mode, drawn)
-
-
-def _record_block(
-    program: StudyProgram, shared: SharedInputs, inputs: CaseInputs, record_every: int
-):
-    """The recorded positions of a block of runs: signal -> (B, T, n); and the times, (B, T)."""
-    varied, _, _ = drawn_leaves(program.targets, shared, inputs)
-    recorded = program.batch.positions(shared.uncertain.scenario, varied, shared.dt, record_every)
-    times = recorded.pop("t")
-    return recorded, times
-
-
 @programs.jit(static_argnames=("program", "record_every"))
 def _execute(
     shared: SharedInputs,
@@ -104,9 +84,19 @@ def _execute(
     program: StudyProgram,
     record_every: int | None = None,
 ):
-    if record_every is None:
-        return _block(program, shared, inputs)
-    return _record_block(program, shared, inputs, record_every)
+    """Draws and runs one block; with `record_every` its recorded positions, signal -> (B, T, n),
+    and the times, (B, T).
+    """
+    varied, drawn, admissible = drawn_leaves(program.targets, shared, inputs)
+    scenario = shared.uncertain.scenario
+    if record_every is not None:
+        recorded = program.batch.positions(scenario, varied, shared.dt, record_every)
+        return recorded, recorded.pop("t")
+    outcome = program.batch(scenario, varied, shared.folds, shared.dt)
+    metrics = {name: _without_inadmissible(admissible, x) for name, x in outcome.metrics.items()}
+    status = jnp.where(admissible, outcome.status, flag(~admissible, Status.INADMISSIBLE_DRAW))
+    mode = _without_inadmissible(admissible, outcome.fastest_mode)
+    return BlockResults(metrics, status, mode, drawn)
 
 
 def run_blocks(

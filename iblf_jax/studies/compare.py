@@ -128,7 +128,11 @@ def compare(
     }
     settling = next(fold for fold in _folds(scenario, metrics) if isinstance(fold, Settling))
     rollouts = {name: _run(one, options) for name, one in scenarios.items()}
-    gains = {name: _gains_in_words(one.controller) for name, one in scenarios.items()}
+    gains = {}
+    for name, one in scenarios.items():
+        own = attributes(unwrapped(one.controller), gain_names(one.controller))
+        words = [f"{gain} = {_shown(value)}" for gain, value in own.items()]
+        gains[name] = ", ".join(words) or "no gains"
     if not equal_effort:
         return Comparison(rollouts, {}, {}, {}, gains, settling=settling)
     first = next(iter(rollouts))
@@ -213,15 +217,14 @@ def _with_law(scenario: Scenario, law: str | TrackingLaw) -> Scenario:
         if robot is not None:
             model = robot
         elif isinstance(law, str):
-            raise _no_robot(law, model)
+            expected = (
+                f"a law, as names are laws of robots and {type(model).__name__} contains none"
+            )
+            remedy = (
+                f"Give {{{law!r}: controllers.BarrierBackstepping(...)}}, with a barrier a level."
+            )
+            raise checks.fail("laws", law, expected, remedy)
     return dataclasses.replace(scenario, controller=controller, observer=observer, model=model)
-
-
-def _no_robot(name: str, model: Any) -> ValueError:
-    """The error for a law by name on a plant without a robot."""
-    expected = f"a law, as names are laws of robots and {type(model).__name__} contains none"
-    remedy = f"Give {{{name!r}: controllers.BarrierBackstepping(...)}}, with a barrier a level."
-    return checks.fail("laws", name, expected, remedy)
 
 
 def _folds(scenario: Scenario, further: Sequence[Fold]) -> tuple[Fold, ...]:
@@ -301,7 +304,7 @@ def _at_effort_of(
     return _EqualEffort(float("nan"), reason=reason, search=found)
 
 
-def _scaled(scenario: Scenario, names: Sequence[str], factor: Any) -> dict[str, Any]:
+def _scaled(scenario: Scenario, names: Sequence[str], factor: np.ndarray | float) -> dict[str, Any]:
     """Path -> gains times a factor, or times each of several factors, (N, ...)."""
     gains = attributes(unwrapped(scenario.controller), names)
     return {
@@ -346,7 +349,7 @@ def _trials_of(
 def _batch(
     scenario: Scenario,
     varied: dict[str, jax.Array],
-    folds: Any,
+    folds: tuple[Fold, ...],
     dt: jax.Array,
     *,
     request: RunRequest,
@@ -371,12 +374,7 @@ def factor_nearest_one(effort: Callable[[float], float], target: float) -> float
     return search(trials, target).factor
 
 
-def _gains_in_words(law: TrackingLaw) -> str:
-    gains = attributes(unwrapped(law), gain_names(law))
-    return ", ".join(f"{name} = {_shown(gain)}" for name, gain in gains.items()) or "no gains"
-
-
-def _shown(value: Any) -> str:
+def _shown(value: object) -> str:
     values = np.unique(np.asarray(value))
     if values.size == 1:
         return f"{values[0]:g}"

@@ -239,7 +239,15 @@ class Comparison(Result):
                 "Each law's gains (k1 and K2, or its own) are scaled by one factor: of those found"
                 " from 1/32 to 32 that do it, the one nearest to 1 (by |ln factor|)."
             )
-            notes["effort"] = [f"{equal} {scaled}", *self._searches_in_words()]
+            # Why a law has no factor, and for the others what was searched where that says more
+            # than the factor.
+            notes["effort"] = [f"{equal} {scaled}"]
+            notes["effort"] += [f"{name}: no factor; {why}." for name, why in self.reasons.items()]
+            notes["effort"] += [
+                f"{name}: factor {self.factors[name]:.4g}; {found.in_words()}."
+                for name, found in self.searches.items()
+                if name not in self.reasons and (found.failed or len(found.crossings) > 1)
+            ]
         for kind, runs in (("gains", self.rollouts), ("effort", self.equal_effort)):
             if kind in notes and runs and all(map(_is_closest_at_start, runs.values())):
                 notes[kind].append(MARGINS_OF_START)
@@ -268,16 +276,6 @@ class Comparison(Result):
             name = plants.input_name(plant)
             return f"{name}, sqrt(mean |u - u_0|^2) with u_0 = 0 (the plant has no steady_input),"
         return plant.notation.effort_formula
-
-    def _searches_in_words(self) -> list[str]:
-        """Why a law has no factor, and for the others what was searched where that says more than
-        the factor.
-        """
-        lines = [f"{name}: no factor; {why}." for name, why in self.reasons.items()]
-        for name, found in self.searches.items():
-            if name not in self.reasons and (found.failed or len(found.crossings) > 1):
-                lines.append(f"{name}: factor {self.factors[name]:.4g}; {found.in_words()}.")
-        return lines
 
     def _content(self) -> Content:
         run = next(iter(self.rollouts.values()))
@@ -323,7 +321,7 @@ class Comparison(Result):
         return present("comparison figure", self, joint, **options)
 
 
-def _cell(value: Any) -> str:
+def _cell(value: object) -> str:
     if isinstance(value, str):
         return value
     return "never" if value == math.inf else number(value)

@@ -54,7 +54,9 @@ def to_dataset(
         )
         attributes = {"units": units.get(name, "")}
         by_point = values.reshape(-1, config["runs"], *values.shape[1:])
-        if name.startswith(DRAWN) and np.all(done) and _is_constant(by_point):
+        of_first = np.broadcast_to(by_point[:1], by_point.shape)
+        is_drawn = name.startswith(DRAWN) and np.all(done)
+        if is_drawn and np.array_equal(by_point, of_first, equal_nan=True):
             path = name.removeprefix(DRAWN)
             coordinates[path] = ((RUN, *dims[len(outer) :]), by_point[0], attributes)
         else:
@@ -69,11 +71,6 @@ def to_dataset(
         )
         variables["started_outside"] = (dims, outside, {"units": "1", "description": text})
     return xarray.Dataset(variables, coordinates, _attributes(config, done))
-
-
-def _is_constant(values: np.ndarray) -> bool:
-    """Whether values, (points, runs, ...), do not depend on the point."""
-    return np.array_equal(values, np.broadcast_to(values[:1], values.shape), equal_nan=True)
 
 
 def status_attributes(values: str) -> dict[str, Any]:

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
@@ -26,7 +25,7 @@ MAX_SOBOL = (21201, 2**30)
 """Dimensions and points that SciPy's Sobol sequence has."""
 
 
-def check_sampler(sampler: str, runs: int, replicates: Any) -> int:
+def check_sampler(sampler: str, runs: int, replicates: object) -> int:
     """The number of replicates; ValueError for a sampler, a number of runs and replicates that do
     not fit together.
     """
@@ -91,7 +90,7 @@ def designed_numbers(
     runs: int,
     replicates: int,
     seed: int,
-    dtype: Any,
+    dtype: np.dtype,
     salt: int = 0,
 ) -> dict[str, np.ndarray]:
     """Name of the draws -> their uniform numbers in all runs, (runs, ...); arguments as
@@ -102,7 +101,7 @@ def designed_numbers(
 
 
 def split(
-    points: np.ndarray, shapes: Mapping[str, tuple[int, ...]], dtype: Any
+    points: np.ndarray, shapes: Mapping[str, tuple[int, ...]], dtype: np.dtype
 ) -> dict[str, np.ndarray]:
     """The columns of `points` by path, each with its leaf's shape, kept off 0 and 1 in `dtype`."""
     edge = np.finfo(dtype).eps / 2

@@ -252,7 +252,7 @@ class Interval:
         return np.asarray(self.low), np.asarray(self.high)
 
 
-def is_distribution(value: Any) -> bool:
+def is_distribution(value: object) -> bool:
     """Whether a value is an interval, or has what a distribution requires; its class is then
     adopted by the family.
     """
@@ -264,7 +264,7 @@ def is_distribution(value: Any) -> bool:
     return fits
 
 
-def is_interval(perturbation: Any) -> bool:
+def is_interval(perturbation: object) -> bool:
     """Whether a perturbation states a set of values and no distribution."""
     return isinstance(perturbation, Perturbation) and isinstance(
         perturbation.distribution, Interval
@@ -560,7 +560,7 @@ def _perturbation(kind: str, distribution: Any, shared: Any) -> Perturbation:
     return Perturbation(distribution, kind, shared)
 
 
-def _no_distribution(kind: str, given: Any) -> ValueError:
+def _no_distribution(kind: str, given: object) -> ValueError:
     remedy = f"Write ij.{kind}(ij.uniform(low, high)), for example."
     return checks.fail(f"{kind}: distribution", given, "a distribution", remedy)
 

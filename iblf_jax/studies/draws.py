@@ -148,7 +148,12 @@ def targets_of(
                 f"{what}[{source!r}]", perturbation, expected, _remedy_for(perturbation)
             )
         _check_kind(f"{what}[{source!r}]", perturbation, intervals)
-        for path in _targets(scenario, source, perturbation):
+        # Plant and model are separate targets where their nominal values differ.
+        full = paths.expand(source)
+        values = [np.asarray(paths.get(scenario, path)) for path in full]
+        if perturbation.kind == "value" or all(np.array_equal(x, values[0]) for x in values):
+            full = [source]
+        for path in full:
             nominal = np.asarray(paths.get(scenario, path))
             sign = paths.sign_at(scenario, path)
             target = Target(path, source, nominal.shape, sign)
@@ -157,23 +162,16 @@ def targets_of(
                 _check_sign(f"{what}[{source!r}]", target, perturbation, nominal)
             targets.append(target)
             by_path[path] = perturbation
-    _check_groups(what, by_path)
-    return tuple(targets), by_path
-
-
-def _check_groups(what: str, perturbations: Mapping[str, Perturbation]) -> None:
-    """Raises ValueError for leaves that cannot share the draws of their group."""
     first: dict[str, tuple[str, Any]] = {}
-    for path, perturbation in perturbations.items():
+    for path, perturbation in by_path.items():
         group = perturbation.group
         distribution: Any = perturbation.distribution
-        if not group:
-            continue
         other_path, other = first.setdefault(group, (path, distribution))
-        if not _can_share_draws(other, distribution):
+        if group and not _can_share_draws(other, distribution):
             expected = "the same number of draws, and the same weights of samples"
             remedy = "Give the leaves that do not vary together groups of other names."
             raise checks.fail(f"{what}: group {group!r}", (other_path, path), expected, remedy)
+    return tuple(targets), by_path
 
 
 def _can_share_draws(a: Distribution, b: Distribution) -> bool:
@@ -189,7 +187,7 @@ def _can_share_draws(a: Distribution, b: Distribution) -> bool:
     return np.array_equal(np.asarray(a.weights), np.asarray(b.weights))
 
 
-def _remedy_for(given: Any) -> str:
+def _remedy_for(given: object) -> str:
     """The remedy for a range or a distribution that was given instead of a perturbation."""
     if isinstance(given, tuple | list) and len(given) == 2 and checks.is_concrete(given):
         ends = [
@@ -216,15 +214,6 @@ def _check_kind(name: str, perturbation: Perturbation, intervals: bool) -> None:
         expected = "a distribution: an interval is a set of values without probabilities"
         remedy = f"Write ij.{perturbation.kind}(ij.uniform(low, high)) for equal probabilities."
     raise checks.fail(name, perturbation.distribution, expected, remedy)
-
-
-def _targets(scenario: Scenario, source: str, perturbation: Perturbation) -> list[str]:
-    """The source itself, or separate paths of plant and model where their nominal values differ."""
-    full = paths.expand(source)
-    nominal = [np.asarray(paths.get(scenario, path)) for path in full]
-    if perturbation.kind == "value" or all(np.array_equal(x, nominal[0]) for x in nominal):
-        return [source]
-    return full
 
 
 def _check_fit(name: str, perturbation: Perturbation, nominal: np.ndarray) -> None:

@@ -301,7 +301,12 @@ def _refined(
             places += _hiding_places(powers, excess)
         if not places:
             break
-        further = _between(powers, places, len(grid()))
+        # Exponents inside the intervals nearest to the factor 1, equally many in each.
+        most = len(grid())
+        places = sorted(places, key=lambda i: min(abs(powers[i]), abs(powers[i + 1])))[:most]
+        each = max(1, most // len(places))
+        share = np.arange(1, each + 1) / (each + 1)
+        further = np.concatenate([powers[i] + share * (powers[i + 1] - powers[i]) for i in places])
         new = run(2.0**further)
         order = np.argsort(np.concatenate([powers, further]), kind="stable")
         powers = np.concatenate([powers, further])[order]
@@ -341,16 +346,6 @@ def _hiding_places(powers: np.ndarray, excess: np.ndarray) -> list[int]:
             found |= set(range(a, b))  # the crossing is somewhere among failed trials
     brackets = set(_open_brackets(powers, excess))
     return sorted(found - brackets)
-
-
-def _between(powers: np.ndarray, places: list[int], most: int) -> np.ndarray:
-    """Exponents inside these intervals, equally many in each; at most `most`, in the intervals
-    nearest to the factor 1.
-    """
-    chosen = sorted(places, key=lambda i: min(abs(powers[i]), abs(powers[i + 1])))[:most]
-    each = max(1, most // len(chosen))
-    share = np.arange(1, each + 1) / (each + 1)
-    return np.concatenate([powers[i] + share * (powers[i + 1] - powers[i]) for i in chosen])
 
 
 def _crossings(powers: np.ndarray, excess: np.ndarray, target: float) -> list[float]:

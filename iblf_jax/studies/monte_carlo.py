@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
-from typing import Any
 
 import numpy as np
 
@@ -92,7 +91,10 @@ def monte_carlo(
     options = RunOptions(
         duration, dt, method, backend, seed, runs=runs, sampler=sampler, replicates=replicates
     )
-    _check_not_all_the_same(scenario, perturbations)
+    is_empty = isinstance(perturbations, Mapping) and not perturbations
+    if is_empty and not (isinstance(scenario, Scenario) and has_noise(scenario)):
+        remedy = "Without any all runs are the same: use ij.simulate."
+        raise checks.fail("perturbations", perturbations, "at least one perturbation", remedy)
     prepared = prepare(scenario, perturbations, options, metrics)
     checks.fits_memory("runs", options.runs, case_bytes(prepared))
     with bar(progress, options.runs) as shown:
@@ -101,14 +103,3 @@ def monte_carlo(
     warn_of_step(results.status, results.fastest_mode, errors, options.dt, method)
     warn_of_sampling(results.status, results.metrics.get(RADIUS))
     return Study.of(prepared, results)
-
-
-def _check_not_all_the_same(scenario: Any, perturbations: Any) -> None:
-    is_empty = isinstance(perturbations, Mapping) and not perturbations
-    if is_empty and not (isinstance(scenario, Scenario) and has_noise(scenario)):
-        raise checks.fail(
-            "perturbations",
-            perturbations,
-            "at least one perturbation",
-            "Without any all runs are the same: use ij.simulate.",
-        )

@@ -10,7 +10,6 @@ import dataclasses
 import os
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from typing import Any
 
 import jax
 
@@ -98,7 +97,7 @@ class Design:
     """Number of points; None for a grid."""
 
 
-def executor_of(executor: Any) -> LocalExecutor | Executor:
+def executor_of(executor: object) -> LocalExecutor | Executor:
     """The checked `executor` of a study; None for this process.
 
     Raises:
@@ -118,7 +117,7 @@ def executor_of(executor: Any) -> LocalExecutor | Executor:
     return executor
 
 
-def store_of(store: Any) -> StoreOptions | None:
+def store_of(store: StoreOptions | str | os.PathLike | None) -> StoreOptions | None:
     """The checked `store` of a sweep, from a path or an object."""
     if store is None:
         return None
@@ -127,7 +126,7 @@ def store_of(store: Any) -> StoreOptions | None:
     return store.checked()
 
 
-def design_of(design: Any) -> Design:
+def design_of(design: Design | str) -> Design:
     """The `design` of a sweep, from a word or an object."""
     if isinstance(design, Design):
         return design

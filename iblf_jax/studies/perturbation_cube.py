@@ -9,9 +9,9 @@ their distributions.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +21,10 @@ from iblf_jax.core import checks
 from iblf_jax.simulation.paths import get, why_inadmissible
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies.draws import Target, UncertainScenario, draw, draw_shapes, targets_of
+
+if TYPE_CHECKING:
+    from iblf_jax.studies.distributions import Perturbation
+
 
 MAX_BATCHES = 64
 """Batches of random points that are drawn at most in the search for admissible ones."""
@@ -108,7 +112,9 @@ class Cube:
 _values = jax.jit(Cube.values)
 
 
-def unit_cube(scenario: Scenario, perturbations: Any, *, signs: bool = True) -> Cube:
+def unit_cube(
+    scenario: Scenario, perturbations: Mapping[str, Perturbation], *, signs: bool = True
+) -> Cube:
     """The cube of a user's perturbations.
 
     Args:

@@ -146,8 +146,14 @@ def sensitivity(
     Source: A. Saltelli et al., Computer Physics Communications 181 (2010) 259-270.
     """
     executor = executor_of(executor)
-    points = _checked_points(points)
-    _check_arguments(perturbations, output)
+    points = checks.positive_integer("points", points, most=MAX_SOBOL[1])
+    if points & (points - 1) or points < 2:
+        nearest = max(2, 1 << round(np.log2(points)))
+        raise checks.fail("points", points, "a power of two", f"Take points={nearest}.")
+    if not isinstance(output, str) and not callable(output):
+        raise checks.fail("output", output, "the name of a metric, or a function of the metrics")
+    if isinstance(perturbations, Mapping) and not perturbations:
+        raise checks.fail("perturbations", perturbations, "at least one perturbation")
     options = RunOptions(duration, dt, method, backend, seed, runs=1)
     prepared = prepare(scenario, perturbations, options, metrics)
     if isinstance(output, str):
@@ -171,21 +177,6 @@ def sensitivity(
         runs,
         evaluation.failed,
     )
-
-
-def _checked_points(points: Any) -> int:
-    points = checks.positive_integer("points", points, most=MAX_SOBOL[1])
-    if points & (points - 1) or points < 2:
-        nearest = max(2, 1 << round(np.log2(points)))
-        raise checks.fail("points", points, "a power of two", f"Take points={nearest}.")
-    return points
-
-
-def _check_arguments(perturbations: Any, output: Any) -> None:
-    if not isinstance(output, str) and not callable(output):
-        raise checks.fail("output", output, "the name of a metric, or a function of the metrics")
-    if isinstance(perturbations, Mapping) and not perturbations:
-        raise checks.fail("perturbations", perturbations, "at least one perturbation")
 
 
 def _indices(evaluation: _Evaluation, points: int, dimension: int) -> tuple[Any, Any]:

@@ -58,7 +58,7 @@ class Probability(Result):
         return f"{self.estimate:.4g} ({self.count} of {self.runs} runs; {ends})"
 
 
-def check_confidence(confidence: Any) -> float:
+def check_confidence(confidence: object) -> float:
     """A confidence in (0, 1), or a ValueError."""
     number = checks.positive_number("confidence", confidence, "1")
     if number >= 1:

@@ -77,7 +77,7 @@ def _zarr() -> Any:
     return zarr
 
 
-def differences(theirs: Any, ours: Any, name: str = "") -> list[str]:
+def differences(theirs: object, ours: object, name: str = "") -> list[str]:
     """Where two configurations differ, "name: the store has x, this call y"."""
     if isinstance(theirs, dict) and isinstance(ours, dict):
         found = []
@@ -90,7 +90,7 @@ def differences(theirs: Any, ours: Any, name: str = "") -> list[str]:
     return [f"{name}: the store has {_shown(theirs)}, this call {_shown(ours)}"]
 
 
-def _shown(value: Any) -> str:
+def _shown(value: object) -> str:
     text = "nothing"
     if value is not ABSENT:
         text = json.dumps(value)

@@ -23,7 +23,7 @@ from iblf_jax.studies.study_setup import PreparedStudy
 from iblf_jax.studies.sweep_points import Points
 
 
-def describe_component(part: Any) -> Any:
+def describe_component(part: object) -> Any:
     """A component as JSON: its class and the values of all its fields, recursively."""
     if isinstance(part, str | bool | None):
         return part
@@ -40,7 +40,7 @@ def describe_component(part: Any) -> Any:
     return {"class": type(part).__qualname__, **fields}
 
 
-def structure(part: Any) -> Any:
+def structure(part: object) -> Any:
     """The classes and static fields of a component, without its numbers."""
     if modules.is_module(part) and not isinstance(part, tuple | list):
         inner = {str(k): structure(x) for k, x in modules.entries(part).items()}
@@ -62,7 +62,7 @@ def structure(part: Any) -> Any:
     return found
 
 
-def _static(value: Any) -> Any:
+def _static(value: object) -> Any:
     """A static field; of a function its name, as its code is in the digest of the program."""
     if isinstance(value, str | bool | int | float):
         return value

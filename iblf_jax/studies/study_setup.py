@@ -48,7 +48,7 @@ class SharedInputs(NamedTuple):
     """The inputs that all runs of a study share; traced."""
 
     uncertain: UncertainScenario
-    folds: Any
+    folds: tuple[Fold, ...]
     dt: jax.Array
 
 

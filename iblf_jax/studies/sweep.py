@@ -132,13 +132,25 @@ def sweep(
     options = RunOptions(
         duration, dt, method, backend, seed, runs=runs, sampler=sampler, replicates=replicates
     )
-    _check_something_varies(grid, perturbations, options.runs)
+    example = '{"plant.mass[1]": ij.factor(ij.uniform(0.7, 1.3))}'
+    checks.mapping("perturbations", perturbations, example)
+    if not perturbations and options.runs > 1:
+        remedy = "Without any all runs at a point are the same."
+        raise checks.fail("runs", options.runs, "1 without perturbations", remedy)
+    if not perturbations and isinstance(grid, Mapping) and not grid:
+        remedy = "Give a grid or perturbations, or use ij.simulate."
+        raise checks.fail("grid", grid, "something to vary", remedy)
     points = make_points(canonical(scenario), grid, design.kind, design.points, options.seed)
     prepared = prepare(scenario, perturbations, options, metrics, points.values)
     checks.fits_memory("runs at all points", prepared.cases, case_bytes(prepared))
     config = store_config.describe(prepared, points, design.kind)
     if store_options is None:
-        result = _in_memory(prepared, config, executor, progress)
+        with bar(progress, prepared.cases) as shown:
+            arrays = named_arrays(run_all_cases(prepared, executor, shown.update))
+        variables = _variables(prepared, config)
+        data = {name: arrays[name] for name in variables}
+        units = {name: variable.si_unit for name, variable in variables.items()}
+        result = to_dataset(config, data, units, np.ones(prepared.cases, bool))
     else:
         result = _into_store(prepared, config, executor, progress, store_options)
     status, modes = (np.ravel(result[name]) for name in ("status", "fastest_mode"))
@@ -147,19 +159,6 @@ def sweep(
     radii = np.ravel(result[RADIUS]) if RADIUS in result else None
     warn_of_sampling(status, radii)
     return result
-
-
-def _check_something_varies(grid: Any, perturbations: Any, runs: int) -> None:
-    example = '{"plant.mass[1]": ij.factor(ij.uniform(0.7, 1.3))}'
-    checks.mapping("perturbations", perturbations, example)
-    if perturbations:
-        return
-    if runs > 1:
-        remedy = "Without any all runs at a point are the same."
-        raise checks.fail("runs", runs, "1 without perturbations", remedy)
-    if isinstance(grid, Mapping) and not grid:
-        remedy = "Give a grid or perturbations, or use ij.simulate."
-        raise checks.fail("grid", grid, "something to vary", remedy)
 
 
 @checks.known_keywords
@@ -208,20 +207,6 @@ def _variables(prepared: PreparedStudy, config: dict[str, Any]) -> dict[str, Var
     return variables
 
 
-def _in_memory(
-    prepared: PreparedStudy,
-    config: dict[str, Any],
-    executor: LocalExecutor | Executor,
-    progress: bool | None,
-) -> xarray.Dataset:
-    with bar(progress, prepared.cases) as shown:
-        arrays = named_arrays(run_all_cases(prepared, executor, shown.update))
-    variables = _variables(prepared, config)
-    data = {name: arrays[name] for name in variables}
-    units = {name: variable.si_unit for name, variable in variables.items()}
-    return to_dataset(config, data, units, np.ones(prepared.cases, bool))
-
-
 def _into_store(
     prepared: PreparedStudy,
     config: dict[str, Any],
@@ -249,8 +234,12 @@ def _into_store(
             for span, computed in results:
                 if computed is not None:
                     store.write(span.start // store.unit, named_arrays(computed))
-                if stop.requested:
-                    _interrupt(store)
+                marks = store.marks() if stop.requested else None
+                if marks is not None and not marks.all():
+                    raise Interrupted(
+                        f"Stopped after {marks.sum()} of {store.units} units, which are written to"
+                        f" {store.path}. Start the same call or command again to resume."
+                    )
     return _dataset(store)
 
 
@@ -295,16 +284,6 @@ def _spans(
             advance(store.size(unit))
         else:
             yield store.span(unit)
-
-
-def _interrupt(store: Store) -> None:
-    """Raises Interrupted unless all units are computed."""
-    marks = store.marks()
-    if not marks.all():
-        raise Interrupted(
-            f"Stopped after {marks.sum()} of {store.units} units, which are written to"
-            f" {store.path}. Start the same call or command again to resume."
-        )
 
 
 __all__ = ["Interrupted", "StoreError", "load_sweep", "sweep"]

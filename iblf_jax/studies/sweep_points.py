@@ -97,7 +97,7 @@ def _grid(scenario: Scenario, grid: Mapping[str, Any]) -> Points:
     return Points(dims, {path: path for path in grid}, axis_values, values)
 
 
-def _axis_values(scenario: Scenario, path: str, values: Any) -> np.ndarray:
+def _axis_values(scenario: Scenario, path: str, values: object) -> np.ndarray:
     """The values of one path of a grid, (m,) for numbers that fill the leaf, or (m, ...) for whole
     leaves.
     """

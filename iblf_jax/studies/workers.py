@@ -114,17 +114,13 @@ def environment(backend: str) -> dict[str, Any]:
         "platform": devices.platform(),
     }
     if uses_host_compiler(backend):
-        found |= _kernel_environment()
+        from iblf_jax.kernels import ToolchainError, built_for
+
+        try:
+            found |= built_for()
+        except ToolchainError:
+            found |= {"processor": "unknown", "compiler": "none"}
     return found
-
-
-def _kernel_environment() -> dict[str, str]:
-    from iblf_jax.kernels import ToolchainError, built_for
-
-    try:
-        return built_for()
-    except ToolchainError:
-        return {"processor": "unknown", "compiler": "none"}
 
 
 REMEDIES = {

@@ -232,7 +232,9 @@ def failure_probability(
     return _result(space, options, found, arguments)
 
 
-def _checked(estimator: Any, margin: Any, limit: Any, confidence: Any, runs: Any) -> FailureOptions:
+def _checked(
+    estimator: str, margin: str, limit: float, confidence: float, runs: int | None
+) -> FailureOptions:
     checks.one_of("estimator", estimator, tuple(RUNS))
     checks.one_of("margin", margin, tuple(FOLDS))
     number = float(checks.number_between("limit", limit, -1e9, 1e9, "the margin's unit"))

@@ -24,7 +24,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -51,6 +51,9 @@ from iblf_jax.tuning.parameters import Box
 from iblf_jax.tuning.quantities import DEFICITS, SIGNAL_OF_MARGIN, Peak
 from iblf_jax.tuning.runs import NUMBERS_A_RUN
 from iblf_jax.tuning.solvers import SQP, SearchSpace
+
+if TYPE_CHECKING:
+    from tqdm import tqdm
 
 SOLVER = SQP(tolerance=1e-4, radius=0.5)
 MAX_HALVINGS = 8
@@ -202,7 +205,8 @@ def falsify(
     )
 
 
-class _Attacks(NamedTuple):
+@dataclasses.dataclass
+class _Attacks:
     """All attacks, as `solvers.sqp` evaluates them."""
 
     problem: WorstCaseSearch
@@ -216,7 +220,7 @@ class _Attacks(NamedTuple):
         return Derivatives(Value(found.values), found.gradients, np.zeros((starts, size, size)))
 
 
-def _attack(iterations: int, shown: Any, unit: str, problem: WorstCaseSearch) -> None:
+def _attack(iterations: int, shown: tqdm, unit: str, problem: WorstCaseSearch) -> None:
     """All steps of all attacks."""
     d, starts = problem.cube.size, problem.starts
     space = SearchSpace(Box(np.full(d, 0.5), np.zeros(d), np.ones(d)))

@@ -30,7 +30,7 @@ import dataclasses
 import itertools
 import time
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -52,6 +52,9 @@ from iblf_jax.tuning.runs import NUMBERS_A_RUN
 from iblf_jax.tuning.search import Search
 from iblf_jax.tuning.solvers import SQP
 from iblf_jax.tuning.starts import screened
+
+if TYPE_CHECKING:
+    from tqdm import tqdm
 
 END_TOLERANCE = 1e-3
 """By how much an end may be above the least value of its objective, relative to it."""
@@ -231,7 +234,7 @@ class FrontSearch:
         self.evaluations = 0
         self.values = 0
 
-    def run(self, points: int, seed: int, shown: Any) -> None:
+    def run(self, points: int, seed: int, shown: tqdm) -> None:
         """The ends, points in the largest gaps, and values on the lines between them."""
         self.ends(seed)
         shown.update(2)
@@ -304,7 +307,14 @@ class FrontSearch:
         self.values += len(z)
         self._keep(z, found.terms, found.valid, found.margin, found.exact_excess)
 
-    def _keep(self, z: Any, terms: Any, valid: Any, margin: Any, excess: Any) -> None:
+    def _keep(
+        self,
+        z: np.ndarray,
+        terms: np.ndarray,
+        valid: np.ndarray,
+        margin: np.ndarray,
+        excess: np.ndarray,
+    ) -> None:
         """Stores the trials that satisfy bounds and requirements."""
         feasible = valid & (margin > 0) & (np.max(excess, axis=-1, initial=-np.inf) <= 0)
         self.z = np.concatenate([self.z, z[feasible]])
@@ -378,17 +388,13 @@ def _best_of(found: Value, violation: np.ndarray, term: int) -> int:
     return 1 + int(order[0])
 
 
-def _pair(objectives: Any) -> Objective:
+def _pair(objectives: Sequence[Objective]) -> Objective:
     """The two objectives as one."""
     is_pair = isinstance(objectives, tuple | list) and len(objectives) == 2
-    if is_pair and all(_is_single_term(x) for x in objectives):
-        return objectives[0] + objectives[1]
+    if is_pair and all(isinstance(x, Objective) and len(x.terms) == 1 for x in objectives):
+        one, other = objectives
+        if one.terms[0].shape == "plain" and other.terms[0].shape == "plain":
+            return one + other
     expected = "two objectives of one term each, without a limit"
     remedy = "Such as (ij.objectives.tracking(), ij.objectives.effort())."
     raise checks.fail("objectives", objectives, expected, remedy)
-
-
-def _is_single_term(objective: Any) -> bool:
-    if not isinstance(objective, Objective) or len(objective.terms) != 1:
-        return False
-    return objective.terms[0].shape == "plain"

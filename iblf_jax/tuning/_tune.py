@@ -9,7 +9,7 @@ import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +26,6 @@ from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.tuning.checkpoints import fingerprint, load_checkpoint, save_checkpoint
 from iblf_jax.tuning.evaluation import Evaluator, values
 from iblf_jax.tuning.objectives import Objective
-from iblf_jax.tuning.optimality import Conditions
 from iblf_jax.tuning.options import Effort, Report, SearchOptions, chosen_solver, options_of
 from iblf_jax.tuning.parameters import Tunable, in_units, names_of, values_at
 from iblf_jax.tuning.problem import TuningProblem
@@ -232,24 +231,17 @@ def _run(
         def on_step(search: Search) -> None:
             if checkpoint is not None:
                 save_checkpoint(search, checkpoint, mark)
-            _show(shown, search, unit)
+            shown.update(1)
+            last = {name: x[-1] for name, x in search.history.items()}
+            s = int(np.argmin(np.where(last["valid"], last["loss"], np.inf)))  # the best start
+            shown.set_postfix_str(
+                f"loss {last['loss'][s]:.5g}, |gradient| {last['gradient_norm'][s]:.2g}, margin"
+                f" {last['margin'][s]:.3g} {unit}"
+            )
             if options.callback is not None:
                 options.callback(search)
 
         return search.run(iterations, on_step)
-
-
-def _show(shown: Any, search: Search, unit: str) -> None:
-    """Writes numbers of the last step beside the progress bar: those of the start with the smallest
-    loss; `unit` is that of the margin.
-    """
-    shown.update(1)
-    last = {name: x[-1] for name, x in search.history.items()}
-    s = int(np.argmin(np.where(last["valid"], last["loss"], np.inf)))
-    shown.set_postfix_str(
-        f"loss {last['loss'][s]:.5g}, |gradient| {last['gradient_norm'][s]:.2g}, margin"
-        f" {last['margin'][s]:.3g} {unit}"
-    )
 
 
 def _setup(problem: TuningProblem, report: Report) -> TuneSetup:
@@ -291,22 +283,18 @@ def _outcome(search: Search, stopped: str) -> Outcome:
     """
     found = search.conditions()
     if stopped == "converged" or search.is_violated or found.hold:
-        stopped = _reason_from_conditions(search, found)
+        if not np.all(np.isfinite(found.residuals)):
+            stopped = NO_GRADIENT
+        elif search.is_violated:
+            # Without phases the search itself minimised the violation.
+            is_minimised = search.strategy is None or search.state.repair_ended
+            stopped = INFEASIBLE if is_minimised and found.hold else NOT_FOUND_FEASIBLE
+        elif found.at_kink:
+            stopped = AT_KINK
+        else:
+            stopped = "converged" if found.hold else STUCK
     z = search.state.incumbent_z
     return Outcome(search, z, stopped, found.multipliers, found.residuals, _tried(search))
-
-
-def _reason_from_conditions(search: Search, found: Conditions) -> str:
-    """`TuneResult.stopped`, from the conditions at the best point."""
-    if not np.all(np.isfinite(found.residuals)):
-        return NO_GRADIENT
-    if search.is_violated:
-        # Without phases the search itself minimised the violation.
-        is_minimised = search.strategy is None or search.state.repair_ended
-        return INFEASIBLE if is_minimised and found.hold else NOT_FOUND_FEASIBLE
-    if found.at_kink:
-        return AT_KINK
-    return "converged" if found.hold else STUCK
 
 
 def _tried(search: Search) -> tuple[str, ...]:

@@ -58,7 +58,7 @@ def fingerprint(evaluate: Evaluator, solver: Solver, mode: str, iterations: int)
     return digest.hexdigest()
 
 
-def _digest_of(traced: Any) -> str:
+def _digest_of(traced: jax.stages.Traced) -> str:
     """The digest of a program; ValueError for one that calls functions of Python."""
     try:
         return program_digest(traced)
@@ -91,7 +91,7 @@ def described_solver(solver: Solver, iterations: int) -> tuple[str, dict[str, An
     return f"{cls.__module__}.{cls.__qualname__}", options
 
 
-def _program_of(optimiser: Any) -> str:
+def _program_of(optimiser: optax.GradientTransformation) -> str:
     """The digest of the first two steps of an optimiser of optax, with the numbers of its start.
 
     Its functions print as addresses, which differ between processes.

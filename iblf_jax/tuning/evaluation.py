@@ -30,9 +30,9 @@ of L only.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -50,6 +50,11 @@ from iblf_jax.tuning.robust import Risk, combine, worst_share
 from iblf_jax.tuning.rollouts import Rollouts, fold_of
 from iblf_jax.tuning.runs import in_groups, tangents_of_runs
 from iblf_jax.tuning.solvers import SearchSpace
+
+if TYPE_CHECKING:
+    from iblf_jax.engine.outcome import Outcome
+
+T = TypeVar("T")
 
 
 class Value(NamedTuple):
@@ -91,7 +96,7 @@ def _fold(problem: TuningProblem) -> tuple[Quantities, ...]:
     return fold_of(problem.objective, problem.dt.dtype, problem.request.steps * problem.dt)
 
 
-def _by_start(tree: Any, candidates: Candidate) -> Any:
+def _by_start(tree: T, candidates: Candidate) -> T:
     """Arrays (S * B, ...) as (S, B, ...)."""
     return jax.tree.map(lambda x: x.reshape(*candidates.index.shape, *x.shape[1:]), tree)
 
@@ -122,23 +127,22 @@ def _excesses(problem: TuningProblem, quantities: jax.Array) -> jax.Array:
     return jnp.stack([worst_share(each[:, r], share) for r, share in enumerate(problem.allowed)])
 
 
-def _augmentation(excess: jax.Array, multipliers: jax.Array, penalty: jax.Array) -> jax.Array:
-    """sum_r psi(G_r; y_r, mu)."""
-    active = jnp.maximum(0.0, multipliers + penalty * excess)
-    return jnp.sum(active**2 - multipliers**2) / (2 * penalty)
-
-
 def _loss(problem: TuningProblem, candidate: Candidate, smooth: jax.Array) -> jax.Array:
-    """L, or f where the requirements are not part of the loss."""
+    """L = f + sum_r psi(G_r; y_r, mu), or f where the requirements are not part of the loss."""
     objective = _objective(problem, candidate, smooth)
     if not problem.requirements_in_loss:
         return objective
-    excess = _excesses(problem, smooth)
-    return objective + _augmentation(excess, candidate.multipliers, candidate.penalty)
+    y, mu = candidate.multipliers, candidate.penalty
+    active = jnp.maximum(0.0, y + mu * _excesses(problem, smooth))
+    return objective + jnp.sum(active**2 - y**2) / (2 * mu)
 
 
 def value_of_start(
-    problem: TuningProblem, candidate: Candidate, smooth: Any, exact: Any, status: Any
+    problem: TuningProblem,
+    candidate: Candidate,
+    smooth: jax.Array,
+    exact: jax.Array,
+    status: jax.Array,
 ) -> Value:
     """The `Value` of one start.
 
@@ -166,7 +170,11 @@ def value_of_start(
 
 
 def _derivatives_of_start(
-    problem: TuningProblem, candidate: Candidate, outcome: Any, tangents: Any, products: Any
+    problem: TuningProblem,
+    candidate: Candidate,
+    outcome: Outcome,
+    tangents: Mapping[str, jax.Array],
+    products: tuple[jax.Array, ...],
 ) -> Derivatives:
     """Loss, gradient and Gauss-Newton matrix of one start, and the pieces of its requirements."""
     smooth, exact, pieces = (outcome.metrics[name] for name in Quantities.units)
@@ -189,30 +197,22 @@ def _derivatives_of_start(
     excess = [r.excess(by_quantity[k]) for r, k in zip(requirements, own, strict=True)]
     slopes = [gradients[k] / r.scale for r, k in zip(requirements, own, strict=True)]
     if problem.on_front:
-        over_level, its_gradient = _over_levels(problem, candidate, smooth, J)
-        excess.append(over_level)
-        slopes.append(its_gradient)
+
+        def over(smooth: jax.Array) -> jax.Array:
+            terms = _terms(problem.options.risk, problem.objective, smooth)
+            return jnp.log(terms) - candidate.levels
+
+        # F_k - level_k in the first of the runs, and far below zero in the others.
+        slope = jnp.einsum("tbk,buk->ut", jax.jacrev(over)(smooth), J)
+        below = jnp.full((len(smooth), len(candidate.levels)), -NO_LEVEL, smooth.dtype)
+        excess.append(below.at[0].set(over(smooth)))
+        flat = jnp.zeros((len(smooth), *slope.shape), smooth.dtype)
+        slopes.append(flat.at[0].set(slope))
     if not excess:
         return found
     return found._replace(
         pieces=jnp.concatenate(excess, axis=1), piece_gradients=jnp.concatenate(slopes, axis=2)
     )
-
-
-def _over_levels(
-    problem: TuningProblem, candidate: Candidate, smooth: jax.Array, J: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """F_k - level_k in the first of the runs, far below zero in the others, (B, n_terms), and the
-    gradients, (B, p, n_terms).
-    """
-
-    def over(smooth: jax.Array) -> jax.Array:
-        return jnp.log(_terms(problem.options.risk, problem.objective, smooth)) - candidate.levels
-
-    slopes = jnp.einsum("tbk,buk->ut", jax.jacrev(over)(smooth), J)
-    below = jnp.full((len(smooth), len(candidate.levels)), -NO_LEVEL, smooth.dtype)
-    excess = below.at[0].set(over(smooth))
-    return excess, jnp.zeros((len(smooth), *slopes.shape), smooth.dtype).at[0].set(slopes)
 
 
 # -------------------------------------------------------------------------------- compiled calls
@@ -240,6 +240,9 @@ def forward_derivatives(problem: TuningProblem, candidates: Candidate) -> Deriva
     """The problem with gradient (S, p), Gauss-Newton matrix (S, p, p) and the pieces of the
     requirements, by forward mode.
     """
+    # The tied leaves that no perturbation changes have one number for all of their entries.
+    perturbed = [target.path for target in problem.targets]
+    tied = [block.path for block in problem.blocks if block.size == 1]
     found = tangents_of_runs(
         problem.scenario,
         problem.leaves_of_runs(candidates),
@@ -247,7 +250,7 @@ def forward_derivatives(problem: TuningProblem, candidates: Candidate) -> Deriva
         _fold(problem),
         problem.dt,
         problem.request,
-        uniform=_uniform_paths(problem),
+        uniform=[path for path in tied if not _overlaps(problem, path, perturbed)],
     )
     by_start = _by_start((found.outcome, found.tangents, found.products), candidates)
     return jax.vmap(partial(_derivatives_of_start, problem))(candidates, *by_start)
@@ -262,13 +265,6 @@ def _jacobians(problem: TuningProblem, candidates: Candidate) -> dict[str, jax.A
         for path, x in every.items()
         if path != NOISE_NAME and _overlaps(problem, path, tuned)
     }
-
-
-def _uniform_paths(problem: TuningProblem) -> list[str]:
-    """The tied leaves that no perturbation changes: one number for all of their entries."""
-    perturbed = [target.path for target in problem.targets]
-    tied = [block.path for block in problem.blocks if block.size == 1]
-    return [path for path in tied if not _overlaps(problem, path, perturbed)]
 
 
 def _overlaps(problem: TuningProblem, path: str, others: list[str]) -> bool:
@@ -361,7 +357,17 @@ class Evaluator:
         found = in_groups(derivatives, len(active), self.group)
         if len(active) == len(z):
             return found
-        return _scattered(found, active, len(z))
+
+        def among_all(x: np.ndarray) -> np.ndarray:
+            full = np.zeros((len(z), *x.shape[1:]), x.dtype)
+            if np.issubdtype(x.dtype, np.floating):
+                full[:] = np.nan
+            full[active] = x
+            return full
+
+        found = jax.tree.map(among_all, found)
+        found.value.loss[~found.value.valid] = np.inf  # the other starts are invalid
+        return found
 
     def traced(self) -> Any:
         """The program of value and derivatives of a group of starts, traced."""
@@ -376,18 +382,3 @@ class Evaluator:
         self.plain_values += len(z)
         self.on_values(z, found)
         return found
-
-
-def _scattered(found: Derivatives, rows: np.ndarray, starts: int) -> Derivatives:
-    """The values of some starts among all of them; the others are invalid, with infinite losses."""
-
-    def scattered(x: np.ndarray) -> np.ndarray:
-        full = np.zeros((starts, *x.shape[1:]), x.dtype)
-        if np.issubdtype(x.dtype, np.floating):
-            full[:] = np.nan
-        full[rows] = x
-        return full
-
-    found = jax.tree.map(scattered, found)
-    found.value.loss[~found.value.valid] = np.inf
-    return found

@@ -280,7 +280,11 @@ def _distinct_draws(x: np.ndarray) -> list[int]:
 
 @programs.jit(static_argnames="targets")
 def drawn_leaves(
-    cases: UncertainScenario, point: Any, index: jax.Array, *, targets: tuple[Target, ...]
+    cases: UncertainScenario,
+    point: Mapping[str, jax.Array],
+    index: jax.Array,
+    *,
+    targets: tuple[Target, ...],
 ) -> dict[str, jax.Array]:
     """Path -> values of the perturbed leaves in some runs, (N, ...).
 

@@ -31,14 +31,14 @@ max_i |y_i| / limit_i < 1.
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks, notices
-from iblf_jax.core.joints import Selection, indices, selection
+from iblf_jax.core.joints import Joints, Selection, indices, selection
 from iblf_jax.core.pytree import component, leaf, note_code, static
 from iblf_jax.engine import Outer as Outer
 from iblf_jax.simulation.metrics import Fold, Settling, Tracking, check_needs
@@ -54,6 +54,9 @@ from iblf_jax.tuning.quantities import (
 )
 from iblf_jax.tuning.quantities import Quantity as Quantity
 from iblf_jax.world import plants
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
 
 A_SHARE = "a share of the runs, from 0 to 1"
 UNSUITABLE_SCALES = (
@@ -148,7 +151,7 @@ class Requirement:
             return 1.0, ""
         return self.quantity.sign, self.quantity.unit
 
-    def __add__(self, other: Any) -> Objective:
+    def __add__(self, other: object) -> Objective:
         return Objective((), (self,)) + other
 
     __radd__ = __add__
@@ -167,7 +170,7 @@ class Objective:
     terms: tuple[Term, ...] = ()
     requirements: tuple[Requirement, ...] = ()
 
-    def __add__(self, other: Any) -> Objective:
+    def __add__(self, other: object) -> Objective:
         if isinstance(other, Requirement):
             other = Objective((), (other,))
         if not isinstance(other, Objective):
@@ -175,7 +178,7 @@ class Objective:
             raise checks.fail("objective", other, expected, "ij.objectives has them.")
         return Objective((*self.terms, *other.terms), (*self.requirements, *other.requirements))
 
-    def __mul__(self, weight: Any) -> Objective:
+    def __mul__(self, weight: ArrayLike) -> Objective:
         weight = checks.as_floats("weight", weight)
         checks.shape_is("weight", weight, ())
         terms = (dataclasses.replace(t, weight=weight * t.weight) for t in self.terms)
@@ -207,7 +210,7 @@ WHAT_IT_IS = (
 )
 
 
-def checked(objective: Any) -> Objective:
+def checked(objective: object) -> Objective:
     """The objective that the user composed, if it is one; ValueError otherwise."""
     if isinstance(objective, Requirement):
         objective = Objective((), (objective,))
@@ -223,7 +226,7 @@ def checked(objective: Any) -> Objective:
     raise checks.fail("objective", objective, WHAT_IT_IS, remedy)
 
 
-def _composed(objective: Any) -> Objective:
+def _composed(objective: object) -> Objective:
     if isinstance(objective, Objective):
         return objective
     remedy = "Such as ij.objectives.tracking()."
@@ -236,7 +239,7 @@ def is_complete(objective: Objective) -> bool:
 
 
 def complete(
-    objective: Objective, start: Any, margin: float | None = None, unit: str = "rad"
+    objective: Objective, start: ArrayLike, margin: float | None = None, unit: str = "rad"
 ) -> Objective:
     """The objective with every missing scale and limit set to the value at the start.
 
@@ -370,21 +373,16 @@ def _part_of(part: Any, function: str, names: tuple[str, ...]) -> Any:
             # its weights belong to the numbers of the metric, which need not be those of joints
             return part
     chosen = indices(f"{function}: joints", quantity.joints, names)
-    _check_count(function, quantity, len(chosen), len(names))
+    shape = jnp.shape(quantity.weights)
+    if shape not in ((), (len(chosen),), (len(names),)):
+        name, came = "weights", quantity.weights
+        if isinstance(quantity, Peak) and quantity.relative:
+            name, came = NAME_OF_LIMIT.get(function, "limit"), 1.0 / quantity.weights
+        expected = f"one number, or {len(chosen)}, one for each of the joints"
+        raise checks.fail(f"{function}: {name}", came, expected, f"Its shape is {shape}.")
     if quantity.joints is None:
         return part
     return dataclasses.replace(part, quantity=dataclasses.replace(quantity, joints=chosen))
-
-
-def _check_count(function: str, quantity: Any, chosen: int, n: int) -> None:
-    shape = jnp.shape(quantity.weights)
-    if shape in ((), (chosen,), (n,)):
-        return
-    name, came = "weights", quantity.weights
-    if isinstance(quantity, Peak) and quantity.relative:
-        name, came = NAME_OF_LIMIT.get(function, "limit"), 1.0 / quantity.weights
-    expected = f"one number, or {chosen}, one for each of the joints"
-    raise checks.fail(f"{function}: {name}", came, expected, f"Its shape is {shape}.")
 
 
 NAME_OF_LIMIT = {"margin": "target", "velocity_margin": "target", "region_margin": "target"}
@@ -403,7 +401,7 @@ IN_WORDS = {
 
 
 def _number(
-    function: str, name: str, value: Any, sign: str | None = None, most: int = 0
+    function: str, name: str, value: ArrayLike, sign: str | None = None, most: int = 0
 ) -> jax.Array:
     """An argument of one of these functions as an array of at most `most` dimensions; ValueError
     with the argument's name.
@@ -417,7 +415,7 @@ def _number(
     return array
 
 
-def _limit(function: str, limit: Any, example: str) -> jax.Array:
+def _limit(function: str, limit: ArrayLike, example: str) -> jax.Array:
     """The limit of a function, one number or one for each joint."""
     name = NAME_OF_LIMIT.get(function, "limit")
     try:
@@ -431,14 +429,16 @@ def _limit(function: str, limit: Any, example: str) -> jax.Array:
     return array
 
 
-def _share(function: str, name: str, share: Any) -> jax.Array:
+def _share(function: str, name: str, share: ArrayLike) -> jax.Array:
     number = _number(function, name, share, "nonnegative")
     if checks.is_concrete(number) and number > 1:
         raise checks.fail(f"{function}: {name}", share, A_SHARE)
     return number
 
 
-def _selected(function: str, joints: Any, weights: Any) -> tuple[Selection, Any]:
+def _selected(
+    function: str, joints: Joints, weights: ArrayLike | None
+) -> tuple[Selection, jax.Array]:
     """The joints that count, and their weights."""
     chosen = selection(f"{function}: joints", joints)
     given = 1.0 if weights is None else weights
@@ -452,10 +452,10 @@ def _peak(
     function: str,
     signal: str,
     limit: Any,
-    joints: Any,
-    weights: Any,
-    after: Any = 0.0,
-    smoothing: Any = 0.01,
+    joints: Joints,
+    weights: ArrayLike | None,
+    after: ArrayLike = 0.0,
+    smoothing: ArrayLike = 0.01,
 ) -> tuple[Peak, Any]:
     """The peak of a signal under a limit that is one number, or one for each joint; and the limit
     of that peak.
@@ -475,16 +475,16 @@ def _peak(
 def _requirement(
     function: str,
     signal: str,
-    limit: Any,
+    limit: ArrayLike,
     example: str,
-    allowed: Any,
-    joints: Any = None,
-    weights: Any = None,
-    after: Any = 0.0,
+    allowed: ArrayLike,
+    joints: Joints = None,
+    weights: ArrayLike | None = None,
+    after: ArrayLike = 0.0,
 ) -> Requirement:
     """The requirement that a peak is below its limit, or a margin, minus a peak, above it."""
     given = _limit(function, limit, example)
-    peak, limit = _peak(function, signal, given, joints, weights, after)
+    peak, own_limit = _peak(function, signal, given, joints, weights, after)
     sides = {1.0: "<", -1.0: ">"}
     numbers = np.asarray(given)
     text = f"{numbers:g}" if not numbers.ndim else f"[{', '.join(f'{x:g}' for x in numbers)}]"
@@ -493,10 +493,11 @@ def _requirement(
     if after:
         name += f" after {after:g} s"
     share = _share(function, "allowed", allowed)
-    return Requirement(peak, peak.sign * limit, limit, share, name=name, function=function)
+    own = peak.sign * own_limit
+    return Requirement(peak, own, own_limit, share, name=name, function=function)
 
 
-def _of_joints(chosen: Any) -> str:
+def _of_joints(chosen: Selection) -> str:
     """Which joints a requirement is on, for its name."""
     if chosen is None:
         return ""
@@ -510,12 +511,12 @@ def _of_joints(chosen: Any) -> str:
 def _soft(
     function: str,
     signal: str,
-    limit: Any,
+    limit: ArrayLike | None,
     example: str,
-    sharpness: Any,
-    smoothing: Any,
-    joints: Any = None,
-    weights: Any = None,
+    sharpness: ArrayLike,
+    smoothing: ArrayLike,
+    joints: Joints = None,
+    weights: ArrayLike | None = None,
 ) -> Objective:
     """A soft penalty on a peak above a limit, or on a margin below it.  Without a limit, the peak
     at the start will be scale and limit.
@@ -527,7 +528,7 @@ def _soft(
     return Objective((Term(peak, sharpness=sharpness, shape="above", name=function, **limited),))
 
 
-def _one_term(function: str, quantity: Quantity, scale: Any, name: str) -> Objective:
+def _one_term(function: str, quantity: Quantity, scale: ArrayLike | None, name: str) -> Objective:
     if scale is not None:
         scale = _number(function, "scale", scale, "positive")
     return Objective((Term(quantity, scale=scale, name=name),))
@@ -536,11 +537,11 @@ def _one_term(function: str, quantity: Quantity, scale: Any, name: str) -> Objec
 def _integral(
     function: str,
     signal: str,
-    joints: Any,
-    weights: Any,
-    scale: Any,
-    after: Any = 0.0,
-    tolerance: Any = None,
+    joints: Joints,
+    weights: ArrayLike | None,
+    scale: ArrayLike | None,
+    after: ArrayLike = 0.0,
+    tolerance: jax.Array | None = None,
 ) -> Objective:
     chosen, w = _selected(function, joints, weights)
     quantity = TimeIntegral(signal, w, _number(function, "after", after), tolerance, chosen)
@@ -551,7 +552,11 @@ def _integral(
 
 
 def tracking(
-    *, joints: Any = None, weights: Any = None, after: Any = 0.0, scale: Any = None
+    *,
+    joints: Joints = None,
+    weights: ArrayLike | None = None,
+    after: ArrayLike = 0.0,
+    scale: ArrayLike | None = None,
 ) -> Objective:
     """Integral of the squared position error.
 
@@ -575,7 +580,9 @@ def tracking(
     return _integral("tracking", "error", joints, weights, scale, after)
 
 
-def effort(*, joints: Any = None, weights: Any = None, scale: Any = None) -> Objective:
+def effort(
+    *, joints: Joints = None, weights: ArrayLike | None = None, scale: ArrayLike | None = None
+) -> Objective:
     """Integral of the squared torque, int sum_i (w_i tau_i)^2 dt / scale; arguments as `tracking`,
     scale in N^2 m^2 s.
 
@@ -585,7 +592,9 @@ def effort(*, joints: Any = None, weights: Any = None, scale: Any = None) -> Obj
     return _integral("effort", "torque", joints, weights, scale)
 
 
-def torque_rate(*, joints: Any = None, weights: Any = None, scale: Any = None) -> Objective:
+def torque_rate(
+    *, joints: Joints = None, weights: ArrayLike | None = None, scale: ArrayLike | None = None
+) -> Objective:
     """Integral of the squared rate of the torque, int sum_i (w_i tau_i')^2 dt / scale; arguments as
     `tracking`, scale in N^2 m^2/s.
 
@@ -596,7 +605,11 @@ def torque_rate(*, joints: Any = None, weights: Any = None, scale: Any = None) -
 
 
 def settle(
-    tolerance: Any = 0.01, *, joints: Any = None, weights: Any = None, scale: Any = 1.0
+    tolerance: ArrayLike = 0.01,
+    *,
+    joints: Joints = None,
+    weights: ArrayLike | None = None,
+    scale: ArrayLike = 1.0,
 ) -> Objective:
     """Time that the joints spend outside a tolerance, a smooth substitute for the settling time,
     summed over joints / scale.
@@ -613,12 +626,12 @@ def settle(
 
 
 def peak_torque(
-    limit: Any = None,
+    limit: ArrayLike | None = None,
     *,
-    sharpness: Any = 20.0,
-    smoothing: Any = 0.01,
-    joints: Any = None,
-    weights: Any = None,
+    sharpness: ArrayLike = 20.0,
+    smoothing: ArrayLike = 0.01,
+    joints: Joints = None,
+    weights: ArrayLike | None = None,
 ) -> Objective:
     """Soft penalty on the largest torque above a limit, with the smooth maximum p of w_i |tau_i|.
 
@@ -634,7 +647,11 @@ def peak_torque(
 
 
 def margin(
-    target: Any = 0.05, *, sharpness: Any = 5.0, smoothing: Any = 0.02, joints: Any = None
+    target: ArrayLike = 0.05,
+    *,
+    sharpness: ArrayLike = 5.0,
+    smoothing: ArrayLike = 0.02,
+    joints: Joints = None,
 ) -> Objective:
     """Soft penalty on a margin to the bounds below a target.
 
@@ -649,7 +666,11 @@ def margin(
 
 
 def velocity_margin(
-    target: Any = 0.05, *, sharpness: Any = 5.0, smoothing: Any = 0.02, joints: Any = None
+    target: ArrayLike = 0.05,
+    *,
+    sharpness: ArrayLike = 5.0,
+    smoothing: ArrayLike = 0.02,
+    joints: Joints = None,
 ) -> Objective:
     """Soft penalty on a margin to the velocity bounds below a target; as `margin`, in rad/s, for
     scenarios with bounds of the second level.
@@ -659,7 +680,9 @@ def velocity_margin(
     )
 
 
-def region_margin(target: Any = 0.02, *, sharpness: Any = 5.0, smoothing: Any = 0.02) -> Objective:
+def region_margin(
+    target: ArrayLike = 0.02, *, sharpness: ArrayLike = 5.0, smoothing: ArrayLike = 0.02
+) -> Objective:
     """Soft penalty on a distance to the regions' boundaries below a target; as `margin`, in m, for
     scenarios with `regions`.
     """
@@ -667,7 +690,12 @@ def region_margin(target: Any = 0.02, *, sharpness: Any = 5.0, smoothing: Any = 
 
 
 def metric(
-    fold: Fold, name: str, *, joints: Any = None, weights: Any = None, scale: Any = None
+    fold: Fold,
+    name: str,
+    *,
+    joints: Joints = None,
+    weights: ArrayLike | None = None,
+    scale: ArrayLike | None = None,
 ) -> Objective:
     """A result of any metric, `metric(ij.metrics.Tracking(), "iae")` or of a fold of your own,
     summed over the joints.
@@ -705,7 +733,12 @@ def metric(
 
 
 def error_below(
-    limit: Any, *, after: Any = 0.0, allowed: Any = 0.01, joints: Any = None, weights: Any = None
+    limit: ArrayLike,
+    *,
+    after: ArrayLike = 0.0,
+    allowed: ArrayLike = 0.01,
+    joints: Joints = None,
+    weights: ArrayLike | None = None,
 ) -> Requirement:
     """|e1| < limit on every joint from a time on: `error_below(0.01, after=1.0)`.
 
@@ -723,34 +756,44 @@ def error_below(
 
 
 def peak_torque_below(
-    limit: Any, *, allowed: Any = 0.01, joints: Any = None, weights: Any = None
+    limit: ArrayLike,
+    *,
+    allowed: ArrayLike = 0.01,
+    joints: Joints = None,
+    weights: ArrayLike | None = None,
 ) -> Requirement:
     """Largest |tau| < limit [N m], one number or one for each joint; arguments as `error_below`."""
     return _requirement("peak_torque_below", "torque", limit, "140.0", allowed, joints, weights)
 
 
-def margin_above(limit: Any, *, allowed: Any = 0.01, joints: Any = None) -> Requirement:
+def margin_above(
+    limit: ArrayLike, *, allowed: ArrayLike = 0.01, joints: Joints = None
+) -> Requirement:
     """Minimum over time and joints of min(q - lower, upper - q) > limit [rad]; `limit`, `allowed`
     and `joints` as `error_below`.
     """
     return _requirement("margin_above", "deficit", limit, "0.05", allowed, joints)
 
 
-def velocity_margin_above(limit: Any, *, allowed: Any = 0.01, joints: Any = None) -> Requirement:
+def velocity_margin_above(
+    limit: ArrayLike, *, allowed: ArrayLike = 0.01, joints: Joints = None
+) -> Requirement:
     """Minimum over time and joints of min(q' - v_l, v_u - q') > limit [rad/s], for scenarios with
     bounds of the second level; as `margin_above`.
     """
     return _requirement("velocity_margin_above", "velocity_deficit", limit, "0.05", allowed, joints)
 
 
-def region_margin_above(limit: Any, *, allowed: Any = 0.01) -> Requirement:
+def region_margin_above(limit: ArrayLike, *, allowed: ArrayLike = 0.01) -> Requirement:
     """Minimum over time and regions of the distance to the boundary > limit [m], for scenarios with
     `regions`; as `margin_above`.
     """
     return _requirement("region_margin_above", "region_deficit", limit, "0.05", allowed)
 
 
-def violation_probability_below(probability: Any, *, scale: Any = 0.05) -> Requirement:
+def violation_probability_below(
+    probability: float | jax.Array, *, scale: ArrayLike = 0.05
+) -> Requirement:
     """The probability that a run leaves its bounds or diverges is below a limit.
 
     While tuning, the margin of the worst `probability` share of the runs (at least of one) is kept
@@ -775,7 +818,7 @@ def violation_probability_below(probability: Any, *, scale: Any = 0.05) -> Requi
 
 
 def failure_probability_below(
-    probability: Any, found: FailureProbability, *, scale: Any = 0.05
+    probability: float | jax.Array, found: FailureProbability, *, scale: ArrayLike = 0.05
 ) -> Requirement:
     """The probability of a rare failure is below a limit, assessed on draws near failure.
 

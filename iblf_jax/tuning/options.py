@@ -175,7 +175,7 @@ def options_of(
     return SearchOptions(_solver(solver), report, progress, callback, budget)
 
 
-def _solver(given: Any) -> Solver | None:
+def _solver(given: Solver | str | None) -> Solver | None:
     """The solver that was given, or the one of a name in SOLVERS; None for "auto" and None."""
     if given is None:
         return None

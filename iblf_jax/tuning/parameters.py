@@ -17,9 +17,9 @@ multiples by values (`along`).
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -37,6 +37,9 @@ from iblf_jax.tuning.ranges import (
     default_highs,
     default_lows,
 )
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
 
 LIMIT_DISTANCE = 1e-3
 """Smallest distance of the start of a squashed coordinate from a limit, relative to the box."""
@@ -84,7 +87,7 @@ class Box:
     """Why the lower and the upper end of each coordinate are there, in words."""
 
 
-def _own_limit(path: str, side: str, value: Any) -> jax.Array | None:
+def _own_limit(path: str, side: str, value: ArrayLike | None) -> jax.Array | None:
     """A limit of a parameter as an array; None where there is none of the user's own."""
     if value is None:
         return None
@@ -98,7 +101,12 @@ def _own_limit(path: str, side: str, value: Any) -> jax.Array | None:
 
 
 def tunable(
-    path: str, low: Any = None, high: Any = None, *, tied: bool = False, scale: str | None = None
+    path: str,
+    low: ArrayLike | None = None,
+    high: ArrayLike | None = None,
+    *,
+    tied: bool = False,
+    scale: str | None = None,
 ) -> Tunable:
     """A leaf to tune, with limits of one's own.
 
@@ -133,7 +141,7 @@ def tunable(
     return Tunable(path, low, high, checks.boolean("tunable: tied", tied), scale)
 
 
-def as_tunable(name: str, given: Any) -> Tunable:
+def as_tunable(name: str, given: object) -> Tunable:
     """An entry of a user's list of parameters; `name` is that of the entry in messages."""
     if isinstance(given, str):
         return Tunable(given)
@@ -145,7 +153,7 @@ def as_tunable(name: str, given: Any) -> Tunable:
 
 
 def layout(
-    scenario: Scenario, parameters: Any, dt: float, method: str
+    scenario: Scenario, parameters: Sequence[str | Tunable], dt: float, method: str
 ) -> tuple[tuple[Block, ...], Box]:
     """The coordinates of a list of parameters: blocks, and the box with the start in it.
 
@@ -236,7 +244,11 @@ def _ends_of(
         ends.append(end._replace(value=limit))
     low, high = ends
     if step:
-        low, high = _whole_steps(low, high, step)
+        # the outermost multiples of the time step within the range
+        first = np.maximum(np.ceil(low.value / step - WHOLE_TOLERANCE), 1.0)
+        last = np.floor(high.value / step + WHOLE_TOLERANCE)
+        low = low._replace(value=first * step)
+        high = high._replace(value=last * step)
     if np.all((low.value <= start) & (start <= high.value) & (low.value < high.value)):
         return low, high
     expected = f"a start between its limits {low.value.tolist()} and {high.value.tolist()}"
@@ -248,14 +260,7 @@ def _ends_of(
     raise checks.fail(f"tunable({item.path!r})", start, expected, remedy)
 
 
-def _whole_steps(low: End, high: End, step: float) -> tuple[End, End]:
-    """The outermost multiples of the time step within a range."""
-    first = np.maximum(np.ceil(low.value / step - WHOLE_TOLERANCE), 1.0)
-    last = np.floor(high.value / step + WHOLE_TOLERANCE)
-    return low._replace(value=first * step), high._replace(value=last * step)
-
-
-def _limit(item: Tunable, name: str, given: Any, value: np.ndarray) -> np.ndarray:
+def _limit(item: Tunable, name: str, given: ArrayLike, value: np.ndarray) -> np.ndarray:
     field = f"tunable({item.path!r}): {name}"
     limit = np.asarray(checks.as_floats(field, given), float)
     if limit.shape not in ((), value.shape):
@@ -270,7 +275,7 @@ def _coordinate(x: np.ndarray, log: bool) -> np.ndarray:
         return np.log(np.maximum(x, 0.0))
 
 
-def values_at(blocks: tuple[Block, ...], z: Any) -> dict[str, jax.Array]:
+def values_at(blocks: tuple[Block, ...], z: jax.Array) -> dict[str, jax.Array]:
     """Path -> value of the leaf at coordinates z, (p,); differentiable, with the derivative 0 of a
     constant where the leaf is a multiple of a step.
     """

@@ -8,7 +8,7 @@ arrays are traced and its structure is static, so it is passed to the compiled f
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple, cast
 
@@ -106,7 +106,7 @@ class TuningProblem:
     def build(
         scenario: Scenario,
         parameters: Sequence[str | Tunable],
-        objective: Any,
+        objective: object,
         *,
         on_front: bool = False,
         **options: Any,
@@ -291,7 +291,7 @@ class TuningProblem:
 _leaves_of_runs = programs.jit(TuningProblem.leaves_of_runs)
 
 
-def of_runs(function: Any, candidates: Candidate) -> Any:
+def of_runs(function: Callable[[jax.Array, jax.Array], object], candidates: Candidate) -> Any:
     """A function of the coordinates and the number of one run, for all runs of all starts,
     (S * B, ...).
     """

@@ -53,7 +53,7 @@ class Quantity(Part):
     signal: str = "torque"
     """What it is computed from, one of `TUNED_SIGNALS`; a user's quantity is assumed to depend on
     the torque."""
-    smoothing: Any = None
+    smoothing: jax.Array | None = None
     """Of a maximum, a leaf that `tune` decreases; None for a quantity that is smooth itself."""
 
     @attribute
@@ -152,7 +152,7 @@ def weights_of(weights: jax.Array, joints: Selection, n: int, field: str) -> jax
     raise checks.fail(field, weights, expected, f"Its shape is {shape}.")
 
 
-def _check_choice(owner: str, joints: Selection, weights: Any) -> None:
+def _check_choice(owner: str, joints: Selection, weights: jax.Array | float) -> None:
     """Raises ValueError for a selection that is not normalised, or weights of more dimensions than
     one.
     """
@@ -164,7 +164,11 @@ def _check_choice(owner: str, joints: Selection, weights: Any) -> None:
 
 
 def signal_of(
-    name: str, sample: Sample, last: jax.Array, tolerance: Any, joints: Selection = None
+    name: str,
+    sample: Sample,
+    last: jax.Array,
+    tolerance: Any,
+    joints: Selection = None,
 ) -> jax.Array:
     """A signal of the selected joints at one sample, (k,), (2 k,) or one number a region.
 

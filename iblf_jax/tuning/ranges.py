@@ -256,15 +256,16 @@ def default_highs(
 ) -> dict[str, End]:
     """The upper ends of the ranges of some leaves; arguments as `default_lows`."""
     conditions = Conditions(scenario, dt, method)
-    gains = {path: x for path, x in starts.items() if _is_gain(path) and np.all(x > 0)}
+    # The positive gains of the law and of the observer may be scaled up together.
+    gains = {
+        path: x
+        for path, x in starts.items()
+        if path.startswith(("controller.", "observer.")) and not LOWER_POWER.match(path)
+        if np.all(x > 0)
+    }
     others = {path: x for path, x in starts.items() if path not in gains}
     ends = {path: _default_high(conditions, path, start) for path, start in others.items()}
     return ends | _highs_of_gains(conditions, gains)
-
-
-def _is_gain(path: str) -> bool:
-    """Whether a leaf is a gain of the law or of the observer, which may be scaled up."""
-    return path.startswith(("controller.", "observer.")) and not LOWER_POWER.match(path)
 
 
 def _default_high(conditions: Conditions, path: str, start: np.ndarray) -> End:
@@ -430,8 +431,9 @@ def _command_steps(scenario: Scenario, times: jax.Array) -> tuple[jax.Array, jax
     resolution = jnp.asarray(sensor.resolution, times.dtype)
 
     def command(t: jax.Array, state: LoopState, y: jax.Array, normal: jax.Array) -> jax.Array:
-        moved = _with_levels_of_sensor(state, y)
-        return run_sampled_law(smooth, t, moved, normal).sampled.commands[0]
+        # The sensor receives the levels, (r, n), or q alone, (n,).
+        x = state.x.at[0].set(y) if y.ndim == 1 else y
+        return run_sampled_law(smooth, t, state._replace(x=x), normal).sampled.commands[0]
 
     def at(t: jax.Array, state: LoopState) -> tuple[jax.Array, jax.Array]:
         normal = jnp.zeros((sensor.draws, scenario.n), times.dtype)
@@ -442,10 +444,3 @@ def _command_steps(scenario: Scenario, times: jax.Array) -> tuple[jax.Array, jax
 
     from_start = jnp.concatenate([jnp.zeros_like(times[:1]), times])
     return jax.vmap(at)(from_start, start_and_along(scenario, times))
-
-
-def _with_levels_of_sensor(state: LoopState, y: jax.Array) -> LoopState:
-    """The state with other levels, (r, n), or with another q, (n,), as the sensor receives them."""
-    if y.ndim == 1:
-        return state._replace(x=state.x.at[0].set(y))
-    return state._replace(x=y)

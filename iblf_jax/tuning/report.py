@@ -22,8 +22,8 @@ runs of the tuning at half the step.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -53,6 +53,8 @@ from iblf_jax.tuning.samples import (
     uncertain_scenario,
 )
 from iblf_jax.tuning.step_check import ReportedQuantities, StepCheck
+
+T = TypeVar("T")
 
 LARGEST_PERCENTAGE = 100.0
 """Ratio of two values from which a report shows the factor and no percentage."""
@@ -266,14 +268,26 @@ class TuningReport(Result):
             )
             of_all = " of all runs"
         torques = [", ".join(f"{x:.5g}" for x in row) for row in self.peak_torque]
-        rows = [
-            *self._bounds_in_words(),
-            *self._requirements_in_words(),
-            *map(str, self.changes),
-            *self._doubts(),
+        rows = self._bounds_in_words()
+        # The failed requirements are first, with the explanation of the runs that broke them, and
+        # those that the tuning's runs break are last.
+        for verdict in sorted(self.verdicts, key=lambda v: list(WORST_FIRST).index(v.verdict)):
+            rows.append(f"requirement {verdict}")
+            own = [x for x in self.failures if x.requirement == verdict.name]
+            rows += [f"  {x.cause_in_words()}" for x in own]
+        if self.step_check is not None:
+            rows += self.step_check.warnings_of_requirements()
+        rows += map(str, self.changes)
+        objective = self.changes[0]
+        if objective.significant is False:
+            doubt = "these runs do not show that tuning helped."
+            rows.append(f"The objective's change is not significant: {doubt}")
+        elif objective.after > objective.before:
+            rows.append("The objective went up.")
+        rows.append(
             f"peak {shown.input}{of_all}, {shown.component} by {shown.component}:"
-            f" {torques[0]} -> {torques[1]} {shown.input_unit}",
-        ]
+            f" {torques[0]} -> {torques[1]} {shown.input_unit}"
+        )
         if self.at_limits is not None:
             rows += self.at_limits or ["gains at an end of their range: none"]
         if self.step_check is not None:
@@ -281,7 +295,9 @@ class TuningReport(Result):
         return [heading, *(f"  {row}" for row in (*rows, *self.notes))]
 
     def _bounds_in_words(self) -> list[str]:
-        """Violated bounds with their explanation, those of the tuning's runs, smallest margin."""
+        """Violated bounds with their explanation, those of the tuning's runs, the smallest margin,
+        and the largest spectral radius of a sampled loop.
+        """
         violated: list[Any] = list(self.violation)
         if self.seed is None:
             violated = [p.count for p in self.violation]
@@ -293,12 +309,9 @@ class TuningReport(Result):
         if check is not None and (any(check.violated) or any(check.untrusted)):
             rows.append(check.bounds_in_words())
         margins = f"{self.margin[0]:.4g} -> {self.margin[1]:.4g} {self.quantities.margin_unit}"
-        return [*rows, f"smallest margin: {margins}", *self._stability_in_words()]
-
-    def _stability_in_words(self) -> list[str]:
-        """The largest spectral radius of a sampled loop, and how many runs are unstable."""
+        rows.append(f"smallest margin: {margins}")
         if self.sampling_radius is None:
-            return []
+            return rows
         before, after = self.sampling_radius
         row = f"largest sampling_radius: {before:.6g} -> {after:.6g}; stable below 1"
         if self.unstable[1]:
@@ -306,36 +319,13 @@ class TuningReport(Result):
                 "; WARNING: with the tuned gains the sampled loop is unstable in"
                 f" {self._unstable_in_words()}: narrow the ranges of its gains"
             )
-        return [row]
+        return [*rows, row]
 
     def _unstable_in_words(self) -> str:
         """The number of runs whose sampled loop is unstable with the tuned gains."""
         if self.seed is None:
             return "the nominal run"
         return f"{self.unstable[1]} of {self.runs} runs"
-
-    def _requirements_in_words(self) -> list[str]:
-        """The requirements, the failed first, with the explanation of the runs that broke them;
-        then those that the tuning's runs break.
-        """
-        rows = []
-        for verdict in sorted(self.verdicts, key=lambda v: list(WORST_FIRST).index(v.verdict)):
-            rows.append(f"requirement {verdict}")
-            own = [x for x in self.failures if x.requirement == verdict.name]
-            rows += [f"  {x.cause_in_words()}" for x in own]
-        if self.step_check is not None:
-            rows += self.step_check.warnings_of_requirements()
-        return rows
-
-    def _doubts(self) -> list[str]:
-        """What to say about the objective where it did not become lower."""
-        objective = self.changes[0]
-        if objective.significant is False:
-            doubt = "these runs do not show that tuning helped."
-            return [f"The objective's change is not significant: {doubt}"]
-        if objective.after > objective.before:
-            return ["The objective went up."]
-        return []
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as numbers and strings."""
@@ -386,7 +376,7 @@ def make_report(request: ReportRequest) -> TuningReport:
     )
     before, after = samples = sample_runs(draws, (request.before, request.after))
 
-    def each(function: Any) -> tuple[Any, Any]:
+    def each(function: Callable[[Sample], T]) -> tuple[T, T]:
         return function(before), function(after)
 
     return TuningReport(

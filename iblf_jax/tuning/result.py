@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -67,7 +68,12 @@ class AtLimit(NamedTuple):
 
 @programs.jit(static_argnames="request")
 def _slice(
-    scenario: Scenario, changes: Any, folds: Any, dt: jax.Array, *, request: RunRequest
+    scenario: Scenario,
+    changes: Mapping[str, jax.Array],
+    folds: Any,
+    dt: jax.Array,
+    *,
+    request: RunRequest,
 ) -> Any:
     return run_batch(scenario, changes, folds, dt, request)
 

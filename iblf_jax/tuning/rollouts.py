@@ -30,7 +30,9 @@ a peak of `presets.ur5` takes 1,400 choices of a step with 14 tangents, of some 
 operations."""
 
 
-def fold_of(objective: Objective, dtype: Any, duration: Any = None) -> tuple[Quantities, ...]:
+def fold_of(
+    objective: Objective, dtype: np.dtype, duration: jax.Array | float | None = None
+) -> tuple[Quantities, ...]:
     """The fold of a problem: its quantities and the margin last.
 
     Args:

@@ -12,7 +12,7 @@ its program does not depend on where it is called.  The chain rule does the rest
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +20,9 @@ import numpy as np
 
 from iblf_jax.engine import RunRequest, Tangents, run_batch_jvp
 from iblf_jax.simulation.scenario import Scenario
+
+if TYPE_CHECKING:
+    from iblf_jax.simulation.metrics import Fold
 
 NUMBERS_A_RUN = 100
 """Approximate count of numbers that one run of a batch holds while it is computed: its state, its
@@ -43,7 +46,7 @@ def tangents_of_runs(
     scenario: Scenario,
     varied: Mapping[str, jax.Array],
     jacobians: Mapping[str, jax.Array],
-    folds: Any,
+    folds: tuple[Fold, ...],
     dt: jax.Array,
     request: RunRequest,
     *,
@@ -63,20 +66,18 @@ def tangents_of_runs(
     Returns:
       `Tangents`, run axis first, along the D coordinates.
     """
-    patterns = {path: _patterns(x.shape[1:-1], path in uniform) for path, x in jacobians.items()}
+    patterns = {}
+    for path, x in jacobians.items():
+        shape = x.shape[1:-1]
+        # A uniform leaf moves at once, and the entries of another one after one another.
+        entries = np.eye(int(np.prod(shape))).reshape(-1, *shape)
+        patterns[path] = np.ones((1, *shape)) if path in uniform else entries
     found = run_batch_jvp(scenario, varied, _directions(patterns), folds, dt, request)
     by_entry = {path: x.reshape(len(x), -1, x.shape[-1]) for path, x in jacobians.items()}
     C = jnp.concatenate([x[:, : len(patterns[path])] for path, x in by_entry.items()], axis=1)
     tangents = jax.tree.map(lambda x: jnp.einsum("bpd,bp...->bd...", C, x), found.tangents)
     products = tuple(jnp.einsum("bpd,bpq,bqe->bde", C, N, C) for N in found.products)
     return Tangents(found.outcome, tangents, products)
-
-
-def _patterns(shape: tuple[int, ...], uniform: bool) -> np.ndarray:
-    """The patterns along which a leaf moves: all of it at once, or one entry after the other."""
-    if uniform:
-        return np.ones((1, *shape))
-    return np.eye(int(np.prod(shape))).reshape(-1, *shape)
 
 
 def _directions(patterns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -47,7 +47,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import numpy as np
@@ -67,6 +67,9 @@ from iblf_jax.tuning.starts import (
     ranked,
     spread_points,
 )
+
+if TYPE_CHECKING:
+    from iblf_jax.tuning.solvers._base import Evaluation
 
 STEPS_PER_UPDATE = 12
 """Largest number of steps between two updates of the multipliers."""
@@ -221,7 +224,7 @@ class Search:
         if strategy is not None:
             self.consider_values(strategy.screening.points, strategy.screening.found)
 
-    def retire(self, starts: Any) -> None:
+    def retire(self, starts: slice | np.ndarray | list[int]) -> None:
         """Ends some starts for the rest of the phase."""
         self.state.finished[starts] = True
         self.state.retired[starts] = True
@@ -278,7 +281,10 @@ class Search:
             if state.phase == REPAIR and not self.is_violated:
                 return "the requirements are kept"
             if state.stage < self.stages:
-                if finished or exhausted or self._stage_is_long():
+                # Only problems without requirements have a largest number of steps of a stage.
+                longest = COARSE_STEPS if np.sum(~state.retired) > 1 else STEPS_PER_UPDATE
+                is_unlimited = state.multipliers.shape[1] > 0 or state.stage_steps < longest
+                if finished or exhausted or not is_unlimited:
                     self._next_stage()
             elif finished:
                 return "converged"
@@ -292,33 +298,37 @@ class Search:
 
     def _next_phase(self, stopped: str) -> bool:
         """Begins a further phase where one is needed; returns whether it has."""
-        phase = self.state.phase
-        if self.strategy is None or phase == SECOND_SEARCH:
+        state = self.state
+        if self.strategy is None or state.phase == SECOND_SEARCH:
             return False
-        if phase == REPAIR and self.is_violated:
-            self.state.repair_ended = bool(self.conditions().hold)
+        if state.phase == REPAIR and self.is_violated:
+            state.repair_ended = bool(self.conditions().hold)
             return False
-        if phase == OPTIMISE:
-            self.state.valleys = self._valleys()
-            self._compare_multiples()
+        if state.phase == OPTIMISE:
+            state.valleys = self._valleys()
+            # A sampling period is a whole number of steps and has no derivative, so that the values
+            # with other periods than that of the incumbent are compared.
+            problem = self.evaluate.problem
+            others = along(problem.blocks, problem.box, state.incumbent_z, MOST_MULTIPLES)
+            if len(others):
+                self.evaluate.values(others)
             if self.is_violated:
                 self._begin_phase(REPAIR, self._repair_starts())
                 return True
-            if stopped == "converged" and self._is_incumbent_explored() and self.conditions().hold:
+            # Only screened points or retired starts may be known in the valley of the incumbent.
+            distance = np.max(np.abs(state.best_z - state.incumbent_z), axis=1)
+            is_explored = bool(np.any((distance <= SAME_VALLEY) & ~state.retired))
+            if stopped == "converged" and is_explored and self.conditions().hold:
                 return False
-        self._begin_phase(SECOND_SEARCH, self._second_search_starts())
+        # The second search begins at the incumbent and at the best screened point that is far from
+        # all earlier starts.
+        best = state.incumbent_z[None]
+        explored = np.concatenate([best, self.history["z"][0], state.best_z])
+        order = np.argsort(self.strategy.screening.merit, kind="stable")
+        count = min(2, len(state.finished)) - 1
+        further = self._distinct(self.strategy.screening, order, count, explored)
+        self._begin_phase(SECOND_SEARCH, np.concatenate([best, further]))
         return True
-
-    def _compare_multiples(self) -> None:
-        """Evaluates the incumbent with other sampling periods.
-
-        A sampling period is a whole number of steps, so that no derivative by it exists.
-        """
-        problem = self.evaluate.problem
-        z = self.state.incumbent_z
-        others = along(problem.blocks, problem.box, z, MOST_MULTIPLES)
-        if len(others):
-            self.evaluate.values(others)
 
     def conditions(self) -> Conditions:
         """The optimality conditions at the incumbent, which is evaluated once more; determined once
@@ -339,7 +349,10 @@ class Search:
         state = self.state
         row, z = self._converged_near_incumbent()
         found = self._derivatives_at(row, z)
-        if self._is_as_good(found.value, row):
+        violation, objective = _keys(found.value)[row]
+        least, best = state.incumbent_key
+        small = self.solver.tolerance * max(1e-3, abs(float(best)))
+        if found.value.valid[row] and violation <= least and objective <= best + small:
             state.incumbent_z = np.array(z)
             state.incumbent_key = np.array(_keys(found.value)[row])
         elif not np.array_equal(z, state.incumbent_z):
@@ -374,15 +387,6 @@ class Search:
         nearest = min(distances, key=distances.__getitem__)
         return nearest, converged[nearest]
 
-    def _is_as_good(self, found: Value, row: int) -> bool:
-        """Whether a point is as good as the incumbent, up to the tolerance of the solver."""
-        if not found.valid[row]:
-            return False
-        violation, objective = _keys(found)[row]
-        least, best = self.state.incumbent_key
-        small = self.solver.tolerance * max(1e-3, abs(float(best)))
-        return violation <= least and objective <= best + small
-
     def _derivatives_at(self, row: int, z: np.ndarray) -> Derivatives:
         """The derivatives at one point, (p,), with the multipliers of one start and in its row."""
         evaluate = self.evaluate
@@ -393,13 +397,6 @@ class Search:
         self.state.evaluations += evaluate.evaluations - before
         self.history["evaluations"][-1] = np.array(self.state.evaluations)
         return found
-
-    def _is_incumbent_explored(self) -> bool:
-        """Whether a start that was not retired has its best trial in the valley of the incumbent.
-        Otherwise only screened points or retired starts are known there.
-        """
-        distance = np.max(np.abs(self.state.best_z - self.state.incumbent_z), axis=1)
-        return bool(np.any((distance <= SAME_VALLEY) & ~self.state.retired))
 
     def _begin_phase(self, phase: int, z: np.ndarray) -> None:
         """Begins a phase with the first k starts at the points z, (k, p), k <= S; the other starts
@@ -446,16 +443,6 @@ class Search:
         starts = min(REPAIR_STARTS, len(self.state.finished)) - 1
         order = np.argsort(both.excess, kind="stable")
         return np.concatenate([best, self._distinct(both, order, starts, best)])
-
-    def _second_search_starts(self) -> np.ndarray:
-        """The incumbent and the best screened point that is far from all earlier starts, (k, p)."""
-        assert self.strategy is not None
-        best = self.state.incumbent_z[None]
-        explored = np.concatenate([best, self.history["z"][0], self.state.best_z])
-        order = np.argsort(self.strategy.screening.merit, kind="stable")
-        count = min(2, len(self.state.finished)) - 1
-        further = self._distinct(self.strategy.screening, order, count, explored)
-        return np.concatenate([best, further])
 
     def _distinct(
         self, screening: Screening, order: np.ndarray, count: int, others: np.ndarray
@@ -507,16 +494,6 @@ class Search:
 
     # ------------------------------------------------------------------------------------ stages
 
-    def _stage_is_long(self) -> bool:
-        """Whether a stage has taken its largest number of steps, which only problems without
-        requirements have.
-        """
-        if self.state.multipliers.shape[1] > 0:
-            return False
-        if np.sum(~self.state.retired) > 1:
-            return self.state.stage_steps >= COARSE_STEPS
-        return self.state.stage_steps >= STEPS_PER_UPDATE
-
     def _next_stage(self) -> None:
         """Reduces the smoothing and retires the worse half of the starts."""
         state = self.state
@@ -541,7 +518,7 @@ class Search:
         state = self.state
         self._prepare_evaluation()
         before = self.evaluate.evaluations
-        evaluate: Any = self.evaluate
+        evaluate: Evaluation = self.evaluate
         if state.phase == REPAIR:
             evaluate = ExcessOnly(self.evaluate, self._space(REPAIR))
         tolerance = self.solver.tolerance

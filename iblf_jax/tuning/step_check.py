@@ -11,8 +11,8 @@ runs as in the search,
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -28,6 +28,8 @@ from iblf_jax.tuning.options import TuningRunOptions
 from iblf_jax.tuning.robust import combine, worst_count, worst_share
 from iblf_jax.tuning.samples import Sample, SampleRequest, is_random, sample_runs
 from iblf_jax.world import plants
+
+T = TypeVar("T")
 
 STEP_TOLERANCE = 1e-3
 """Largest excess of a requirement at half the step, in its scale, that is tolerated.
@@ -287,7 +289,7 @@ def check_step_size(
     full = _tuned_runs(scenario, values, objective, options, dt, batch)
     half = _tuned_runs(scenario, values, objective, options, 0.5 * dt, batch)
 
-    def pair(function: Any) -> tuple[Any, Any]:
+    def pair(function: Callable[[Sample], T]) -> tuple[T, T]:
         return function(full), function(half)
 
     return StepCheck(

@@ -176,7 +176,13 @@ class NormalSpace:
 
     def runnable_share(self) -> float:
         """The probability that a draw can be run, from draws that are not run."""
-        if not self._may_be_inadmissible():
+        supports = [
+            self.cube.uncertain.perturbations[target.path].distribution.support()
+            for target in self.cube.targets
+            if target.sign is not None
+        ]
+        # `prepare` refuses bounded distributions that reach inadmissible values.
+        if all(np.all(np.isfinite(end)) for support in supports for end in support):
             return 1.0
         rng = np.random.default_rng([self.prepared.options.seed, 2])
         return float(
@@ -187,16 +193,6 @@ class NormalSpace:
         """Whether the draws at points z, (k, d), can be run, (k,)."""
         dtype = self.prepared.scenario.initial.q.dtype
         return np.asarray(_admissible(self.cube, jnp.asarray(z, dtype)))
-
-    def _may_be_inadmissible(self) -> bool:
-        cube = self.cube
-        supports = [
-            cube.uncertain.perturbations[target.path].distribution.support()
-            for target in cube.targets
-            if target.sign is not None
-        ]
-        # `prepare` refuses bounded distributions that reach inadmissible values.
-        return any(not np.all(np.isfinite(end)) for support in supports for end in support)
 
     def noise(self, point: np.ndarray) -> jax.Array | None:
         """Key of the noise of the run at a point, (d,); None for a scenario without noise."""
@@ -219,7 +215,7 @@ def run_numbers(z: np.ndarray) -> np.ndarray:
     return np.array([zlib.crc32(row.tobytes()) for row in rows], np.uint32)
 
 
-def check_varied(perturbations: Any) -> None:
+def check_varied(perturbations: object) -> None:
     """Raises ValueError for no perturbations."""
     if isinstance(perturbations, Mapping) and not perturbations:
         raise checks.fail(

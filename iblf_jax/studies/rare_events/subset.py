@@ -223,7 +223,16 @@ def _estimate(
     before = float(np.prod([level.probability for level in levels[:-1]]))
     nearby = Samples(last.z, last.margins, np.ones(len(last.margins)))
     if not np.any(failed):
-        reached = _upper_bound_of(history, before, confidence)
+        # The upper end of the interval of the probability of the last level, times the bound of
+        # independent samples, one for each parent.
+        reached = before
+        if before < 1:
+            _, reached = log_normal_interval(before, variation_of(history[:-1]), confidence)
+        reached *= upper_bound(len(np.unique(last.parent)), confidence)
+        if converge(levels):
+            count = len(levels) - len(levels) // 2
+            margin = levels[-1].threshold
+            notes = [CONVERGED.format(margin=margin, count=count, levels=len(levels)), *notes]
         return Estimate(
             probability=reached,
             low=0.0,
@@ -235,7 +244,7 @@ def _estimate(
             nearby_probability=before,
             estimator="subset",
             effective_samples=0.0,
-            notes=(NO_FAILURE, *_note_of_convergence(levels), *notes),
+            notes=(NO_FAILURE, *notes),
         )
     levels = [*levels[:-1], _level(last, 0.0)]
     history = [*history[:-1], (last, 0.0)]
@@ -258,28 +267,6 @@ def _estimate(
     )
 
 
-def _note_of_convergence(levels: list[Level]) -> tuple[str, ...]:
-    """A note if the thresholds converge to a margin that is not 0."""
-    if not converge(levels):
-        return ()
-    count = len(levels) - len(levels) // 2
-    last = levels[-1].threshold
-    return (CONVERGED.format(margin=last, count=count, levels=len(levels)),)
-
-
-def _upper_bound_of(
-    history: list[tuple[Population, float]], before: float, confidence: float
-) -> float:
-    """A bound of the probability from a last level without failures: the upper end of the interval
-    of the level's own probability, times the bound of independent samples, one for each parent.
-    """
-    last, _ = history[-1]
-    reached = before
-    if before < 1:
-        _, reached = log_normal_interval(before, variation_of(history[:-1]), confidence)
-    return reached * upper_bound(len(np.unique(last.parent)), confidence)
-
-
 def variation_of(history: list[tuple[Population, float]]) -> float:
     """The coefficient of variation of the product of the conditional probabilities.
 
@@ -292,20 +279,15 @@ def variation_of(history: list[tuple[Population, float]]) -> float:
         total += _sum_of_squares(np.bincount(samples.parent, deviations))
         ancestor = samples.parent
         for earlier, its_threshold in reversed(history[:number]):
-            ancestor = _parents_of_chains(earlier)[ancestor]
+            parent_of_chain = np.zeros(np.max(earlier.chain) + 1, int)
+            parent_of_chain[earlier.chain] = earlier.parent
+            ancestor = parent_of_chain[ancestor]
             its_deviations = relative_deviations(earlier, its_threshold)
             count = max(np.max(ancestor), np.max(earlier.parent)) + 1
             of_earlier = np.bincount(earlier.parent, its_deviations, count)
             of_later = np.bincount(ancestor, deviations, count)
             total += 2 * max(0.0, float(of_earlier @ of_later))
     return float(np.sqrt(total))
-
-
-def _parents_of_chains(samples: Population) -> np.ndarray:
-    """The parent of each chain of a level."""
-    parents = np.zeros(np.max(samples.chain) + 1, int)
-    parents[samples.chain] = samples.parent
-    return parents
 
 
 def relative_deviations(samples: Population, threshold: float) -> np.ndarray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
@@ -14,6 +14,9 @@ from iblf_jax.core.pytree import field_values
 from iblf_jax.studies.designs import MAX_RUNS
 from iblf_jax.tuning.parameters import Box
 from iblf_jax.tuning.robust import worst_count
+
+if TYPE_CHECKING:
+    from iblf_jax.tuning.evaluation import Derivatives, Value
 
 MODES = ("auto", "forward", "reverse")
 SCHEDULES = ("cosine", "constant")
@@ -83,13 +86,23 @@ class SearchSpace(NamedTuple):
     """Largest number of steps of the search, for schedules."""
 
 
+class Evaluation(Protocol):
+    """A problem as a function of coordinates z, (S, p), whose derivatives are NumPy arrays."""
+
+    space: SearchSpace
+    """Of this step."""
+    active: np.ndarray
+    """Which starts are to be advanced, (S,) bool."""
+
+    def __call__(self, z: np.ndarray, /) -> Derivatives:
+        """The derivatives at z."""
+
+
 class Solver(abc.ABC):
     """An algorithm with its options; a frozen dataclass without state of its own.
 
-    It advances S starts together.  `evaluate` is a function of coordinates z, (S, p), that returns
-    `Derivatives` as NumPy arrays.  Its attribute `space` is the `SearchSpace` of this step, and
-    `active`, (S,), says which starts are to be advanced.  The state is any pytree of NumPy arrays,
-    which `step` and `restart` may change in place.
+    It advances S starts together.  The state is any pytree of NumPy arrays, which `step` and
+    `restart` may change in place.
 
     In the phase REPAIR of a search (see `search`) the loss is zero, and
     `space.constraints.largest_only` is true: a solver with the requirements as constraints then
@@ -124,11 +137,13 @@ class Solver(abc.ABC):
         """The state of S starts at z, (S, p), before the first evaluation."""
 
     @abc.abstractmethod
-    def step(self, evaluate: Any, state: Any, tolerance: float) -> tuple[np.ndarray, Any]:
+    def step(
+        self, evaluate: Evaluation, state: Any, tolerance: float
+    ) -> tuple[np.ndarray, Derivatives]:
         """Advances the active starts by one trial each.
 
         Args:
-          evaluate: function of z, (S, p), with the attributes that are described above.
+          evaluate: the problem.
           state: of `init`, changed in place.
           tolerance: of this step; larger than the solver's own while peaks are still smoothed.
 
@@ -157,7 +172,7 @@ weight of 5, six of eight searches of a problem of nine gains began, and ended, 
 requirements cannot be kept."""
 
 
-def violations(value: Any) -> np.ndarray:
+def violations(value: Value) -> np.ndarray:
     """The largest excess at each point of a `Value`, of requirements in their scales and of bounds
     in rad, (N,); 0 at feasible points.
     """
@@ -165,12 +180,12 @@ def violations(value: Any) -> np.ndarray:
     return np.maximum(excess, np.maximum(-value.margin, 0.0))
 
 
-def _word(name: str, value: Any, allowed: tuple[str, ...]) -> str:
+def _word(name: str, value: str, allowed: tuple[str, ...]) -> str:
     checks.one_of(name, value, allowed)
     return value
 
 
-def _optimiser(name: str, value: Any) -> Any:
+def _optimiser(name: str, value: object) -> object:
     """An optimiser of optax, which is a tuple of functions, or None."""
     expected = "an optax.GradientTransformation such as optax.lion(1e-3)"
     if value is not None and not has_members(value, "init", "update"):
@@ -205,12 +220,12 @@ CHECKS: dict[str, Any] = {
 ValueError."""
 
 
-def check_options(options: Any) -> None:
+def check_options(options: object) -> None:
     """Checks the fields of a frozen dataclass of options, and converts them to their types."""
     for name, value in field_values(options).items():
         object.__setattr__(options, name, CHECKS[name](name, value))
 
 
-def where_rows(mask: np.ndarray, new: Any, old: Any) -> np.ndarray:
+def where_rows(mask: np.ndarray, new: np.ndarray, old: np.ndarray) -> np.ndarray:
     """Rows of `new` where the mask, (S,), is true, of `old` otherwise."""
     return np.where(mask.reshape((-1,) + (1,) * (np.ndim(new) - 1)), new, old)

@@ -7,13 +7,16 @@ for few gains `sqp` needs fewer rollouts.
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import optax
 
 from iblf_jax.tuning.solvers import optax_steps
 from iblf_jax.tuning.solvers._base import SearchSpace, Solver, check_options
+
+if TYPE_CHECKING:
+    pass
 
 FINAL_RATE = 0.02
 """Last learning rate of the cosine schedule, relative to the first."""

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import dataclasses
 from functools import partial
-from typing import Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +27,10 @@ import optax
 
 from iblf_jax.tuning.parameters import squashed, unsquash
 from iblf_jax.tuning.solvers._base import SearchSpace, Solver, check_options, where_rows
+
+if TYPE_CHECKING:
+    from iblf_jax.tuning.evaluation import Derivatives
+    from iblf_jax.tuning.solvers._base import Evaluation
 
 SUFFICIENT_DECREASE = 1e-4
 """c1."""
@@ -92,13 +96,19 @@ class LBFGS(Solver):
         return state["done"].copy()
 
     def step(
-        self, evaluate: Any, state: dict[str, Any], tolerance: float
-    ) -> tuple[np.ndarray, Any]:
+        self, evaluate: Evaluation, state: dict[str, Any], tolerance: float
+    ) -> tuple[np.ndarray, Derivatives]:
         """One line search of every active start, as `Solver.step`."""
         active = evaluate.active.copy()
-        found = None
+        found: Any = None
         if not np.all(state["evaluated"][active]):
-            found = self._evaluate_here(evaluate, state)
+            z, pull = squashed(evaluate.space.box, state["w"])
+            found = evaluate(z)
+            gradient = pull(found.gradient)
+            valid = active & _is_finite(found.value.loss, gradient)
+            state["loss"] = np.where(valid, found.value.loss, state["loss"])
+            state["gradient"] = where_rows(valid, gradient, state["gradient"])
+            state["evaluated"] = state["evaluated"] | valid
         search = LineSearch(evaluate, self._directions(state), state, found)
         search.run(active & state["evaluated"], self.line_steps)
         evaluate.active = active
@@ -109,17 +119,6 @@ class LBFGS(Solver):
         for name in ("w", "loss", "gradient"):
             state[name] = where_rows(search.improved, getattr(search, name), state[name])
         return search.z, search.found
-
-    def _evaluate_here(self, evaluate: Any, state: dict[str, Any]) -> Any:
-        """Evaluates the present points of the active starts."""
-        z, pull = squashed(evaluate.space.box, state["w"])
-        found = evaluate(z)
-        gradient = pull(found.gradient)
-        valid = evaluate.active & _is_finite(found.value.loss, gradient)
-        state["loss"] = np.where(valid, found.value.loss, state["loss"])
-        state["gradient"] = where_rows(valid, gradient, state["gradient"])
-        state["evaluated"] = state["evaluated"] | valid
-        return found
 
     def _directions(self, state: dict[str, Any]) -> np.ndarray:
         """The direction of descent of each start, (S, p), by a curvature that includes its last
@@ -172,7 +171,13 @@ class LineSearch:
       here: `Derivatives` at the present points, or None.
     """
 
-    def __init__(self, evaluate: Any, directions: np.ndarray, state: dict[str, Any], here: Any):
+    def __init__(
+        self,
+        evaluate: Evaluation,
+        directions: np.ndarray,
+        state: dict[str, Any],
+        here: Any,
+    ):
         self.evaluate = evaluate
         self.directions = directions
         self.origin = state["w"]
@@ -239,7 +244,7 @@ class Trial(NamedTuple):
 
     w: np.ndarray
     z: np.ndarray
-    found: Any
+    found: Derivatives
     loss: np.ndarray
     gradient: np.ndarray
     """By w, (S, p)."""

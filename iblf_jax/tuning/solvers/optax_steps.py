@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import dataclasses
 from functools import partial
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -36,6 +36,10 @@ import optax
 from iblf_jax.core import checks, notices
 from iblf_jax.tuning.parameters import squashed, unsquash
 from iblf_jax.tuning.solvers._base import SearchSpace, Solver, check_options, where_rows
+
+if TYPE_CHECKING:
+    from iblf_jax.tuning.evaluation import Derivatives, Evaluator
+    from iblf_jax.tuning.problem import TuningProblem
 
 CHECK_STEPS = 5
 """Steps from one value on all runs to the next, where the runs of the steps differ; at most the
@@ -69,7 +73,7 @@ class Optax(Solver):
       tolerance: relative change of the objective that counts as a better result.
     """
 
-    optimiser: Any = None
+    optimiser: object = None
     batch: int | None = None
     resample: bool = False
     mode: str = "auto"
@@ -122,7 +126,13 @@ def init(solver: Any, space: SearchSpace, z: np.ndarray) -> dict[str, Any]:
       ValueError: a mini-batch of more than all runs, or beside `resample`; an optimiser that needs
         more than gradients, parameters and the loss.
     """
-    _check_batch(solver, space.constraints.runs)
+    if solver.batch is not None and solver.resample:
+        came = checks.Words(f"{solver.batch} with resample=True")
+        raise checks.fail("batch", came, "one of them", "New runs need no mini-batches.")
+    runs = space.constraints.runs
+    if solver.batch is not None and solver.batch > runs:
+        remedy = "Lower it, or give tune more runs."
+        raise checks.fail("batch", solver.batch, f"at most the number of runs, {runs}", remedy)
     w = np.stack([unsquash(x, space.box) for x in z])
     try:
         inner = jax.vmap(solver.transformation(space.iterations).init)(jnp.asarray(w))
@@ -144,17 +154,6 @@ def init(solver: Any, space: SearchSpace, z: np.ndarray) -> dict[str, Any]:
     }
 
 
-def _check_batch(solver: Any, runs: int) -> None:
-    if solver.batch is None:
-        return
-    if solver.resample:
-        came = checks.Words(f"{solver.batch} with resample=True")
-        raise checks.fail("batch", came, "one of them", "New runs need no mini-batches.")
-    if solver.batch > runs:
-        remedy = "Lower it, or give tune more runs."
-        raise checks.fail("batch", solver.batch, f"at most the number of runs, {runs}", remedy)
-
-
 def restart(
     solver: Any, space: SearchSpace, state: dict[str, Any], start: int, z: np.ndarray | None
 ) -> None:
@@ -166,7 +165,7 @@ def restart(
         jax.tree.map(lambda old, x: old.__setitem__(start, x[0]), state[name], new[name])
 
 
-def step(solver: Any, evaluate: Any, state: dict[str, Any]) -> tuple[np.ndarray, Any]:
+def step(solver: Any, evaluate: Evaluator, state: dict[str, Any]) -> tuple[np.ndarray, Derivatives]:
     """One step of every active start, as `Solver.step`."""
     space = evaluate.space
     number = int(state["steps"])
@@ -189,10 +188,16 @@ def step(solver: Any, evaluate: Any, state: dict[str, Any]) -> tuple[np.ndarray,
     state["steps"] = state["steps"] + 1
     if solver.batch is None and not solver.resample:
         return z, found
-    return z, found._replace(value=_value_on_all_runs(solver, evaluate, z, found.value, number))
+    is_last = number + 1 >= space.iterations
+    if number % min(CHECK_STEPS, solver.patience) and not is_last:
+        value = found.value._replace(valid=np.zeros_like(found.value.valid))
+    else:
+        value = evaluate.values(z)  # on all runs
+        value = value._replace(valid=value.valid & evaluate.active)
+    return z, found._replace(value=value)
 
 
-def _evaluated(solver: Any, evaluate: Any, z: np.ndarray, number: int) -> Any:
+def _evaluated(solver: Any, evaluate: Evaluator, z: np.ndarray, number: int) -> Derivatives:
     """The derivatives at z on the runs of a step."""
     if solver.batch is None:
         return evaluate(z)
@@ -222,7 +227,7 @@ def runs_of_step(runs: int, batch: int, seed: int, number: int) -> np.ndarray:
     return np.sort(order[place * batch : (place + 1) * batch])
 
 
-def _warn_of_bias(solver: Any, problem: Any) -> None:
+def _warn_of_bias(solver: Any, problem: TuningProblem) -> None:
     """Warns of a risk whose worst runs a mini-batch does not represent."""
     risk = problem.options.risk
     if risk.kind == "mean" or solver.batch == problem.runs:
@@ -236,17 +241,9 @@ def _warn_of_bias(solver: Any, problem: Any) -> None:
     )
 
 
-def _value_on_all_runs(solver: Any, evaluate: Any, z: np.ndarray, value: Any, number: int) -> Any:
-    """The value at z on all runs where it is due; otherwise the given one, marked as not valid."""
-    interval = min(CHECK_STEPS, solver.patience)
-    is_last = number + 1 >= evaluate.space.iterations
-    if number % interval and not is_last:
-        return value._replace(valid=np.zeros_like(value.valid))
-    everything = evaluate.values(z)
-    return everything._replace(valid=everything.valid & evaluate.active)
-
-
-def _updated(solver: Any, iterations: int, gradient: Any, inner: Any, w: Any, loss: Any) -> Any:
+def _updated(
+    solver: Any, iterations: int, gradient: jax.Array, inner: Any, w: jax.Array, loss: jax.Array
+) -> Any:
     optimiser = optax.with_extra_args_support(solver.transformation(iterations))
 
     def of_start(gradient: jax.Array, inner: Any, w: jax.Array, loss: jax.Array) -> Any:

@@ -18,12 +18,15 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from functools import partial
-from typing import Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import jax
 import numpy as np
 
 from iblf_jax.tuning.solvers._base import EXCESS_WEIGHT, SearchSpace, Solver, violations
+
+if TYPE_CHECKING:
+    from iblf_jax.tuning.evaluation import Evaluator, Value
 
 INVALID_LOSS = 1e6
 BATCHES_IN_FIRST_STEP = 2
@@ -67,13 +70,13 @@ class PopulationState:
     """The point where it begins, (p,)."""
     losses: np.ndarray
     """Losses of all points so far, NaN in the places of later ones."""
-    count: Any
+    count: np.ndarray | int
     """Number of points so far."""
-    generations: Any
+    generations: np.ndarray | int
     """Number of generations so far."""
-    reference: Any
+    reference: np.ndarray | float
     """|f0|; NaN before the first valid point."""
-    done: Any
+    done: np.ndarray | bool
     """Whether the library has converged."""
     library: Library
     """The library's object; not part of a checkpoint."""
@@ -183,7 +186,10 @@ class Population(Solver):
 
 
 def _losses(
-    evaluate: Any, own: PopulationState, points: np.ndarray, seen: list[tuple[np.ndarray, Any]]
+    evaluate: Evaluator,
+    own: PopulationState,
+    points: np.ndarray,
+    seen: list[tuple[np.ndarray, Value]],
 ) -> np.ndarray:
     """Evaluates points, (N, p), appends them to `seen` and returns their losses, (N,).
 

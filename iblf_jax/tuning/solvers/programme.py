@@ -17,13 +17,20 @@ shortens its step.
 from __future__ import annotations
 
 from collections import OrderedDict
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import jax
 import numpy as np
 
 from iblf_jax.tuning.solvers._base import SearchSpace, Solver, violations
 from iblf_jax.tuning.solvers.sqp import MAX_PIECES, TARGET_EXCESS
+
+if TYPE_CHECKING:
+    from iblf_jax.tuning.evaluation import Derivatives
+    from iblf_jax.tuning.solvers._base import Evaluation
+
+T = TypeVar("T")
+
 
 INVALID_OBJECTIVE = 1e3
 """Value of f / |f0| where a run is invalid."""
@@ -66,7 +73,7 @@ class Programme:
       z: point where the run begins, (p,).
     """
 
-    def __init__(self, evaluate: Any, start: int, z: np.ndarray):
+    def __init__(self, evaluate: Evaluation, start: int, z: np.ndarray):
         self.evaluate = evaluate
         self.start = start
         self.space: SearchSpace = evaluate.space
@@ -147,7 +154,11 @@ class Programme:
             found = evaluate(np.tile(z, (len(active), 1)))
         finally:
             evaluate.active = active
-        key = self._key(found.value)
+        # Violation and loss compare the points.
+        key = (np.inf, np.inf)
+        if found.value.valid[self.start]:
+            violation = violations(found.value)[self.start]
+            key = (float(violation), float(found.value.loss[self.start]))
         if self.best is None or key < self.best[0]:
             self.best = key, z, found
         row = self._row_of(found)
@@ -155,14 +166,7 @@ class Programme:
         is_finite = all(bool(np.all(np.isfinite(x))) for x in numbers)
         return row if is_finite else None
 
-    def _key(self, value: Any) -> tuple[float, float]:
-        """Violation and loss, by which points are compared; infinite where a run is invalid."""
-        s = self.start
-        if not value.valid[s]:
-            return np.inf, np.inf
-        return float(violations(value)[s]), float(value.loss[s])
-
-    def _row_of(self, found: Any) -> Row:
+    def _row_of(self, found: Derivatives) -> Row:
         """The numbers of this start from `Derivatives` of all starts."""
         gradient = np.asarray(found.gradient[self.start], float)
         objective = float(found.value.loss[self.start])
@@ -286,7 +290,7 @@ class RunsToItsEnd(Solver):
         return best, found
 
 
-def _with_row(tree: Any, other: Any, row: int) -> Any:
+def _with_row(tree: T, other: T, row: int) -> T:
     """Derivatives of several starts in which one row is replaced by that of `other`."""
 
     def replaced(x: np.ndarray, y: np.ndarray) -> np.ndarray:

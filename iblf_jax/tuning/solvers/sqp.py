@@ -64,7 +64,7 @@ regions).
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import jax
 import numpy as np
@@ -74,6 +74,10 @@ from iblf_jax.core import checks
 from iblf_jax.tuning.parameters import Box
 from iblf_jax.tuning.solvers import quadratic
 from iblf_jax.tuning.solvers._base import Constraints, SearchSpace, Solver, check_options
+
+if TYPE_CHECKING:
+    from iblf_jax.tuning.evaluation import Derivatives
+    from iblf_jax.tuning.solvers._base import Evaluation
 
 INITIAL_RADIUS = 1.0
 """First delta in the coordinates z; 1 is a factor e for a gain."""
@@ -201,7 +205,15 @@ def solve_subproblem(
     ]
     runs_and_counts = zip(selected, constraints.worst, strict=True)
     own_columns = [_own_columns(chosen.run, k) for chosen, k in runs_and_counts]
-    rows, limits = _rows_of_pieces(selected, own_columns, pieces, piece_gradients)
+    # The rows of each requirement in the columns of the step, and the right-hand sides: a_j and
+    # -c_j - TARGET_EXCESS for its pieces, and zeros for the conditions on its own unknowns.
+    rows = []
+    limits = []
+    for chosen, own in zip(selected, own_columns, strict=True):
+        added = len(own) - len(chosen.run)
+        gradients = piece_gradients[chosen.run, :, chosen.piece]
+        rows.append(np.pad(gradients, ((0, added), (0, 0))))
+        limits.append(np.pad(-pieces[chosen.run, chosen.piece] - TARGET_EXCESS, (0, added)))
     own_block, violation_columns = _columns_of_requirements(size, own_columns, constraints)
     A = np.hstack([np.vstack([np.eye(size), -np.eye(size), *rows]), own_block])
     H = block_diag(matrix, np.zeros((own_block.shape[1], own_block.shape[1])))
@@ -227,25 +239,6 @@ def solve_subproblem(
         multipliers=multipliers,
         lagrangian=gradient + np.einsum("bm,bpm->p", piece_multipliers, piece_gradients),
     )
-
-
-def _rows_of_pieces(
-    selected: list[Selected],
-    own_columns: list[np.ndarray],
-    pieces: np.ndarray,
-    piece_gradients: np.ndarray,
-) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """The rows of each requirement in the columns of the step, and the right-hand sides: a_j and
-    -c_j - TARGET_EXCESS for its pieces, and zeros for the conditions on its own unknowns.
-    """
-    step_columns = []
-    limits = []
-    for chosen, own in zip(selected, own_columns, strict=True):
-        added = len(own) - len(chosen.run)
-        gradients = piece_gradients[chosen.run, :, chosen.piece]
-        step_columns.append(np.pad(gradients, ((0, added), (0, 0))))
-        limits.append(np.pad(-pieces[chosen.run, chosen.piece] - TARGET_EXCESS, (0, added)))
-    return step_columns, limits
 
 
 def _columns_of_requirements(
@@ -349,7 +342,7 @@ class Point(NamedTuple):
     """a, (B, p, M)."""
 
     @staticmethod
-    def of(space: SearchSpace, found: Any, start: int) -> Point:
+    def of(space: SearchSpace, found: Derivatives, start: int) -> Point:
         """The numbers of one start from `Derivatives` of all, in double precision."""
         gradient = np.asarray(found.gradient[start], float)
         runs = space.constraints.runs
@@ -398,15 +391,15 @@ class SQPState:
     """The point of the next evaluation, (p,)."""
     predicted: Any
     """Decrease of the penalty function that the model predicts for the trial."""
-    corrected: Any
+    corrected: np.ndarray | bool
     """Whether the trial is a second-order correction."""
     residuals: np.ndarray
     """As `optimality.Conditions.residuals`, at z, (3,)."""
-    evaluated: Any
+    evaluated: np.ndarray | bool
     """Whether z has been evaluated with the present loss."""
-    done: Any
+    done: np.ndarray | bool
     """Whether the start has converged or cannot continue."""
-    rejections: Any
+    rejections: np.ndarray | int
     """Rejected steps since the last accepted one."""
     cut_z: np.ndarray
     """Rejected trials of which the pieces are also constraints, (CUTS, p); NaN where there is
@@ -543,7 +536,7 @@ class SQP(Solver):
         return found
 
     def step(
-        self, evaluate: Any, state: list[SQPState], tolerance: float
+        self, evaluate: Evaluation, state: list[SQPState], tolerance: float
     ) -> tuple[np.ndarray, Any]:
         """One trial of every active start, as `Solver.step`."""
         space: SearchSpace = evaluate.space
@@ -572,10 +565,16 @@ def _advance(space: SearchSpace, state: SQPState, found: Point, tolerance: float
     step = state.trial - state.z
     length = float(np.max(np.abs(step)))
     ratio = -np.inf
-    if valid:
-        ratio = _decrease_ratio(space, state, found)
-        if _is_comparable(state, found):
-            _update_curvatures(state, step, found)
+    if valid and state.predicted > 0:
+        before = _merit(space, state, state.here.loss, state.here.pieces)
+        decrease = before - _merit(space, state, found.loss, found.pieces)
+        ratio = decrease / state.predicted
+    if valid and _is_comparable(state, found):
+        # the symmetric rank-one updates of A and of every stored C_j
+        change = found.gradient - state.here.gradient - state.here.matrix @ step
+        _rank_one_update(state.correction, change, step)
+        changes = np.swapaxes(found.piece_gradients - state.here.piece_gradients, 1, 2)
+        _rank_one_update(state.curvatures, changes.reshape(-1, len(step))[state.curved], step)
     is_accepted = ratio > RATIO_TO_ACCEPT
     state.rejections = 0 if is_accepted else state.rejections + 1
     if state.rejections >= MOST_REJECTIONS:
@@ -586,7 +585,12 @@ def _advance(space: SearchSpace, state: SQPState, found: Point, tolerance: float
     if is_accepted:
         _accept(space, state, found)
     elif valid:
-        _keep_cut(state, found)
+        # Its pieces replace the oldest ones of rejected trials.
+        new = (state.trial, found.pieces, found.piece_gradients)
+        kept = (state.cut_z, state.cut_pieces, state.cut_gradients)
+        for stored, x in zip(kept, new, strict=True):
+            stored[1:] = stored[:-1].copy()
+            stored[0] = x
         if not state.corrected and _correct(space, state, step, found.pieces):
             return
     if ratio < RATIO_TO_SHRINK:
@@ -612,14 +616,6 @@ def _merit(space: SearchSpace, state: SQPState, loss: float, pieces: np.ndarray)
     return loss + state.penalty * space.constraints.violation(excess)
 
 
-def _decrease_ratio(space: SearchSpace, state: SQPState, found: Point) -> float:
-    """Ratio of actual to predicted decrease of the penalty function."""
-    if not state.predicted > 0:
-        return -np.inf
-    before = _merit(space, state, state.here.loss, state.here.pieces)
-    return (before - _merit(space, state, found.loss, found.pieces)) / state.predicted
-
-
 def _accept(space: SearchSpace, state: SQPState, found: Point) -> None:
     """Makes the trial the accepted point.
 
@@ -628,7 +624,14 @@ def _accept(space: SearchSpace, state: SQPState, found: Point) -> None:
     """
     state.z = state.trial.copy()
     state.here = found
-    curved = _worst_pieces(space.constraints, found.pieces)
+    # The worst pieces of each requirement have a C_j; in row order, and in increasing order.
+    constraints = space.constraints
+    chosen = [np.zeros(0, int)]
+    for r, count in enumerate(_curvatures_kept(constraints)):
+        own = np.flatnonzero(np.tile(constraints.owner == r, constraints.runs))
+        from_worst = np.argsort(-found.pieces.ravel()[own], kind="stable")
+        chosen.append(np.sort(own[from_worst[:count]]))
+    curved = np.concatenate(chosen)
     curvatures = np.zeros_like(state.curvatures)
     _, new, old = np.intersect1d(curved, state.curved, return_indices=True)
     curvatures[new] = state.curvatures[old]
@@ -640,18 +643,6 @@ def _curvatures_kept(constraints: Constraints) -> list[int]:
     """The number of pieces of each requirement of which C_j is stored."""
     counts = [len(constraints.pieces_of(r)) for r in range(len(constraints.worst))]
     return [min(constraints.runs * count, MAX_CURVATURES) for count in counts]
-
-
-def _worst_pieces(constraints: Constraints, pieces: np.ndarray) -> np.ndarray:
-    """The worst pieces of each requirement, in increasing order, as indices into `pieces` in row
-    order.
-    """
-    chosen = [np.zeros(0, int)]
-    for r, count in enumerate(_curvatures_kept(constraints)):
-        own = np.flatnonzero(np.tile(constraints.owner == r, constraints.runs))
-        from_worst = np.argsort(-pieces.ravel()[own], kind="stable")
-        chosen.append(np.sort(own[from_worst[:count]]))
-    return np.concatenate(chosen)
 
 
 def _solve(space: SearchSpace, state: SQPState, pieces: np.ndarray, penalty: float) -> Step:
@@ -693,15 +684,6 @@ def _cut_values(state: SQPState, c: int) -> np.ndarray:
     """
     change = np.einsum("p,bpm->bm", state.z - state.cut_z[c], state.cut_gradients[c])
     return np.minimum(state.cut_pieces[c] + change, state.here.pieces)
-
-
-def _keep_cut(state: SQPState, found: Point) -> None:
-    """Stores the pieces of a rejected trial in place of the oldest ones."""
-    new = (state.trial, found.pieces, found.piece_gradients)
-    kept = (state.cut_z, state.cut_pieces, state.cut_gradients)
-    for stored, x in zip(kept, new, strict=True):
-        stored[1:] = stored[:-1].copy()
-        stored[0] = x
 
 
 def _predicted_decrease(space: SearchSpace, state: SQPState, step: np.ndarray) -> float:
@@ -748,7 +730,19 @@ def _plan(space: SearchSpace, state: SQPState, tolerance: float) -> None:
     violation = space.constraints.violation(excess + TARGET_EXCESS)
     reduction = violation - predicted_violation
     linear_decrease = -found.change + state.penalty * reduction
-    step, decrease = _best_with_curvature(space, state, found, penalty)
+    step = found.step
+    decrease = _predicted_decrease(space, state, step)
+    if state.here.pieces.size:
+        # The step with the largest predicted decrease, among the one found and those of
+        # subproblems with the curvature of the pieces, becomes the trial.
+        last = found
+        for _ in range(CURVATURE_SOLVES):
+            curved = state.here.pieces + state.curvature_along(last.step)
+            last = _solve(space, state, curved, penalty)
+            other = _predicted_decrease(space, state, last.step)
+            if other > decrease:
+                step = last.step
+                decrease = other
     state.trial = np.clip(state.z + step, space.box.low, space.box.high)
     # The quadratic models are used unless their prediction is far below that of the linear pieces.
     state.predicted = linear_decrease
@@ -766,26 +760,6 @@ def _plan(space: SearchSpace, state: SQPState, tolerance: float) -> None:
     is_stationary = state.residuals[0] <= STATIONARITY_TOLERANCE * slope_scale
     is_optimal = bool(length < 1e-7 or (is_flat and is_stationary))
     state.done = is_optimal or bool(state.radius < COLLAPSED_RADIUS)
-
-
-def _best_with_curvature(
-    space: SearchSpace, state: SQPState, found: Step, penalty: float
-) -> tuple[np.ndarray, float]:
-    """The step with the largest predicted decrease, and the decrease, among the given step and
-    CURVATURE_SOLVES steps of subproblems with the curvature of the pieces.
-    """
-    best = found.step
-    decrease = _predicted_decrease(space, state, best)
-    if not state.here.pieces.size:
-        return best, decrease
-    last = found
-    for _ in range(CURVATURE_SOLVES):
-        last = _solve(space, state, state.here.pieces + state.curvature_along(last.step), penalty)
-        other = _predicted_decrease(space, state, last.step)
-        if other > decrease:
-            best = last.step
-            decrease = other
-    return best, decrease
 
 
 def slope_size(here: Point) -> float:
@@ -877,14 +851,6 @@ def _correct(space: SearchSpace, state: SQPState, step: np.ndarray, pieces: np.n
     state.corrected = True
     difference = np.max(np.abs(state.trial - state.z - step))
     return bool(difference > 1e-3 * np.max(np.abs(step)))
-
-
-def _update_curvatures(state: SQPState, step: np.ndarray, found: Point) -> None:
-    """The symmetric rank-one updates of A and of every stored C_j."""
-    change = found.gradient - state.here.gradient - state.here.matrix @ step
-    _rank_one_update(state.correction, change, step)
-    changes = np.swapaxes(found.piece_gradients - state.here.piece_gradients, 1, 2)
-    _rank_one_update(state.curvatures, changes.reshape(-1, len(step))[state.curved], step)
 
 
 def _rank_one_update(matrix: np.ndarray, change: np.ndarray, step: np.ndarray) -> None:
