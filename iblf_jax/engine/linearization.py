@@ -18,6 +18,7 @@ from iblf_jax.engine.carry import Inputs, Step, StepOptions, keep_if
 from iblf_jax.simulation import error_estimate, stability
 from iblf_jax.simulation.closed_loop import (
     LoopState,
+    PerturbedState,
     initial_state,
     integrated_part,
     perturbed_rate,
@@ -152,7 +153,10 @@ def fastest_mode(scenario: Scenario, found: Linearization) -> jax.Array:
 
 
 def linearization_at(
-    time: jax.Array, state: LoopState, watched: int, unresolved: error_estimate.UnresolvedSignals
+    time: jax.Array,
+    state: LoopState | PerturbedState,
+    watched: int,
+    unresolved: error_estimate.UnresolvedSignals,
 ) -> Linearization:
     """The carry of a `LinearizationStep` at a state, as `perturbed_state` gives it, of which
     `error_estimate` watches so many numbers.

@@ -135,7 +135,8 @@ class Scene:
         scenario = curves[0].run.scenario
         limits = set_limits(self.arm, points, scenario.regions)
         plant = scenario.loop.plant
-        draw_boundaries(self.arm, plant.robot, scenario.regions, limits)
+        if plant.robot is not None:
+            draw_boundaries(self.arm, plant.robot, scenario.regions, limits)
         self._add_fans()
         self._add_arms(curves)
         self._add_bars(curves)

@@ -277,11 +277,12 @@ def check_supported(scenario: Scenario) -> None:
 def _check_plant(scenario: Scenario) -> None:
     for name in ("plant", "model"):
         part = vars(scenario)[name]
-        if plants.as_plant(part).robot is not part:
+        robot = plants.as_plant(part).robot
+        if robot is None or robot is not part:
             reason = "This bound is that of rigid arms."
             raise unsupported(name, type(part).__name__, "a robot", reason)
         reason = "A load that is picked up changes the plant during the run."
-        check_unchanging(name, part, "a robot that does not change", reason)
+        check_unchanging(name, robot, "a robot that does not change", reason)
     expected = f"a robot of the structure of the plant, {type(scenario.plant).__name__}"
     check_same_structure(scenario, expected)
 

@@ -626,7 +626,7 @@ def with_growth(
     return found, {BOUND: jnp.where(jumped, of_codes, 0.0)}
 
 
-def errors_by_step(metrics: Mapping[str, jax.Array]) -> jax.Array:
+def errors_by_step(metrics: Mapping[Any, Any]) -> jax.Array:
     """The stated error of runs relative to the tube, as far as a smaller step makes it tolerable;
     `metrics` are by name.
 

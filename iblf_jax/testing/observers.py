@@ -14,7 +14,6 @@ from iblf_jax.control.observers import Observer, RobotObserver
 from iblf_jax.control.observers._base import contract_of
 from iblf_jax.control.observers.none import observer_of_x
 from iblf_jax.core import checks
-from iblf_jax.simulation.scenario import check_plant_or_robot
 from iblf_jax.testing._contract import (
     Findings,
     call_has_shape,
@@ -66,7 +65,7 @@ def check_observer(
             if isinstance(observer, Observer):
                 model = plant_of(levels_of(observer), joints)
         elif isinstance(observer, Observer):
-            check_plant_or_robot("model", model)
+            plants.check_part("model", model)
         else:
             checks.conforms("model", model, Robot)
         check_joints_of(n, model, "model")
