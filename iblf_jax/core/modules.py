@@ -203,8 +203,8 @@ class Division(NamedTuple):
         values = self.treedef.flatten_up_to(module)
         for i, node in enumerate(values):
             if isinstance(node, Structure):
-                held = node.value
-                values[i] = held.array() if isinstance(held, ConstantArray) else held
+                constant = node.value
+                values[i] = constant.array() if isinstance(constant, ConstantArray) else constant
         return self.treedef.unflatten(values)
 
 

@@ -58,4 +58,7 @@ from iblf_jax.tuning.solvers import SearchSpace as SearchSpace
 from iblf_jax.tuning.solvers import Solver as Solver
 from iblf_jax.tuning.solvers import TrustConstr as TrustConstr
 from iblf_jax.tuning.solvers import Uno as Uno
+from iblf_jax.tuning.solvers._base import Derivatives as Derivatives
+from iblf_jax.tuning.solvers._base import Evaluation as Evaluation
+from iblf_jax.tuning.solvers._base import Value as Value
 from iblf_jax.tuning.step_check import StepCheck as StepCheck

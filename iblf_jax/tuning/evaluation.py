@@ -32,7 +32,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -50,46 +50,12 @@ from iblf_jax.tuning.robust import Risk, combine, worst_share
 from iblf_jax.tuning.rollouts import Rollouts, fold_of
 from iblf_jax.tuning.runs import in_groups, tangents_of_runs
 from iblf_jax.tuning.solvers import SearchSpace
+from iblf_jax.tuning.solvers._base import Derivatives, Value
 
 if TYPE_CHECKING:
     from iblf_jax.engine.outcome import Outcome
 
 T = TypeVar("T")
-
-
-class Value(NamedTuple):
-    """A problem at one z."""
-
-    loss: Any
-    """L, infinite where a run was invalid."""
-    objective: Any = ()
-    """f without smoothing: what results are compared by."""
-    terms: Any = ()
-    """Each unweighted term without smoothing, averaged over the runs, on a front combined by the
-    risk, (n_terms,)."""
-    smooth_excess: Any = ()
-    """G_r from the smooth quantities, (n_requirements,)."""
-    exact_excess: Any = ()
-    """G_r from the exact quantities, (n_requirements,)."""
-    margin: Any = ()
-    """The smallest margin of all runs [rad]."""
-    valid: Any = ()
-    trusted: Any = ()
-    """Share of the runs that were integrated to their end, and stably; 1 where valid."""
-
-
-class Derivatives(NamedTuple):
-    """A problem at one z, with derivatives."""
-
-    value: Value
-    gradient: Any
-    hessian: Any
-    """Gauss-Newton approximation, (p, p)."""
-    pieces: Any = ()
-    """g of each piece of each requirement in each run, (B, M), one requirement after the other;
-    levels last, and in the first run only."""
-    piece_gradients: Any = ()
-    """Their gradients, (B, p, M)."""
 
 
 def _fold(problem: TuningProblem) -> tuple[Quantities, ...]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
@@ -14,9 +14,6 @@ from iblf_jax.core.pytree import field_values
 from iblf_jax.studies.designs import MAX_RUNS
 from iblf_jax.tuning.parameters import Box
 from iblf_jax.tuning.robust import worst_count
-
-if TYPE_CHECKING:
-    from iblf_jax.tuning.evaluation import Derivatives, Value
 
 MODES = ("auto", "forward", "reverse")
 SCHEDULES = ("cosine", "constant")
@@ -84,6 +81,41 @@ class SearchSpace(NamedTuple):
     """Whether several local minima are expected."""
     iterations: int = 60
     """Largest number of steps of the search, for schedules."""
+
+
+class Value(NamedTuple):
+    """A problem at one z."""
+
+    loss: Any
+    """L, infinite where a run was invalid."""
+    objective: Any = ()
+    """f without smoothing: what results are compared by."""
+    terms: Any = ()
+    """Each unweighted term without smoothing, averaged over the runs, on a front combined by the
+    risk, (n_terms,)."""
+    smooth_excess: Any = ()
+    """G_r from the smooth quantities, (n_requirements,)."""
+    exact_excess: Any = ()
+    """G_r from the exact quantities, (n_requirements,)."""
+    margin: Any = ()
+    """The smallest margin of all runs [rad]."""
+    valid: Any = ()
+    trusted: Any = ()
+    """Share of the runs that were integrated to their end, and stably; 1 where valid."""
+
+
+class Derivatives(NamedTuple):
+    """A problem at one z, with derivatives."""
+
+    value: Value
+    gradient: Any
+    hessian: Any
+    """Gauss-Newton approximation, (p, p)."""
+    pieces: Any = ()
+    """g of each piece of each requirement in each run, (B, M), one requirement after the other;
+    levels last, and in the first run only."""
+    piece_gradients: Any = ()
+    """Their gradients, (B, p, M)."""
 
 
 class Evaluation(Protocol):

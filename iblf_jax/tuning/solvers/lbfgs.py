@@ -29,8 +29,7 @@ from iblf_jax.tuning.parameters import squashed, unsquash
 from iblf_jax.tuning.solvers._base import SearchSpace, Solver, check_options, where_rows
 
 if TYPE_CHECKING:
-    from iblf_jax.tuning.evaluation import Derivatives
-    from iblf_jax.tuning.solvers._base import Evaluation
+    from iblf_jax.tuning.solvers._base import Derivatives, Evaluation
 
 SUFFICIENT_DECREASE = 1e-4
 """c1."""

@@ -26,8 +26,7 @@ from iblf_jax.tuning.solvers._base import SearchSpace, Solver, violations
 from iblf_jax.tuning.solvers.sqp import MAX_PIECES, TARGET_EXCESS
 
 if TYPE_CHECKING:
-    from iblf_jax.tuning.evaluation import Derivatives
-    from iblf_jax.tuning.solvers._base import Evaluation
+    from iblf_jax.tuning.solvers._base import Derivatives, Evaluation
 
 T = TypeVar("T")
 

@@ -76,8 +76,7 @@ from iblf_jax.tuning.solvers import quadratic
 from iblf_jax.tuning.solvers._base import Constraints, SearchSpace, Solver, check_options
 
 if TYPE_CHECKING:
-    from iblf_jax.tuning.evaluation import Derivatives
-    from iblf_jax.tuning.solvers._base import Evaluation
+    from iblf_jax.tuning.solvers._base import Derivatives, Evaluation
 
 INITIAL_RADIUS = 1.0
 """First delta in the coordinates z; 1 is a factor e for a gain."""
