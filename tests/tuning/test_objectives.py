@@ -401,7 +401,7 @@ def test_limits_of_single_joints_and_weights(three_joints):
         o.tracking(weights=[1.0, 0.5, 2.0]) + o.effort(joints=[0, 2], weights=[1.0, 3.0]), run
     )
     scaled = dataclasses.replace(
-        run, e1=run.e1 * jnp.array([1.0, 0.5, 2.0]), tau=run.tau * jnp.array([1.0, 0.0, 3.0])
+        run, e=run.e * jnp.array([1.0, 0.5, 2.0]), tau=run.tau * jnp.array([1.0, 0.0, 3.0])
     )
     np.testing.assert_allclose(weighted, exact(o.tracking() + o.effort(), scaled), rtol=1e-10)
     term = o.peak_torque(2.0 * peak).terms[0]
