@@ -243,8 +243,8 @@ def alpha_margins_above(sample: Sample) -> Array | None:
 
 def virtual_controls(sample: Sample) -> list[Array]:
     """alpha_1, alpha_2, ..., (n,) each, as many as the law has."""
-    higher = sample.x[2 : len(sample.e)] - sample.e[2:]
-    return [sample.alpha, *higher]
+    others = sample.x[2 : len(sample.e)] - sample.e[2:]
+    return [sample.alpha, *others]
 
 
 SIGNALS: dict[str, Recorded] = {
