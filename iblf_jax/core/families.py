@@ -116,7 +116,7 @@ def contract_of(part: object, of_x: type[X], of_robot: type[R]) -> type[X] | typ
     """The contract that a part is meant to fit: that of parts of the state x, or that of parts of q
     and q'.
 
-    A class without a base class has an attribute that says that it receives x.
+    A class without a base class says by the attribute `receives_x` that it receives x.
     """
     if isinstance(part, of_robot):
         return of_robot

@@ -315,7 +315,9 @@ LEVELS = (
 
 def check_combination(scenario: Scenario) -> None:
     """Raises ValueError for parts that do not fit together."""
-    plant, model = plants.as_plant(scenario.plant), plants.as_plant(scenario.model)
+    plant = model = plants.as_plant(scenario.plant)
+    if scenario.model is not scenario.plant:
+        model = plants.as_plant(scenario.model)
     law, higher = unwrapped(scenario.controller), scenario.initial.higher
     levels = None if higher is None else 2 + len(higher)
     kinds = type(law).__name__, type(scenario.model).__name__
@@ -331,6 +333,8 @@ def check_combination(scenario: Scenario) -> None:
 
 def check_regions(scenario: Scenario) -> None:
     """Raises ValueError for a region that is none, or that does not fit plant and model."""
+    if not scenario.regions:
+        return
     plant, model, *_ = scenario.loop
     for i, region in enumerate(scenario.regions):
         name = f"Scenario.regions[{i}]"
