@@ -51,6 +51,7 @@ hypothesis.settings.register_profile(
 hypothesis.settings.load_profile("default")
 
 import iblf_jax as ij
+from time_of_tests import Times
 
 PAPER = {"duration": 20.0, "dt": 1e-3, "record_every": 10}
 """The paper's run on the grid of the reference data; used wherever the length does not matter, so
@@ -124,6 +125,9 @@ def pytest_configure(config):
     choose_compilers(plain=plain)
     if "not slow" in config.option.markexpr:
         jax.config.update("jax_numpy_dtype_promotion", "strict")
+    is_worker = hasattr(config, "workerinput") or not config.getoption("numprocesses", None)
+    if is_worker and (folder := os.environ.get("TEST_TIMES")):
+        config.pluginmanager.register(Times(ROOT / folder))
 
 
 def slow_part(test: str, parts: int) -> int:

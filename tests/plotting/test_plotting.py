@@ -298,11 +298,14 @@ def test_figures_follow_the_user_s_style(runs):
     assert to_hex(lines_of(axes, "k1=4")[0].get_color()) == _style.COLOURS[1].lower()
 
 
+@ij.component
+class NamedArm(Arm3D):
+    joints = ("base_yaw", "_hidden", "cost$5$")
+
+
 @pytest.mark.slow
-def test_joints_have_the_names_of_the_robot_s_file(tmp_path):
-    plant = Arm3D(3)
-    plant.joints = ("base_yaw", "_hidden", "cost$5$")
-    run = made_up(plant, duration=1.0)
+def test_joints_have_the_names_of_the_robot_s_file():
+    run = made_up(NamedArm(3), duration=1.0)
     figure = run.plot()
     assert [axes.get_title() for axes in figure.axes[:3]] == ["base_yaw", " _hidden", r"cost\$5\$"]
     assert {"base_yaw", " _hidden", r"cost\$5\$"} <= set(texts_of(figure))
