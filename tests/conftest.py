@@ -50,8 +50,9 @@ hypothesis.settings.register_profile(
 )
 hypothesis.settings.load_profile("default")
 
-import iblf_jax as ij
 from time_of_tests import Times
+
+import iblf_jax as ij
 
 PAPER = {"duration": 20.0, "dt": 1e-3, "record_every": 10}
 """The paper's run on the grid of the reference data; used wherever the length does not matter, so
