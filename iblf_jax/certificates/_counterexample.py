@@ -38,7 +38,7 @@ from iblf_jax.certificates.claims.two_cases import gains_of
 from iblf_jax.certificates.eigenvalues import maximise
 from iblf_jax.certificates.terms import TORQUE, receives_q_dq, terms_and_sample
 from iblf_jax.core import checks
-from iblf_jax.core.presentation import Result
+from iblf_jax.core.presentation import Content, Result
 from iblf_jax.simulation.closed_loop import initial_state
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.scenario import Scenario, canonical
@@ -49,7 +49,7 @@ from iblf_jax.studies.worst import Losses, WorstCaseSearch, search
 EXCLUDED = "The guard or a torque limit is active at the start, where nothing is claimed."
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Counterexample(Result):
     """The largest growth that `counterexample` found."""
 
@@ -59,6 +59,10 @@ class Counterexample(Result):
     growth: float
     """The largest g that was found; at most -1 where the proof is exact, positive where V2 grows
     against the claim."""
+
+    def _content(self) -> Content:
+        drawn = [f"  {path}: {value}" for path, value in self.parameters.items()]
+        return [f"Counterexample(growth {self.growth:+.4g})", *"\n".join(drawn).splitlines()]
 
 
 def _growth(scenario: Scenario) -> tuple[jax.Array, jax.Array]:

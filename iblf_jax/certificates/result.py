@@ -19,7 +19,7 @@ from iblf_jax.certificates.lines import (
     Line,
 )
 from iblf_jax.core import checks, tables
-from iblf_jax.core.presentation import Result, present
+from iblf_jax.core.presentation import Content, Result, present
 
 MAX_LISTED = 3
 """Lines that do not apply are listed by name up to this number."""
@@ -83,7 +83,7 @@ class LevelLabel(NamedTuple):
     is_bounded: bool
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Certificate(Result):
     """Theorem 2, or (S.3), inequality by inequality, for one run or for many.  `holds`, `lines`,
     `cert["inequality, case 2"]`, `plot()`.
@@ -156,15 +156,12 @@ class Certificate(Result):
             f" {', '.join(repr(line.name) for line in self.lines)}"
         )
 
-    def __repr__(self) -> str:
-        rows = [
-            ("", "equation", "verdict", "margin", "value", "where the margin is smallest"),
-            *self._rows(),
-        ]
-        shown = [f"Certificate: {self.headline}  ({self.subject})"]
+    def _content(self) -> Content:
+        heading = ("", "equation", "verdict", "margin", "value", "where the margin is smallest")
+        shown: list[str | tables.Table] = [f"Certificate: {self.headline}  ({self.subject})"]
         if self.inaccurate:
             shown.append(self.accuracy_note)
-        shown += tables.as_text(rows)
+        shown.append(tables.Table(heading, self._rows()))
         notes: dict[str, list[str]] = {}
         for line in self.applicable:
             if line.note:
@@ -174,7 +171,7 @@ class Certificate(Result):
             shown += [f"  {'; '.join(names)}: {note}" for note, names in notes.items()]
         if self.omitted:
             shown.append(self.omitted)
-        return "\n".join(shown)
+        return shown
 
     def table_html(self) -> str:
         """The lines that apply as an HTML table, those that fail in bold, and below it why the

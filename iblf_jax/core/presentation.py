@@ -60,14 +60,14 @@ class Result:
     """What a study, a search or a proof finds: it prints, is a card in a notebook, and can be
     saved.
 
-    A subclass has `_content` (and `repr=False`, where it is a dataclass), or its own `__repr__`.
+    A subclass has `_content`, and `repr=False` where it is a dataclass.
     """
 
     __slots__ = ()
 
     def _content(self) -> Content:
         """Its lines and tables, of which this class makes the text, and `reports` the HTML."""
-        return repr(self).splitlines()
+        raise NotImplementedError(f"{type(self).__name__} states no content")
 
     def __repr__(self) -> str:
         lines = (x.lines() if isinstance(x, Table) else [x] for x in self._content())

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from iblf_jax.core import checks
-from iblf_jax.core.presentation import Result
+from iblf_jax.core.presentation import Content, Result
 from iblf_jax.proofs._prove import problem_of, prove, sample_weights, weights_of
 from iblf_jax.proofs.largest import ends_of
 from iblf_jax.proofs.result import Proof
@@ -27,7 +27,7 @@ TRIES = 60
 """Gains that are tried, if the caller gives no number."""
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class GuaranteedGains(Result):
     """Gains with the least largest V_w' on a level set, and the proof."""
 
@@ -43,15 +43,13 @@ class GuaranteedGains(Result):
     """Number of gains that were tried."""
     proof: Proof
 
-    def __repr__(self) -> str:
+    def _content(self) -> Content:
         gains = ", ".join(f"{path} = {value:.4g}" for path, value in self.gains.items())
-        return "\n".join(
-            [
-                f"Gains {gains}: largest V_w' found {self.rate:+.4g}, before"
-                f" {self.rate_before:+.4g} ({self.tries} tries).",
-                repr(self.proof),
-            ]
+        found = (
+            f"Gains {gains}: largest V_w' found {self.rate:+.4g}, before"
+            f" {self.rate_before:+.4g} ({self.tries} tries)."
         )
+        return [found, *self.proof._content()]
 
 
 def gains_for_guarantee(

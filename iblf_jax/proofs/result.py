@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks, tables
-from iblf_jax.core.presentation import Result, present
+from iblf_jax.core.presentation import Content, Result, present
 from iblf_jax.core.pytree import astype
 from iblf_jax.engine.simulate import simulate
 from iblf_jax.proofs.problem import LevelSetProblem
@@ -130,7 +130,7 @@ class Violation(NamedTuple):
     """Least distance from the bounds, in the unit of the position; negative outside."""
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Proof(Result):
     """Whether {V_w <= level} is invariant for all times and parameters; printed as sentences."""
 
@@ -250,8 +250,8 @@ class Proof(Result):
         """Tube, verdict and numbers as a dataset."""
         return present("proof dataset", self)
 
-    def __repr__(self) -> str:
-        return "\n".join([self.sentence(), *self.details()])
+    def _content(self) -> Content:
+        return [self.sentence(), *self.details()]
 
     def sentence(self) -> str:
         """The statement and its verdict as one sentence."""

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.core.presentation import Result, present
+from iblf_jax.core.presentation import Content, Result, present
 from iblf_jax.core.pytree import Pytree
 from iblf_jax.core.status import Status, describe
 from iblf_jax.simulation.error_estimate import RELATIVE
@@ -76,7 +76,7 @@ class Metrics(Mapping):
 
 
 @jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Rollout(Result, Signals):
     """One run of a scenario, or many: every array below has a leading run axis then.
 
@@ -151,9 +151,9 @@ class Rollout(Result, Signals):
             )
         return jax.tree.map(lambda x: x[index], self)
 
-    def __repr__(self) -> str:
+    def _content(self) -> Content:
         if not checks.is_concrete(self):
-            return "Rollout(being traced)"
+            return ["Rollout(being traced)"]
         components = plants.counted_components(self.scenario.plant, self.n)
         shape = (
             f"{self.x.shape[-3]} samples, {components}, dt = {float(np.ravel(self.dt)[0]):g} s,"
@@ -161,12 +161,12 @@ class Rollout(Result, Signals):
         )
         if self.is_batch:
             bad = int(np.sum(np.asarray(self.status) != 0))
-            return f"Rollout({len(self)} runs, {shape}; {bad} with a flag)"
+            return [f"Rollout({len(self)} runs, {shape}; {bad} with a flag)"]
         accuracy = ""
         if RELATIVE in self.metrics and not np.isnan(self.metrics[RELATIVE]):
             accuracy = f"; accurate to {float(self.metrics[RELATIVE]):.1g} of the tube"
         status = describe(int(self.status), status_words(self.scenario))
-        return f"Rollout({shape}; status: {status}{accuracy})"
+        return [f"Rollout({shape}; status: {status}{accuracy})"]
 
     def to_xarray(self):
         """An `xarray.Dataset` with named dimensions, units, and the scenario's parameters in its

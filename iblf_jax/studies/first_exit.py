@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.core.presentation import Result, present
+from iblf_jax.core.presentation import Content, Result, present
 from iblf_jax.core.status import Status, has_flag
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ ROUNDING_STEPS = 4.0
 """Largest rounding error of a time of a run, in units of the last place of its duration."""
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class FirstExit(Result):
     """The distribution of the first exit from the bounds, over the runs of a study."""
 
@@ -49,12 +49,12 @@ class FirstExit(Result):
     diverged: int
     """Runs that diverged before an exit was seen; they count as exits at the end of the run."""
 
-    def __repr__(self) -> str:
-        return (
+    def _content(self) -> Content:
+        return [
             f"FirstExit({len(self.times)} runs; up to {self.t[-1]:g} s:"
             f" {self.probability[-1]:.4g}, {self.confidence:.0%} interval"
             f" {self.low[-1]:.3g} to {self.high[-1]:.3g})"
-        )
+        ]
 
     def plot(self, **options: Any) -> Any:
         """Figure of the distribution.  Options as `plotting.first_exit`."""

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.core.presentation import Result
+from iblf_jax.core.presentation import Content, Result
 
 SMALLER_IS_WORSE = (
     "margin",
@@ -35,7 +35,7 @@ SMALLER_IS_WORSE = (
 """Metrics of which the smallest value, over joints and over runs, is the worst."""
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class Probability(Result):
     """The estimated probability of an event, with its confidence interval."""
 
@@ -51,11 +51,11 @@ class Probability(Result):
     method: str
     """The method of the interval, or why there is none."""
 
-    def __repr__(self) -> str:
+    def _content(self) -> Content:
         ends = f"no interval ({self.method})"
         if self.low is not None:
             ends = f"{self.confidence:.0%} interval {self.low:.3g} to {self.high:.3g}"
-        return f"{self.estimate:.4g} ({self.count} of {self.runs} runs; {ends})"
+        return [f"{self.estimate:.4g} ({self.count} of {self.runs} runs; {ends})"]
 
 
 def check_confidence(confidence: object) -> float:

@@ -58,7 +58,7 @@ ROUNDING = 1e-4
 integrates has the radius 1."""
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class OneRun(Result):
     """One run of a study."""
 
@@ -66,6 +66,11 @@ class OneRun(Result):
     metrics: Metrics
     status: int
     samples: dict[str, Any]
+
+    def _content(self) -> Content:
+        lines = [f"OneRun({self.index}; status: {describe(self.status)})"]
+        drawn = [f"  {path}: {np.asarray(x)}" for path, x in self.samples.items()]
+        return [*lines, *"\n".join(drawn).splitlines(), *repr(self.metrics).splitlines()]
 
 
 @jax.tree_util.register_dataclass

@@ -31,7 +31,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks, notices, programs
-from iblf_jax.core.presentation import Result
+from iblf_jax.core.presentation import Content, Result
 from iblf_jax.core.progress import announced, bar
 from iblf_jax.core.pytree import astype
 from iblf_jax.core.status import VIOLATED, Status, describe, has_flag
@@ -68,7 +68,7 @@ ALL_UNINFORMATIVE = (
 )
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class WorstCase(Result):
     """The worst run that `falsify` found."""
 
@@ -103,7 +103,7 @@ class WorstCase(Result):
         """The worst run, in full."""
         return simulate(self.scenario, record_every=record_every, runs_as=self.run)
 
-    def __repr__(self) -> str:
+    def _content(self) -> Content:
         word = "not falsified"
         if self.violated:
             word = "FALSIFIED"
@@ -115,8 +115,8 @@ class WorstCase(Result):
             f"  status: {describe(self.status, status_words(self.scenario))}",
         ]
         for path, x in self.values.items():
-            lines.append(f"  {path}: {np.array2string(np.asarray(x), precision=5)}")
-        return "\n".join(lines)
+            lines += f"  {path}: {np.array2string(np.asarray(x), precision=5)}".splitlines()
+        return lines
 
 
 @notices.each_warning_once

@@ -36,7 +36,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks, notices
-from iblf_jax.core.presentation import Result, present
+from iblf_jax.core.presentation import Content, Result, present
 from iblf_jax.core.progress import announced, bar
 from iblf_jax.engine import MAX_FORWARD_NUMBERS, differentiates_forward, takes_runs
 from iblf_jax.simulation.paths import with_parameters
@@ -66,7 +66,7 @@ POINTS_BETWEEN = 8
 """Number of values on the lines between neighbours, for each point."""
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class ParetoFront(Result):
     """Gains of which none is dominated by another in both objectives, from low a to low b."""
 
@@ -109,10 +109,10 @@ class ParetoFront(Result):
         """Figure of the front.  Options as `plotting.pareto`."""
         return present("front figure", self, **options)
 
-    def __repr__(self) -> str:
+    def _content(self) -> Content:
         pairs = zip(self.labels, self.objectives.T, strict=True)
         ends = ", ".join(f"{name} {x.min():.4g} to {x.max():.4g}" for name, x in pairs)
-        return f"ParetoFront({len(self)} points of {len(self.tried)} trials; {ends})"
+        return [f"ParetoFront({len(self)} points of {len(self.tried)} trials; {ends})"]
 
 
 def non_dominated(points: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ import numpy as np
 
 from iblf_jax.control.actuators import Ideal
 from iblf_jax.core import checks
-from iblf_jax.core.presentation import Result
+from iblf_jax.core.presentation import Content, Result
 from iblf_jax.deployment.cosimulate import (
     RecordedMotion,
     Rows,
@@ -30,7 +30,7 @@ from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class RobotMotion(Result):
     """The true motion of a simulated robot, what it published, and the efforts that it received.
 
@@ -81,6 +81,15 @@ class RobotMotion(Result):
     `skipped states` of a robot that was late by more than a period."""
     diverged: bool
     """Whether the state was not finite or too fast; the motion ends there."""
+
+    def _content(self) -> Content:
+        counts = ", ".join(f"{count} {name}" for name, count in self.counts.items() if count)
+        return [
+            f"RobotMotion({len(self.state_t)} states every {self.period:g} s,"
+            f" {len(self.t)} rows; no effort in {self.missed_share:.2%} of the periods"
+            f"{'; diverged' if self.diverged else ''})",
+            *([f"  {counts}"] if counts else []),
+        ]
 
     @property
     def missed_share(self) -> float:
