@@ -48,6 +48,8 @@ DISTRIBUTION = {"PIL": "pillow", "mpl_toolkits": "matplotlib", "tomli_w": "tomli
 COMES_WITH = {"jaxlib": "jax", "pandas": "xarray", "pillow": "matplotlib"}
 """What the package imports without a declaration of its own -> the dependency that always brings
 it."""
+OF_TYPE_CHECKERS = {"typing-extensions"}
+"""What every type checker brings, and what is imported for it only."""
 
 
 def imported(source: str) -> set[str]:
@@ -112,7 +114,8 @@ def test_every_import_is_declared():
         DISTRIBUTION.get(name, name) for source in sources for name in imported(source)
     }
     declared = names_of(REQUIRED) | names_of(OPTIONAL)
-    undeclared = {canonicalize_name(name) for name in distributions} - declared - set(COMES_WITH)
+    undeclared = {canonicalize_name(name) for name in distributions} - declared
+    undeclared -= {*COMES_WITH, *OF_TYPE_CHECKERS}
     assert not undeclared, f"declare {undeclared} in pyproject.toml"
     for name, parent in COMES_WITH.items():
         assert name in names_of(
