@@ -65,7 +65,7 @@ class LevelTraces(NamedTuple):
     disturbance_terms: np.ndarray
     """T of (S.3), with the lag of filters [1/s]."""
     error: np.ndarray
-    """Xi of levels with bounds, e_i of the others, (T, r, n)."""
+    """The error xi_i of levels with bounds, e_i of the others, (T, r, n)."""
     error_bound: np.ndarray
     """Bounds on |error| by the envelope, (T, r, n)."""
     d_tilde: np.ndarray
@@ -93,7 +93,9 @@ class Certificate(Result):
     """Law, barrier, variant and observer of the certificate."""
     lines: tuple[Line, ...]
     numbers: dict[str, Any]
-    """The constants of the claim: rho, rho2, lambda_min, lambda_max, V2(0), F_d, F_m, the case."""
+    """Constants of the claim by name.  Theorem 2 and (F.3): rho_{run,box}_case_{1,2}, case, F_m,
+    F_d, rho2, V2_start, V2_end, lambda_{min,max}_{run,box}.  (S.3): rho, rho2, V_start, V_end,
+    d_largest, d_tilde_largest.  All: samples, samples_left_out."""
     traces: Traces | LevelTraces
     """Of the run, or of the worst of many."""
     runs: tuple[int, ...] = ()

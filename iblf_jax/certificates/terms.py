@@ -98,7 +98,8 @@ class Terms(NamedTuple):
     sqrt_V_size: Any = ()
     """Error of sqrt(2 V) for a relative error of 1, ()."""
     claims: Any = ()
-    """Terms that claims add, a dict: by the key of the claim, TORQUE or ESTIMATED."""
+    """Terms of single claims: TORQUE for Theorem 2 and (F.3), ESTIMATED for the estimate of levels,
+    else `Claim.key`."""
 
 
 def rounding(dtype: DTypeLike) -> float:

@@ -66,7 +66,7 @@ class Constants(NamedTuple):
     parts: ArmParts
     numbers: Numbers
     weight: jax.Array
-    """w_f [1/(N m)^2 N m rad]."""
+    """w_f [rad/(N m)]."""
     level: jax.Array
     """c [N m rad]."""
 

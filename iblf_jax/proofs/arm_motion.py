@@ -57,7 +57,7 @@ class ArmParts(NamedTuple):
 
     model: Robot
     plant: Robot
-    """With the parameters of `Uncertainty` at any value."""
+    """The model, with the uncertain parameters at any value."""
     disturbance: Disturbance
     law: controllers.Backstepping
     """Its barrier has no guard."""
@@ -153,19 +153,19 @@ def scaled_alpha(parts: ArmParts, t: jax.Array, xi: jax.Array) -> jax.Array:
 
 
 def relative_alpha(parts: ArmParts, t: jax.Array, xi: jax.Array) -> jax.Array:
-    """Alpha - q_d', (n,) [rad/s]."""
+    """The difference alpha - q_d', (n,) [rad/s]."""
     return side_of(parts, t, xi).k * scaled_alpha(parts, t, xi)
 
 
 def slope(parts: ArmParts, t: jax.Array, xi: jax.Array) -> jax.Array:
-    """W s, (n,) [N m]."""
+    """The weighted slope w s, (n,) [N m]."""
     law, side = parts.law, side_of(parts, t, xi)
     scaled = law.weight * law.barrier.slope(side.scaled, xi)
     return scaled * side.k if degree(law.barrier) == 2 else scaled / side.k
 
 
 def energy(parts: ArmParts, t: jax.Array, xi: jax.Array) -> jax.Array:
-    """W V1, (n,) [N m rad]."""
+    """The weighted barrier w V1, (n,) [N m rad]."""
     law, side = parts.law, side_of(parts, t, xi)
     return law.weight * law.barrier.value(side.scaled, xi) * side.k ** degree(law.barrier)
 
@@ -183,7 +183,7 @@ def along(function: Callable, point: tuple, rates: tuple) -> Any:
 
 
 def xi_rate(parts: ArmParts, at: Errors) -> jax.Array:
-    """Xi' = A - xi k'/k + e2/k, (n,) [1/s]."""
+    """The rate xi' = A - xi k'/k + e2/k, (n,) [1/s]."""
     side = side_of(parts, at.t, at.xi)
     return scaled_alpha(parts, at.t, at.xi) - side.growth * at.xi + at.e2 / side.k
 
@@ -308,7 +308,7 @@ def decay(parts: ArmParts, at: Errors) -> jax.Array:
 
 
 def mismatch_torque(parts: ArmParts, now: Kinematics) -> jax.Array:
-    """F = M0 q" + C0 q' + G0 - Z, (n,) [N m]."""
+    """The uncertain torque f = M0 q" + C0 q' + G0 - Z, (n,) [N m]."""
     model = parts.model
     inertial = matvec(model.mass_matrix(now.q), now.a) + model.coriolis(now.q, now.v, now.v)
     return inertial + model.gravity(now.q) - required_torque(parts, now)

@@ -135,7 +135,7 @@ class ArmProblem(LevelSetProblem):
 
     bound: ArmBound
     parts: ArmParts
-    units: ClassVar[tuple[str, str]] = ("1/(N m)^2 N m rad", "N m rad")
+    units: ClassVar[tuple[str, str]] = ("rad/(N m)", "N m rad")
     first_barrier: ClassVar[str] = "barrier"
 
     @property

@@ -120,7 +120,7 @@ class TruePlant:
         return true / plants.gain_times(self.parts.model, i + 1, t, x, one)
 
     def slope_of_centre(self, i: int, t: jax.Array, x: jax.Array) -> jax.Array:
-        """Rho of the centre of the row above row i, G0_i/G_i - 1."""
+        """The slope rho of the centre of the row above row i, G0_i/G_i - 1."""
         zero, one = jnp.zeros(1), jnp.ones(1)
         slope = along(lambda rate: self.mismatch(i, t, x, rate), (zero,), (one,))
         return -plants.gain_times(self.parts.model, i + 1, t, x, slope)

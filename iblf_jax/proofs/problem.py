@@ -72,8 +72,8 @@ class LevelSetProblem(abc.ABC):
 
     A box is one of coordinates x = (`lower`, `upper`) together with a row of `patterns`, which are
     the last coordinates and are not divided.  `bound(x, constants)` returns upper bounds of V_w'
-    over a box, of which one must be negative, (k,), and numbers of which one is positive if the box
-    holds no point of the level set, (0,) here.
+    over the box, (k,); the box is proved if any is negative.  It also returns an empty region
+    (`search.search`).
 
     A point is a vector (t, s, z) with s of any length: s/|s| divides the level among the terms
     of V_w, and z are the parameters.
@@ -168,7 +168,9 @@ class LevelSetProblem(abc.ABC):
 
     @jax.enable_x64(True)
     def rate(self, points: np.ndarray, constants: Sequence[np.ndarray]) -> np.ndarray:
-        """V_w' at points, (count, p) -> (count,) [N m rad/s], in plain floating-point numbers."""
+        """V_w' at points, (count, p) -> (count,), in the unit of V_w per second and in plain
+        floating-point numbers.
+        """
         return np.asarray(_rates(self.point_rate, np.asarray(points, float), list(constants)))
 
     def sample(self, seed: int, count: int) -> np.ndarray:

@@ -69,7 +69,7 @@ class Claim(metaclass=abc.ABCMeta):
         return {}
 
     def constants(self, summary: Summary) -> Any:
-        """The numbers of the claim for a run, which `Summary.constants` keeps."""
+        """Values that the claim computes once per run for its own methods."""
         return None
 
     def decay_bounds(self, summary: Summary) -> Mapping[int, DecayBound]:
@@ -77,7 +77,7 @@ class Claim(metaclass=abc.ABCMeta):
         return {}
 
     def numbers(self, summary: Summary) -> dict[str, Any]:
-        """The constants of the claim, for `Certificate.numbers`."""
+        """What the claim adds to `Certificate.numbers`."""
         return {}
 
     def assumptions(self, segment: Segment) -> list[Line]:

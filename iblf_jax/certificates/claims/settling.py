@@ -11,7 +11,7 @@ without the term of f_tilde, and
     g = e2 . f_tilde (+ 1/2 e2^T M0' e2 in the printed variant)         `Backstepping`
 
 The second step of `Backstepping` has V = W = 1/2 e2^T M0 e2 with w = 1 and
-e2^T K2 e2 + 2 g(t, W) W >= 2 (mu + g(t, W)) W, mu = lambda_min(M0^-1 K2).
+e2^T K2 e2 + 2 k2(t, W) W >= 2 (mu + k2(t, W)) W, mu = lambda_min(M0^-1 K2).
 
 The levels exchange V, so that only its sum is known.  Let D(t, E) be the least value of the sum in
 (D.2) over all V_j >= 0 with sum w_j V_j = E.  Then E(t) <= v(t) with
@@ -62,7 +62,7 @@ AT_DEADLINE = Statement("prescribed time", "(D.3)", "E(T) <= v(T),  v' = -D(t, v
 INEQUALITY = Statement(
     "inequality, decays",
     "(D.2)",
-    "E' <= -sum w V1 rate(k1(t, V1)) - e2^T K2 e2 - 2 g(t, W) W + e2 . f_tilde",
+    "E' <= -sum w V1 rate(k1(t, V1)) - e2^T K2 e2 - 2 k2(t, W) W + e2 . f_tilde",
     "1/s",
 )
 

@@ -142,7 +142,7 @@ class TorqueTerms(NamedTuple):
     auxiliary: Any = ()
     """`AuxiliaryTerms` of a law that takes the shift of the limit around it."""
     dissipation: Any = ()
-    """sum w V1 rate(k1(t, V1)) + e2^T K2 e2 + 2 g(t, W) W of a `Backstepping` law with decays, ()
+    """sum w V1 rate(k1(t, V1)) + e2^T K2 e2 + 2 k2(t, W) W of a `Backstepping` law with decays, ()
     [1/s]."""
 
 
