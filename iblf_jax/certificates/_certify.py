@@ -306,7 +306,7 @@ def _certificate_by_comparison(run: Rollout, kind: str, reason: str) -> Certific
         )
     continuous = _on_host(simulated)
     certificate = _certificate_of(continuous)
-    cleared: dict[str, Any] = dict.fromkeys(("margin", "value", "joint", "time", "first"))
+    cleared: dict[str, Any] = dict.fromkeys(("margin", "value", "joint", "time", "first_broken"))
     unclaimed = tuple(
         dataclasses.replace(line, verdict=NOT_APPLICABLE, note=reason, **cleared)
         for line in certificate.lines

@@ -152,7 +152,7 @@ class Summary:
         """1 if f' = 0, else 2."""
         return 1 if self.extrema.steady else 2
 
-    def counts(self, case: int) -> bool:
+    def enters_verdict(self, case: int) -> bool:
         """Whether a case enters the verdict: where f' = 0, case 1 decides."""
         return case == 1 or self.case == 2
 

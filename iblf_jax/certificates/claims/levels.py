@@ -59,6 +59,7 @@ from iblf_jax.certificates.claims._base import (
 from iblf_jax.certificates.claims.own import OWN
 from iblf_jax.certificates.lines import (
     Line,
+    Role,
     Statement,
     check_positive,
     check_smallest,
@@ -106,6 +107,7 @@ INEQUALITY = Statement(
     "(S.3)",
     "V' <= -sum w_i decay_i - sum c_i w_i |s_i|^2 + T,  T = dV/dx . d_tilde + dV/dd_hat . d_hat'",
     "1/s",
+    Role.INEQUALITY,
 )
 SURFACE_INEQUALITY = Statement(
     "inequality, levels",
@@ -113,6 +115,7 @@ SURFACE_INEQUALITY = Statement(
     "V' <= -sum w_i decay_i - sum c_i w_i |s_i|^2 + sum w_i s_i . (d_tilde_i + G_i (beta_i -"
     " alpha_i))",
     "1/s",
+    Role.INEQUALITY,
 )
 EQUALITY = Statement("equality", "(S.3)", "both sides of (S.3) are equal", "1/s")
 ESTIMATE = Statement("estimate", "(S.3)", "d_hat' = kappa d_tilde")
@@ -369,7 +372,7 @@ class Levels(MainClaim):
         """The largest disturbance terms, and the largest effect of the filters' lag."""
         summary, reason = segment.summary, self.why_not_in_run(segment.summary)
         if reason:
-            return [not_applicable(TERMS, reason, counts=False)]
+            return [not_applicable(TERMS, reason, enters_verdict=False)]
         claim = segment.terms.claims[self.key]
         lines = [_largest(segment, TERMS, claim.disturbance_terms)]
         if summary.law.filter is not None:

@@ -34,7 +34,7 @@ from iblf_jax.certificates.claims._base import (
 )
 from iblf_jax.certificates.claims.own import own_claim
 from iblf_jax.certificates.claims.theorem import (
-    CASE_1_COUNTS,
+    CASE_1_DECIDES,
     SignalSizes,
     Theorem,
     eigenvalues_in,
@@ -199,10 +199,10 @@ class Matched(Theorem):
             note = f"lambda_min(M0) = {lambda_min:.4g} kg m^2 along the run"
             if margin <= 0 < needed:
                 note += f": c > {0.25 / (needed * lambda_min**2):.4g} would do"
-            if not summary.counts(case):
-                note = CASE_1_COUNTS
-            line = check_positive(statement, margin, counts=summary.counts(case), note=note)
-            lines.append(line)
+            enters = summary.enters_verdict(case)
+            if not enters:
+                note = CASE_1_DECIDES
+            lines.append(check_positive(statement, margin, enters_verdict=enters, note=note))
         return lines
 
     def rate_statement(self, name: str, case: int) -> Statement:

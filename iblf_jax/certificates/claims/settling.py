@@ -35,7 +35,7 @@ import numpy as np
 from iblf_jax.certificates.claims._base import Claim, check_steps, other_actuator
 from iblf_jax.certificates.claims.levels import LEVELS
 from iblf_jax.certificates.claims.matched import MATCHED
-from iblf_jax.certificates.lines import Line, Statement, join_notes, not_applicable
+from iblf_jax.certificates.lines import Line, Role, Statement, join_notes, not_applicable
 from iblf_jax.certificates.summary import ENERGY_ROUNDING, Segment, Summary
 from iblf_jax.certificates.terms import TORQUE
 from iblf_jax.control.controllers import Backstepping, BarrierBackstepping, TrackingLaw
@@ -64,6 +64,7 @@ INEQUALITY = Statement(
     "(D.2)",
     "E' <= -sum w V1 rate(k1(t, V1)) - e2^T K2 e2 - 2 k2(t, W) W + e2 . f_tilde",
     "1/s",
+    Role.INEQUALITY,
 )
 
 

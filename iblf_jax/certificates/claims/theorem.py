@@ -57,6 +57,7 @@ from iblf_jax.certificates.claims.weighted import WEIGHTED
 from iblf_jax.certificates.lines import (
     FAILS,
     Line,
+    Role,
     Statement,
     check_margins,
     check_positive,
@@ -103,7 +104,7 @@ NOT_NEEDED = (
     "the paper's own envelope of V2 is lost, stability is not: the claim with weights (W.1) does"
     " not need it"
 )
-CASE_1_COUNTS = "f' = 0 on this run, so case 1 decides"
+CASE_1_DECIDES = "f' = 0 on this run, so case 1 decides"
 BOUNDED = Statement("f bounded", "Assumption 1", "|f| <= F_m", "N m")
 RATE_BOUNDED = Statement("f' bounded", "Assumption 1", "|f'| <= F_d between jumps", "N m/s")
 START_INSIDE = Statement("start inside", "Theorem 2", "k_lc(0) < q(0) < k_uc(0)", "rad")
@@ -112,6 +113,7 @@ LIMITED = Statement(
     "(A.3)",
     "V2' + rho V2 - |f'|^2/2 - w s . lambda <= 0  (without |f'|^2/2 in case 1)",
     "1/s",
+    Role.INEQUALITY,
 )
 DROPPED_BY_LAW = Statement(
     "dropped term of the law",
@@ -161,8 +163,11 @@ class Theorem(TwoCases, MainClaim):
     key: ClassVar[str] = "theorem"
     in_words: ClassVar[str] = "the paper's theorem"
     inequalities: ClassVar[Mapping[int, Statement]] = {
-        1: Statement("inequality, case 1", "(3.18)", "V2' + rho V2 <= 0", "1/s"),
-        2: Statement("inequality, case 2", "(3.26)", "V2' + rho V2 - |f'|^2/2 <= 0", "1/s"),
+        case: Statement(f"inequality, case {case}", equation, text, "1/s", Role.INEQUALITY)
+        for case, equation, text in (
+            (1, "(3.18)", "V2' + rho V2 <= 0"),
+            (2, "(3.26)", "V2' + rho V2 - |f'|^2/2 <= 0"),
+        )
     }
     envelopes: ClassVar[Mapping[int, Statement]] = {
         1: Statement("envelope, case 1", "(3.20)", "V2(t) <= V2(0) exp(-rho t)"),
@@ -350,17 +355,17 @@ class Theorem(TwoCases, MainClaim):
         conditions = (
             (K2, gains.K2 - LOWEST_K2, True),
             (kf_1, gains.kf - LOWEST_KF[1], True),
-            (kf_2, gains.kf - LOWEST_KF[2], summary.counts(2)),
+            (kf_2, gains.kf - LOWEST_KF[2], summary.enters_verdict(2)),
         )
         lines = []
-        for statement, above_lowest, counts in conditions:
+        for statement, above_lowest, enters in conditions:
             margins = np.asarray(above_lowest)
             line = check_positive(
                 statement,
                 float(margins.min()),
                 joint=int(margins.argmin()),
-                counts=counts,
-                note="" if counts else CASE_1_COUNTS,
+                enters_verdict=enters,
+                note="" if enters else CASE_1_DECIDES,
             )
             lines.append(_unless_replaced(summary, line))
         return lines
@@ -394,7 +399,7 @@ class Theorem(TwoCases, MainClaim):
             rho,
             value=rho,
             note=f"{eigenvalue}{searched}; set by {self.least[np.argmin(terms)]}",
-            counts=summary.counts(case),
+            enters_verdict=summary.enters_verdict(case),
         )
         return _unless_replaced(summary, line)
 
@@ -491,13 +496,18 @@ class Theorem(TwoCases, MainClaim):
         for statement, term, why_exact in self._dropped_parts(segment):
             reason = why_unclaimed or why_exact or why_no_case
             if reason or case is None:
-                lines.append(not_applicable(statement, reason, counts=False))
+                lines.append(not_applicable(statement, reason, enters_verdict=False))
                 continue
             margin = self._margin_of_proof(segment, case)
             largest = float(np.max(np.abs(term[~terms.excluded]), initial=0.0))
             tolerance = summary.eps * terms.size
             line = check_steps(
-                segment, statement, margin - term, tolerance, value=largest, counts=False
+                segment,
+                statement,
+                margin - term,
+                tolerance,
+                value=largest,
+                enters_verdict=False,
             )
             lines.append(line)
         return lines
@@ -597,8 +607,8 @@ def _unless_replaced(summary: Summary, line: Line) -> Line:
     """
     if line.verdict != FAILS or WEIGHTED.case_of(summary) is None:
         return line
-    counts = line.counts and not WEIGHTED.replaces_theorem(summary)
-    return dataclasses.replace(line, counts=counts, note=join_notes(NOT_NEEDED, line.note))
+    enters = line.enters_verdict and not WEIGHTED.replaces_theorem(summary)
+    return dataclasses.replace(line, enters_verdict=enters, note=join_notes(NOT_NEEDED, line.note))
 
 
 def _unclaimed_traces(

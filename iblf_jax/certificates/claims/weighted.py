@@ -31,7 +31,7 @@ from iblf_jax.certificates.claims.two_cases import (
     gains_of,
     why_no_theorem,
 )
-from iblf_jax.certificates.lines import Line, Statement, check_positive, not_applicable
+from iblf_jax.certificates.lines import Line, Role, Statement, check_positive, not_applicable
 from iblf_jax.certificates.summary import DecayBound, Segment, Summary
 from iblf_jax.control.controllers import Backstepping
 from iblf_jax.control.observers import Momentum
@@ -52,7 +52,11 @@ class Weighted(TwoCases):
     key: ClassVar[str] = "weighted"
     inequalities: ClassVar[Mapping[int, Statement]] = {
         case: Statement(
-            f"weighted inequality, case {case}", "(W.1)", f"V_w' + rho V_w{term} <= 0", "N m rad/s"
+            f"weighted inequality, case {case}",
+            "(W.1)",
+            f"V_w' + rho V_w{term} <= 0",
+            "N m rad/s",
+            Role.WEIGHTED_INEQUALITY,
         )
         for case, term in {1: "", 2: " - w_f |f'|^2/(2 b)"}.items()
     }
@@ -62,6 +66,7 @@ class Weighted(TwoCases):
             "(W.3)",
             f"V_w(t) <= V_w(0) exp(-rho t){term}",
             "N m rad",
+            Role.WEIGHTED,
         )
         for case, term in {1: "", 2: " + rho2/rho"}.items()
     }
@@ -70,9 +75,22 @@ class Weighted(TwoCases):
             "weighted xi",
             "(W.3)",
             "w_i V1_i <= Vbar: |xi_i| <= sqrt(1 - exp(-Vbar/w_i)), or as the barrier says",
+            role=Role.WEIGHTED,
         ),
-        "e2": Statement("weighted e2", "(W.3)", "|e2| <= sqrt(2 Vbar/lambda_min(M0))", "rad/s"),
-        "f_tilde": Statement("weighted f_tilde", "(W.3)", "|f_tilde| <= sqrt(2 Vbar/w_f)", "N m"),
+        "e2": Statement(
+            "weighted e2",
+            "(W.3)",
+            "|e2| <= sqrt(2 Vbar/lambda_min(M0))",
+            "rad/s",
+            Role.WEIGHTED,
+        ),
+        "f_tilde": Statement(
+            "weighted f_tilde",
+            "(W.3)",
+            "|f_tilde| <= sqrt(2 Vbar/w_f)",
+            "N m",
+            Role.WEIGHTED,
+        ),
     }
     lyapunov: ClassVar[str] = "V_w, "
 
@@ -139,7 +157,9 @@ class Weighted(TwoCases):
 
     def _rate(self, summary: Summary, case: int) -> Line:
         """The rate of one case, with the chosen numbers."""
-        statement = Statement(f"weighted rho, case {case}", "(W.2)", RATE[case], "1/s")
+        statement = Statement(
+            f"weighted rho, case {case}", "(W.2)", RATE[case], "1/s", Role.WEIGHTED
+        )
         reason = self.why_not_in_case(summary, case)
         if reason:
             return not_applicable(statement, reason)
@@ -155,8 +175,8 @@ class Weighted(TwoCases):
             f" {mu:.4g} 1/s; limited by {least}"
         )
         terms = rate_terms(gains, mu, chosen.a, chosen.b, chosen.w_f)
-        margin, counts = float(np.min(terms)), summary.counts(case)
-        return check_positive(statement, margin, value=chosen.rho, note=note, counts=counts)
+        margin, enters = float(np.min(terms)), summary.enters_verdict(case)
+        return check_positive(statement, margin, value=chosen.rho, note=note, enters_verdict=enters)
 
 
 WEIGHTED = Weighted()

@@ -1,9 +1,9 @@
 """The contract of a tracking law.
 
-A law knows the model, the reference and the bounds (its `LawContext`), measures q and q', receives
-the observer's estimate and commands a torque.  It also returns signals for records and
-certificates: its virtual velocity alpha, its Lyapunov function V1, and whether a guard or a limit
-was active.
+A law is a `Law` of the state x or a `RobotLaw` of (q, q'); the loop calls both as a `Law`
+(`law_of_x`).  It knows the model, the reference and the bounds (its `LawContext`), receives the
+observer's estimate and commands an input.  It also returns signals for records and certificates:
+its virtual velocity alpha, its Lyapunov function V1, and whether a guard or a limit was active.
 """
 
 from __future__ import annotations
@@ -379,7 +379,7 @@ class RobotLaw(TrackingLaw):
 
 
 @component
-class LawOfRobot(Law):
+class RobotLawAdapter(Law):
     """command(t, x, ...) = law.command(t, x_1, x_2, ...): a law of q and q' in the closed loop.
 
     It is no part of a scenario.
@@ -471,7 +471,7 @@ def law_of_x(law: TrackingLaw) -> Law:
     if isinstance(law, Law):
         return law
     assert isinstance(law, RobotLaw)
-    return LawOfRobot(law)
+    return RobotLawAdapter(law)
 
 
 class Wrapping(Law):
