@@ -15,7 +15,7 @@ claim adds its own (`Claim.with_terms_of_claim`).  Two kinds of points differ in
 derivatives:
 
     TorquePoint   for claims about a robot and the torque f: the signals of the loop and their rates
-    LevelPoint    for claims about levels: the arguments (t, x, d_hat, state of the law) of V and
+    ChainPoint    for claims about levels: the arguments (t, x, d_hat, state of the law) of V and
                   their rates, because these claims need dV/dx and dV/dd_hat one by one
 
 Rounding: V' is a sum of large terms that cancel, so its error is some units in the last place of
@@ -119,7 +119,7 @@ def terms_and_sample(
       state: state of the loop at t.
       claims: claims about the scenario, in any order.
     """
-    kind = TorquePoint if any(claim.about_torque for claim in claims) else LevelPoint
+    kind = TorquePoint if any(claim.about_torque for claim in claims) else ChainPoint
     point = kind(scenario, t, state)
     terms = point.terms()
     for claim in claims:
@@ -321,9 +321,9 @@ class Arguments(NamedTuple):
     law_state: Any
 
 
-class LevelPoint(Point):
-    """A state of a loop whose law receives levels: of a plant in strict-feedback form, or of a
-    robot as one of order 2.
+class ChainPoint(Point):
+    """A state of a loop, with the arguments (t, x, d_hat, state of the law) of V and their
+    rates.
     """
 
     def __init__(self, scenario: Scenario, t: jax.Array, state: LoopState) -> None:

@@ -91,7 +91,7 @@ def coordinates(x: jax.Array, n: int, m: int) -> Coordinates:
     return Coordinates(x[-1] + x[0], theta, x[1 + n], phi, z, sign)
 
 
-class LevelPoint(NamedTuple):
+class ArmErrors(NamedTuple):
     """What coordinates mean physically."""
 
     errors: Errors
@@ -101,7 +101,7 @@ class LevelPoint(NamedTuple):
     """|f_tilde|, () [N m]."""
 
 
-def level_point(constants: Constants, at: Coordinates) -> LevelPoint:
+def arm_errors(constants: Constants, at: Coordinates) -> ArmErrors:
     """Errors and |f_tilde| at coordinates."""
     parts, level = constants.parts, constants.level
     *sides, rest = sphere(at.theta)
@@ -114,7 +114,7 @@ def level_point(constants: Constants, at: Coordinates) -> LevelPoint:
     U = upper_factor(parts.model.mass_matrix(position(parts, errors)))
     errors = errors._replace(e2=solve_transposed(U, scaled))
     b = radius * jnp.sin(at.psi) / jnp.sqrt(constants.weight)
-    return LevelPoint(errors, energy, b)
+    return ArmErrors(errors, energy, b)
 
 
 class Affine(NamedTuple):
@@ -292,7 +292,7 @@ class Corner(NamedTuple):
 
 
 def corner_terms(
-    constants: Constants, places: Places, point: LevelPoint, z: jax.Array
+    constants: Constants, places: Places, point: ArmErrors, z: jax.Array
 ) -> list[Corner]:
     """The terms of (B.1) at each corner of the box of parameters."""
     parts, weight, b = constants.parts, constants.weight, point.b
@@ -313,7 +313,7 @@ def corner_terms(
     return terms
 
 
-def decay_bound(constants: Constants, point: LevelPoint) -> jax.Array:
+def decay_bound(constants: Constants, point: ArmErrors) -> jax.Array:
     """A lower bound of the decay of the barriers, ()."""
     parts = constants.parts
     exact = decay(parts, point.errors)
@@ -326,7 +326,7 @@ def arm_bound(places: Places, n: int, x: jax.Array, constants: Constants) -> jax
     be active.
     """
     at = coordinates(x, n, places.coordinates)
-    point = level_point(constants, at)
+    point = arm_errors(constants, at)
     e2, b = point.errors.e2, point.b
     losses = decay_bound(constants, point)
     terms = corner_terms(constants, places, point, at.z)

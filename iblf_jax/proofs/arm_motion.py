@@ -333,7 +333,7 @@ def mismatch_rate(
     return matvec(M0, matvec(inverse(M), rate))
 
 
-def level_rate(
+def lyapunov_rate(
     parts: ArmParts,
     weight: jax.Array,
     at: Errors,

@@ -29,7 +29,7 @@ from iblf_jax.proofs.matrices import solve_transposed, upper_factor
 from iblf_jax.proofs.parameters import Uncertain, uncertain_coordinates
 from iblf_jax.proofs.problem import (
     LevelSetProblem,
-    LevelState,
+    LevelSetState,
     OfStructure,
     split_point,
 )
@@ -69,7 +69,7 @@ ASSUMPTIONS = (
     " noise.",
 )
 VECTORS = ("q", "dq", "f_tilde", "f_hat", "eta")
-"""Vectors of a point in physical numbers, as in `LevelState`."""
+"""Vectors of a point in physical numbers, as in `LevelSetState`."""
 
 
 class ArmBound(OfStructure):
@@ -89,7 +89,7 @@ class ArmRate(OfStructure):
         """V_w', () [N m rad/s]; infinite where the torque is not defined, such as log(-1)."""
         numbers: Constants = jax.tree.unflatten(self.structure, constants)
         found = point_of(self.places, jnp.asarray(point), numbers)
-        rate = arm_motion.level_rate(
+        rate = arm_motion.lyapunov_rate(
             found.parts, numbers.weight, found.errors, found.f_tilde, found.rate
         )
         now = arm_motion.motion(found.parts, found.errors, found.f_tilde).now
@@ -165,18 +165,18 @@ class ArmProblem(LevelSetProblem):
         numbers = jnp.asarray(weight), jnp.asarray(level)
         return Constants(self.parts, self.uncertain.numbers, *numbers)
 
-    def state_of(self, point: np.ndarray, constants: Sequence[np.ndarray]) -> LevelState:
+    def state_of(self, point: np.ndarray, constants: Sequence[np.ndarray]) -> LevelSetState:
         """A point in physical numbers."""
         with jax.enable_x64(True):
             numbers = _physical(self.bound, np.asarray(point, float), list(constants))
-            return LevelState(
+            return LevelSetState(
                 t=float(numbers["t"]),
                 **{name: np.asarray(numbers[name]) for name in VECTORS},
                 parameters=self.uncertain.values(np.asarray(point)[1 + self.terms :]),
                 rate=np.broadcast_to(np.asarray(numbers["rate"]), (self.bound.places.rates,)),
             )
 
-    def initial(self, state: LevelState) -> Initial:
+    def initial(self, state: LevelSetState) -> Initial:
         """Position and velocity of a state."""
         return Initial(q=state.q, dq=state.dq)
 

@@ -126,7 +126,7 @@ class TruePlant:
         return -plants.gain_times(self.parts.model, i + 1, t, x, slope)
 
 
-class LevelPoint(NamedTuple):
+class ChainMotionPoint(NamedTuple):
     """What coordinates mean physically."""
 
     now: Motion
@@ -138,14 +138,14 @@ class LevelPoint(NamedTuple):
     """The input, (1,)."""
 
 
-def level_point(
+def chain_motion_point(
     constants: Constants,
     observed: tuple[bool, ...],
     true: TruePlant,
     t: jax.Array,
     shares: list[jax.Array],
     signs: jax.Array,
-) -> LevelPoint:
+) -> ChainMotionPoint:
     """The motion at coordinates.
 
     Args:
@@ -190,7 +190,7 @@ def level_point(
     x = equations.state(order, y)
     desired = equations.desired_rate(order - 1, y) - y.d_hat[order - 1]
     u = plants.level_input(constants.parts.model, order, t, x, desired)
-    return LevelPoint(now, energy, x, u)
+    return ChainMotionPoint(now, energy, x, u)
 
 
 def _error(
@@ -264,8 +264,8 @@ def _first_error(parts: ChainParts, value: jax.Array, sign: jax.Array, t: jax.Ar
     return error(c) + derivative(error)(t) * (t - c)
 
 
-def level_rate(
-    constants: Constants, observed: tuple[bool, ...], true: TruePlant, point: LevelPoint
+def lyapunov_rate(
+    constants: Constants, observed: tuple[bool, ...], true: TruePlant, point: ChainMotionPoint
 ) -> jax.Array:
     """V' of (C.5), ()."""
     parts, now, equations = constants.parts, point.now, true.equations
@@ -298,6 +298,6 @@ def chain_bound(
     z = x[start : start + places.coordinates]
     signs = x[start + places.coordinates : -1]
     true = TruePlant(constants, places, z, is_box=True)
-    point = level_point(constants, observed, true, x[-1] + x[0], shares, signs)
-    rate = level_rate(constants, observed, true, point)
+    point = chain_motion_point(constants, observed, true, x[-1] + x[0], shares, signs)
+    rate = lyapunov_rate(constants, observed, true, point)
     return jnp.where(true.equations.inside_guards(point.now.y), rate, jnp.inf)

@@ -22,12 +22,12 @@ from iblf_jax.core.families import is_default
 from iblf_jax.core.pytree import astype
 from iblf_jax.proofs import chain_motion
 from iblf_jax.proofs.chain_bound import (
+    ChainMotionPoint,
     Constants,
-    LevelPoint,
     TruePlant,
     chain_bound,
-    level_point,
-    level_rate,
+    chain_motion_point,
+    lyapunov_rate,
 )
 from iblf_jax.proofs.chain_motion import ChainParts
 from iblf_jax.proofs.examination import operations
@@ -90,13 +90,13 @@ class ChainRate(OfStructure):
         """V', (); infinite where d is not defined."""
         numbers: Constants = jax.tree.unflatten(self.structure, constants)
         true, found = point_of(self.places, self.observed, jnp.asarray(point), numbers)
-        rate = level_rate(numbers, self.observed, true, found)
+        rate = lyapunov_rate(numbers, self.observed, true, found)
         return infinite_unless_defined(rate, jnp.stack(found.now.d))
 
 
 def point_of(
     places: Places, observed: tuple[bool, ...], point: jax.Array, constants: Constants
-) -> tuple[TruePlant, LevelPoint]:
+) -> tuple[TruePlant, ChainMotionPoint]:
     """The plant and the motion at a point (t, s, z); s/|s| = (sqrt(w_i V_i/c) with the signs of
     e_i, sqrt(v_i/(2c)) d_tilde_i).
     """
@@ -104,10 +104,10 @@ def point_of(
     t, shares, z = split_point(point, order + sum(observed))
     true = TruePlant(constants, places, z, is_box=False)
     signs = jnp.where(shares[:order] > 0, 1.0, -1.0)
-    return true, level_point(constants, observed, true, t, list(shares), signs)
+    return true, chain_motion_point(constants, observed, true, t, list(shares), signs)
 
 
-class ChainLevelState(NamedTuple):
+class ChainLevelSetState(NamedTuple):
     """A point of the level set in physical numbers."""
 
     t: float
@@ -179,7 +179,7 @@ class ChainProblem(LevelSetProblem):
         )
 
     @jax.enable_x64(True)
-    def state_of(self, point: np.ndarray, constants: Sequence[np.ndarray]) -> ChainLevelState:
+    def state_of(self, point: np.ndarray, constants: Sequence[np.ndarray]) -> ChainLevelSetState:
         """A point in physical numbers."""
         numbers: Constants = jax.tree.unflatten(
             self.bound.structure, list(map(jnp.asarray, constants))
@@ -188,7 +188,7 @@ class ChainProblem(LevelSetProblem):
         _, found = point_of(self.uncertain.places, self.bound.observed, x, numbers)
         y = found.now.y
         d_hat = np.stack(y.d_hat)
-        return ChainLevelState(
+        return ChainLevelSetState(
             t=float(y.t),
             x=np.asarray(found.x),
             u=np.asarray(found.u),
@@ -198,7 +198,7 @@ class ChainProblem(LevelSetProblem):
             parameters=self.uncertain.values(np.asarray(point)[1 + self.terms :]),
         )
 
-    def initial(self, state: ChainLevelState) -> Initial:
+    def initial(self, state: ChainLevelSetState) -> Initial:
         """All levels of a state."""
         return Initial(x=state.x)
 

@@ -29,7 +29,7 @@ PARTS_OF_TIME = 32
 have no positive width, so that no bisection would be better than another."""
 
 
-class LevelState(NamedTuple):
+class LevelSetState(NamedTuple):
     """A point of the level set in physical numbers."""
 
     t: float

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import iblf_jax as ij
-from iblf_jax.files import earlier
+from iblf_jax.files.earlier import fields_of_line
 from iblf_jax.simulation.paths import get
 
 EARLIER = Path(__file__).parents[1] / "data" / "earlier"
@@ -88,6 +88,6 @@ def test_a_run_can_be_done_again(kind):
 )
 def test_the_name_of_a_stored_line_says_its_role(name, role):
     stored = {"name": name, "counts": False, "first": 0.5}
-    found = earlier.fields_of_line(stored)
+    found = fields_of_line(stored)
     assert found == {"name": name, "enters_verdict": False, "first_broken": 0.5, "role": role}
-    assert earlier.fields_of_line(found) == found
+    assert fields_of_line(found) == found

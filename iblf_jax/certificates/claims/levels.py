@@ -74,7 +74,7 @@ from iblf_jax.certificates.summary import DecayBound, Extremum, Segment, Summary
 from iblf_jax.certificates.terms import (
     ESTIMATED,
     Arguments,
-    LevelPoint,
+    ChainPoint,
     Point,
     Terms,
     adaptive_law,
@@ -217,7 +217,7 @@ class Levels(MainClaim):
 
     def with_terms_of_claim(self, point: Point, terms: Terms) -> Terms:
         """The terms at a state with those of this claim, and with those of the estimate."""
-        assert isinstance(point, LevelPoint)
+        assert isinstance(point, ChainPoint)
         entries = terms.claims | {ESTIMATED: _estimate_terms(point)}
         terms = terms._replace(claims=entries)
         if not isinstance(point.law, BarrierBackstepping):
@@ -600,7 +600,7 @@ def _estimate(segment: Segment) -> Line:
 # --- the terms at a state -------------------------------------------------------------------------
 
 
-def _with_claim_terms(point: LevelPoint, terms: Terms) -> Terms:
+def _with_claim_terms(point: ChainPoint, terms: Terms) -> Terms:
     """The terms at a state with V = sum w_i V_i and those of (S.3).
 
     V' is exact: dV/d(t, x, d_hat, state of the law), by forward-mode differentiation, times the
@@ -692,7 +692,7 @@ def _ratio_at_centre(barrier: Barrier, tube: Tube) -> jax.Array:
     return stated  # type: ignore[no-any-return]
 
 
-def _estimate_terms(point: LevelPoint) -> EstimateTerms:
+def _estimate_terms(point: ChainPoint) -> EstimateTerms:
     """The error of d_hat' = kappa d_tilde and the size of its terms; 0 without a stated kappa."""
     scenario, (at, tangent) = point.scenario, point.arguments
     error, sizes = point.d_tilde, point.sizes

@@ -157,9 +157,8 @@ class Weighted(TwoCases):
 
     def _rate(self, summary: Summary, case: int) -> Line:
         """The rate of one case, with the chosen numbers."""
-        statement = Statement(
-            f"weighted rho, case {case}", "(W.2)", RATE[case], "1/s", Role.WEIGHTED
-        )
+        name = f"weighted rho, case {case}"
+        statement = Statement(name, "(W.2)", RATE[case], "1/s", Role.WEIGHTED)
         reason = self.why_not_in_case(summary, case)
         if reason:
             return not_applicable(statement, reason)
