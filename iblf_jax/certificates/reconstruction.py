@@ -296,8 +296,9 @@ def terms_along(
     terms, sample = jax.tree.map(lambda x: np.asarray(x)[:, 0], found)
     defect, defect_f = map(_defect, energies)
     energy = scenario.loop.model.energy_of_errors
-    if "levels" in terms.claims and not is_default(energy, Plant.energy_of_errors):
-        # V of a sample then includes |f_tilde|^2/2, which the sum of w_i V_i does not.
+    omits_f_tilde = any(claim.omits_f_tilde and claim.key in terms.claims for claim in claims)
+    if omits_f_tilde and not is_default(energy, Plant.energy_of_errors):
+        # V of a sample then includes |f_tilde|^2/2, which V of the claim does not.
         defect = defect + defect_f
     return terms, sample, defect, defect_f
 

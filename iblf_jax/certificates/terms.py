@@ -117,10 +117,12 @@ def terms_and_sample(
       scenario: canonical.
       t: time, () [s].
       state: state of the loop at t.
-      claims: claims about the scenario, in any order.
+      claims: claims about the scenario, in any order, with one kind of points.
     """
-    kind = TorquePoint if any(claim.about_torque for claim in claims) else ChainPoint
-    point = kind(scenario, t, state)
+    kinds = {claim.point for claim in claims if claim.point is not None}
+    if len(kinds) != 1:
+        raise ValueError(f"claims of one kind of points are needed, not of {len(kinds)}")
+    point = kinds.pop()(scenario, t, state)
     terms = point.terms()
     for claim in claims:
         terms = claim.with_terms_of_claim(point, terms)

@@ -70,7 +70,7 @@ from iblf_jax.certificates.lines import (
     verdict_of,
 )
 from iblf_jax.certificates.result import LevelLabel, LevelTraces
-from iblf_jax.certificates.summary import DecayBound, Extremum, Segment, Summary
+from iblf_jax.certificates.summary import DecayBound, Reduction, Segment, Summary
 from iblf_jax.certificates.terms import (
     ESTIMATED,
     Arguments,
@@ -158,7 +158,7 @@ class LevelTerms(NamedTuple):
     k_u: jax.Array
 
     @property
-    def growth(self) -> jax.Array:
+    def disturbance_gain(self) -> jax.Array:
         """The term g = T - sum c_i w_i |s_i|^2 with the lag of filters in T, ()."""
         return self.disturbance_terms + self.lag - self.by_slopes
 
@@ -177,7 +177,9 @@ class Levels(MainClaim):
     """(S.3) and the bounds that follow from it."""
 
     key: ClassVar[str] = "levels"
+    point: ClassVar[type[Point] | None] = ChainPoint
     in_words: ClassVar[str] = "the claim (S.3)"
+    omits_f_tilde: ClassVar[bool] = True
 
     def why_not(self, scenario: Scenario) -> str:
         """Why (S.3) claims nothing about a scenario, in words; "" if it does."""
@@ -208,6 +210,10 @@ class Levels(MainClaim):
             return f"{summary.why_never}, or alpha was outside the bounds"
         return reason
 
+    def why_no_settling(self, summary: Summary) -> str:
+        """Why no settling time follows; "" if one does."""
+        return self.why_not_in_run(summary)
+
     def exclusion_note(self, summary: Summary) -> str:
         """Which samples the claim excludes, and where it starts again, in words."""
         excluded = summary.exclusion_note("{}, or alpha was outside the bounds")
@@ -229,12 +235,12 @@ class Levels(MainClaim):
 
     # --- the constants ----------------------------------------------------------------------------
 
-    def extrema(self, scenario: Scenario, terms: Terms) -> dict[str, Extremum]:
-        """The largest g of (S.3), at least 0."""
-        growth = np.zeros(1)
+    def reductions(self, scenario: Scenario, terms: Terms) -> dict[str, Reduction]:
+        """The constant rho2, the largest g of (S.3), at least 0."""
+        gain = np.zeros(1)
         if self.key in terms.claims:
-            growth = np.where(terms.excluded, 0.0, terms.claims[self.key].growth)
-        return {"growth": Extremum(np.maximum, np.maximum(0.0, growth.max()))}
+            gain = np.where(terms.excluded, 0.0, terms.claims[self.key].disturbance_gain)
+        return {"rho2": Reduction(np.maximum, np.maximum(0.0, gain.max()))}
 
     def constants(self, summary: Summary) -> np.ndarray:
         """Decay rate of V_i of each level and component, (r, n) [1/s]; empty where (S.3) does not
@@ -251,7 +257,7 @@ class Levels(MainClaim):
         rates = summary.constants[self.key]
         if not rates.size:
             return {}
-        return {2: DecayBound(float(np.min(rates)), float(summary.extrema.growth))}
+        return {2: DecayBound(float(np.min(rates)), float(summary.reductions.rho2))}
 
     def rho(self, summary: Summary) -> float:
         """The rate of (S.4) [1/s]; NaN where (S.3) does not apply."""
@@ -260,14 +266,14 @@ class Levels(MainClaim):
 
     def numbers(self, summary: Summary) -> dict[str, Any]:
         """The constants of the claim."""
-        extrema = summary.extrema
+        reductions = summary.reductions
         return {
             "rho": self.rho(summary),
-            "rho2": float(extrema.growth),
-            "V_start": float(extrema.V_start),
-            "V_end": float(extrema.V_end),
-            "d_largest": extrema.d,
-            "d_tilde_largest": extrema.d_tilde,
+            "rho2": float(reductions.rho2),
+            "V_start": float(reductions.V_start),
+            "V_end": float(reductions.V_end),
+            "d_largest": reductions.d_largest,
+            "d_tilde_largest": reductions.d_tilde_largest,
             "jump_times": summary.jumps,
         }
 
@@ -344,10 +350,15 @@ class Levels(MainClaim):
                 lines.append(_with_unit(line, unit))
         return lines
 
+    def disturbance_gain_term(self, segment: Segment) -> np.ndarray:
+        """The term g of (S.4) at every step, (T,)."""
+        return segment.terms.claims[self.key].disturbance_gain  # type: ignore[no-any-return]
+
     def left_side(self, segment: Segment) -> np.ndarray:
         """The left less the right side of (S.3), which must not be positive, (T,)."""
-        claim = segment.terms.claims[self.key]
-        return segment.terms.dV + claim.dissipation - claim.growth  # type: ignore[no-any-return]
+        dissipation = segment.terms.claims[self.key].dissipation
+        left = segment.terms.dV + dissipation - self.disturbance_gain_term(segment)
+        return left  # type: ignore[no-any-return]
 
     def _inequalities(self, segment: Segment) -> list[Line]:
         """(S.3) at every step, and its equality for barriers that decay exactly."""
@@ -582,7 +593,7 @@ def _estimate(segment: Segment) -> Line:
         return not_applicable(ESTIMATE, summary.why_invalid)
     statement = ESTIMATE
     if terms.error.ndim == 2:
-        if summary.extrema.d[0] > 0:
+        if summary.reductions.d_largest[0] > 0:
             why = "a torque observer of the robot needs q' = x_2, without d_1"
             return not_applicable(ESTIMATE, why)
         text = "f_hat' = kf f_tilde of the robot inside the plant"

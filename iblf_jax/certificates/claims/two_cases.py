@@ -21,7 +21,7 @@ from iblf_jax.certificates.summary import (
     Summary,
     weighted_lyapunov,
 )
-from iblf_jax.certificates.terms import adaptive_law, on_position
+from iblf_jax.certificates.terms import Point, TorquePoint, adaptive_law, on_position
 from iblf_jax.control.barriers import Barrier
 from iblf_jax.control.controllers import Backstepping, TrackingLaw
 from iblf_jax.control.observers import AsPublished, Momentum
@@ -45,7 +45,7 @@ class Gains(NamedTuple):
 class TwoCases(Claim):
     """A claim with a case for f' = 0 and one for a bounded f'."""
 
-    about_torque: ClassVar[bool] = True
+    point: ClassVar[type[Point] | None] = TorquePoint
     inequalities: ClassVar[Mapping[int, Statement]]
     """By case."""
     envelopes: ClassVar[Mapping[int, Statement]]
@@ -65,8 +65,9 @@ class TwoCases(Claim):
         reason = self.why_not_in_run(summary)
         if reason:
             return reason
-        if case == 1 and summary.case == 2:
-            return f"case 1 is for f' = 0; here |f'| reaches {summary.F_d:.4g} N m/s, see case 2"
+        if case == 1 and case_of_run(summary) == 2:
+            reached = f"{largest_f_rate(summary):.4g} N m/s"
+            return f"case 1 is for f' = 0; here |f'| reaches {reached}, see case 2"
         return self.why_no_rate(summary, case) or summary.why_never
 
     def case_of(self, summary: Summary) -> int | None:
@@ -122,7 +123,7 @@ class TwoCases(Claim):
         summary = segment.summary
         case, statements = self.case_of(summary), self.bound_statements(summary)
         if case is None:
-            reason = self.why_not_in_case(summary, summary.case)
+            reason = self.why_not_in_case(summary, case_of_run(summary))
             return [not_applicable(statement, reason) for statement in statements.values()]
         envelope, w_f = segment.envelopes[self.key, case], summary.decay_bounds[self.key, case].w_f
         bounds = self.bounds_along(segment, envelope.bound, w_f)
@@ -158,7 +159,7 @@ class TwoCases(Claim):
         """
         summary = segment.summary
         return {
-            "e2": np.sqrt(2 * V / summary.extrema.lambda_min),
+            "e2": np.sqrt(2 * V / summary.reductions.lambda_min),
             "xi, by V1": xi_bound_along(segment, V),
             "xi": np.sqrt(2 * V[:, None] / np.asarray(on_position(summary.law)[1])),
             "f_tilde": np.sqrt(2 * V / w_f),
@@ -179,6 +180,23 @@ class TwoCases(Claim):
         if name == "xi" and not np.all(stronger | np.isnan(by_V2)):
             return "xi^2/2 <= V1 (Theorem 1) does not hold for this barrier"
         return ""
+
+
+def case_of_run(summary: Summary) -> int:
+    """The case of a run: 1 if f' = 0, else 2."""
+    return 1 if summary.reductions.steady else 2
+
+
+def enters_verdict(summary: Summary, case: int) -> bool:
+    """Whether a case enters the verdict: where f' = 0, case 1 decides."""
+    return case == 1 or case_of_run(summary) == 2
+
+
+def largest_f_rate(summary: Summary) -> float:
+    """F_d, the largest |f'| [N m/s]; 0 in case 1."""
+    if case_of_run(summary) == 1:
+        return 0.0
+    return float(summary.reductions.d_rate_largest)
 
 
 @programs.jit

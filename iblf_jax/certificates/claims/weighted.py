@@ -28,7 +28,9 @@ from iblf_jax.certificates.claims.two_cases import (
     CASES,
     Gains,
     TwoCases,
+    enters_verdict,
     gains_of,
+    largest_f_rate,
     why_no_theorem,
 )
 from iblf_jax.certificates.lines import Line, Role, Statement, check_positive, not_applicable
@@ -117,15 +119,13 @@ class Weighted(TwoCases):
 
     def constants(self, summary: Summary) -> dict[int, WeightedConstants]:
         """The numbers of the claim by case."""
-        extrema = summary.extrema
-        half_square = float(extrema.half_square_start)
-        V_rest = float(extrema.V_start) - half_square
-        gains, mu = gains_of(summary.run.scenario), float(extrema.mu)
+        reductions, F_d = summary.reductions, largest_f_rate(summary)
+        half_square = float(reductions.half_square_start)
+        V_rest = float(reductions.V_start) - half_square
+        gains, mu = gains_of(summary.run.scenario), float(reductions.mu)
         found = {}
         for case in CASES:
-            best = best_constants(
-                gains, mu, V_rest, half_square, summary.F_d, summary.duration, case
-            )
+            best = best_constants(gains, mu, V_rest, half_square, F_d, summary.duration, case)
             if best is not None:
                 found[case] = best
         return found
@@ -162,7 +162,7 @@ class Weighted(TwoCases):
         reason = self.why_not_in_case(summary, case)
         if reason:
             return not_applicable(statement, reason)
-        gains, mu = gains_of(summary.run.scenario), float(summary.extrema.mu)
+        gains, mu = gains_of(summary.run.scenario), float(summary.reductions.mu)
         chosen = summary.constants[self.key][case]
         limits = (np.min(gains.decay_rate), 2.0 * mu, 2.0 * np.min(gains.kf))
         least = ("the decay rate of V1", "K2 over M0", "kf")[int(np.argmin(limits))]
@@ -174,8 +174,13 @@ class Weighted(TwoCases):
             f" {mu:.4g} 1/s; limited by {least}"
         )
         terms = rate_terms(gains, mu, chosen.a, chosen.b, chosen.w_f)
-        margin, enters = float(np.min(terms)), summary.enters_verdict(case)
-        return check_positive(statement, margin, value=chosen.rho, note=note, enters_verdict=enters)
+        return check_positive(
+            statement,
+            float(np.min(terms)),
+            value=chosen.rho,
+            note=note,
+            enters_verdict=enters_verdict(summary, case),
+        )
 
 
 WEIGHTED = Weighted()
