@@ -33,17 +33,15 @@ import jax
 import jax.numpy as jnp
 from jax.typing import DTypeLike
 
-from iblf_jax.control.barriers import Barrier
 from iblf_jax.control.controllers import (
     AdaptiveParameters,
     Backstepping,
     BarrierBackstepping,
     LawContext,
-    RobotLaw,
     Saturated,
     TrackingLaw,
 )
-from iblf_jax.control.controllers._base import law_of_x, layers_with_states
+from iblf_jax.control.controllers._base import law_of_x, layers_with_states, position_barrier
 from iblf_jax.core.linalg import matvec, solve_spd
 from iblf_jax.core.pytree import layers, unwrapped
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, plant_input, rate
@@ -271,7 +269,7 @@ def _signals(scenario: Scenario, t: jax.Array, state: LoopState) -> tuple[dict[s
     law: TrackingLaw = unwrapped(scenario.controller)
     barrier_slope = jnp.zeros_like(state.q)
     if isinstance(law, Backstepping | BarrierBackstepping):
-        barrier, weight = on_position(law)
+        barrier, weight = position_barrier(law)
         barrier_slope = weight * barrier.slope(scenario.context.tube(t), state.q)
     # All of f where the plant is the model: the torques besides that of the law.
     external = jnp.zeros_like(state.q)
@@ -293,13 +291,6 @@ def _signals(scenario: Scenario, t: jax.Array, state: LoopState) -> tuple[dict[s
         "external": external,
     }
     return signals, sample
-
-
-def on_position(law: Any) -> tuple[Barrier, Any]:
-    """The barrier on the position, and its weight, (n,)."""
-    if law.barriers:
-        return law.barriers[0], law.weights[0]
-    return law.barrier, law.weight
 
 
 def relative_gap(xi: jax.Array, guard: float) -> jax.Array:
@@ -468,7 +459,7 @@ def inner_context(scenario: Scenario, state: Any) -> LawContext:
 
 def receives_q_dq(scenario: Scenario) -> bool:
     """Whether the law of a scenario receives q and q', and not all levels."""
-    return isinstance(unwrapped(scenario.controller), RobotLaw)
+    return not unwrapped(scenario.controller).receives_x
 
 
 def adaptive_law(scenario: Scenario) -> AdaptiveParameters | None:

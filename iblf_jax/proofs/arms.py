@@ -42,7 +42,7 @@ from iblf_jax.proofs.support import (
     check_exponential,
     check_same_structure,
     check_unchanging,
-    claims_of,
+    claim_sentences,
     examined,
     infinite_unless_defined,
     operations_of_plant,
@@ -123,7 +123,7 @@ def point_of(places: Places, point: jax.Array, constants: Constants) -> ArmPoint
     f_tilde = size / jnp.sqrt(constants.weight) * s[2 * n :]
     m = len(places.entries)
     uncertain = (parts.plant, parts.disturbance)
-    plant, disturbance = uncertainty.leaves_at(places, constants.numbers, uncertain, z[:m])
+    plant, disturbance = uncertainty.leaves_at(places, constants.coordinates, uncertain, z[:m])
     rate = z[m:] if places.rates else 0.0
     true = parts._replace(plant=plant, disturbance=disturbance)
     return ArmPoint(true, errors._replace(e2=e2), f_tilde, rate)
@@ -141,7 +141,7 @@ class ArmProblem(LevelSetProblem):
     @property
     def angles(self) -> list[tuple[str, float, float]]:
         """The theta of V1, psi, and the phi of e2."""
-        n = self.signs
+        n = self.sign_count
         right, full = np.nextafter(0.5 * math.pi, 2.0), np.nextafter(2.0 * math.pi, 7.0)
         theta = [(f"theta[{i}]", 0.0, right) for i in range(n)]
         if n == 1:
@@ -151,19 +151,19 @@ class ArmProblem(LevelSetProblem):
         return [*theta, ("psi", 0.0, right), *phi]
 
     @property
-    def signs(self) -> int:
+    def sign_count(self) -> int:
         """Number of joints: each e1 has a sign."""
         return self.scenario.n
 
     @property
-    def terms(self) -> int:
+    def term_count(self) -> int:
         """3 n: those of V1, of e2 and of f_tilde."""
         return 3 * self.scenario.n
 
-    def numbers(self, weight: float, level: float) -> Constants:
+    def constants_of(self, weight: float, level: float) -> Constants:
         """The constants of a weight w_f and a level."""
-        numbers = jnp.asarray(weight), jnp.asarray(level)
-        return Constants(self.parts, self.uncertain.numbers, *numbers)
+        coordinates = self.uncertain.numbers
+        return Constants(self.parts, coordinates, jnp.asarray(weight), jnp.asarray(level))
 
     def state_of(self, point: np.ndarray, constants: Sequence[np.ndarray]) -> LevelSetState:
         """A point in physical numbers."""
@@ -172,7 +172,7 @@ class ArmProblem(LevelSetProblem):
             return LevelSetState(
                 t=float(numbers["t"]),
                 **{name: np.asarray(numbers[name]) for name in VECTORS},
-                parameters=self.uncertain.values(np.asarray(point)[1 + self.terms :]),
+                parameters=self.uncertain.values(np.asarray(point)[1 + self.term_count :]),
                 rate=np.broadcast_to(np.asarray(numbers["rate"]), (self.bound.places.rates,)),
             )
 
@@ -235,7 +235,7 @@ def arm_problem(
         zero = jnp.zeros(())
         structure = jax.tree.structure(Constants(parts, uncertain.numbers, zero, zero))
     of_structure = (structure, uncertain.places, tuple(found.digests))
-    assumptions = (*ASSUMPTIONS, *claims_of([parts.law.barrier]), *found.assumed)
+    assumptions = (*ASSUMPTIONS, *claim_sentences([parts.law.barrier]), *found.assumed)
     functions = (ArmBound(*of_structure), ArmRate(*of_structure))
     return ArmProblem(scenario, uncertain, *functions, length, is_period, assumptions, parts)
 
@@ -348,8 +348,8 @@ def _digests(parts: ArmParts, uncertain: Uncertain) -> list[str]:
 
     vector = jnp.zeros(parts.kf.shape)
     inputs = [jnp.zeros(()), vector, vector, vector]
-    known = (parts.plant, parts.disturbance, parts.model)
-    return [operations_of_plant(torque, inputs, known, uncertain).digest]
+    leaves = (parts.plant, parts.disturbance, parts.model)
+    return [operations_of_plant(torque, inputs, leaves, uncertain).digest]
 
 
 def _check_tube(scenario: Scenario, duration: float) -> None:

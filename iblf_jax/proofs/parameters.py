@@ -185,9 +185,9 @@ def _differing(
         at = numbers.base[k] + numbers.slope[k] * numbers.reference[k]
         at_reference |= dict(zip(together, np.asarray(at).tolist(), strict=True))
     actual = jax.tree.leaves((scenario.plant, scenario.disturbance))
-    known = jax.tree.leaves((scenario.model, scenario.disturbance))
+    model_leaves = jax.tree.leaves((scenario.model, scenario.disturbance))
     found = []
-    for leaf, pair in enumerate(zip(actual, known, strict=True)):
+    for leaf, pair in enumerate(zip(actual, model_leaves, strict=True)):
         values, expected = (np.ravel(np.asarray(x)).tolist() for x in pair)
         for entry, value in enumerate(values):
             place = (leaf, entry)

@@ -104,16 +104,16 @@ class LevelSetProblem(abc.ABC):
 
     @property
     @abc.abstractmethod
-    def signs(self) -> int:
+    def sign_count(self) -> int:
         """Number of errors with a sign."""
 
     @property
     @abc.abstractmethod
-    def terms(self) -> int:
+    def term_count(self) -> int:
         """Number of terms of V_w, the length of s."""
 
     @abc.abstractmethod
-    def numbers(self, weight: float, level: float) -> Any:
+    def constants_of(self, weight: float, level: float) -> Any:
         """The constants of a weight and a level, as a pytree."""
 
     @abc.abstractmethod
@@ -128,7 +128,7 @@ class LevelSetProblem(abc.ABC):
     def names(self) -> tuple[str, ...]:
         """Of the coordinates and of the patterns."""
         angles = [name for name, _, _ in self.angles]
-        sides = [f"side[{i}]" for i in range(self.signs)]
+        sides = [f"side[{i}]" for i in range(self.sign_count)]
         return ("time since start", *angles, *self.uncertain.names, *sides, "start")
 
     @property
@@ -149,7 +149,7 @@ class LevelSetProblem(abc.ABC):
         """The signs of the errors and the start of each part of the time interval, (p, signs +
         1).
         """
-        sides = itertools.product((-1.0, 1.0), repeat=self.signs)
+        sides = itertools.product((-1.0, 1.0), repeat=self.sign_count)
         starts = np.arange(PARTS_OF_TIME) * (self.duration / PARTS_OF_TIME)
         return np.array([[*side, start] for side in sides for start in starts])
 
@@ -164,7 +164,7 @@ class LevelSetProblem(abc.ABC):
         weight = checks.positive_number("weight", weight, self.units[0])
         level = checks.positive_number("level", level, self.units[1])
         check_level(level, self.scenario, self.duration, self.first_barrier)
-        return [np.asarray(x, float) for x in jax.tree.leaves(self.numbers(weight, level))]
+        return [np.asarray(x, float) for x in jax.tree.leaves(self.constants_of(weight, level))]
 
     @jax.enable_x64(True)
     def rate(self, points: np.ndarray, constants: Sequence[np.ndarray]) -> np.ndarray:
@@ -180,7 +180,7 @@ class LevelSetProblem(abc.ABC):
         low, high = self.uncertain.low, self.uncertain.high
         generator = np.random.default_rng(seed)
         t = generator.uniform(0.0, self.duration, (count, 1))
-        s = generator.normal(size=(count, self.terms))
+        s = generator.normal(size=(count, self.term_count))
         s /= np.linalg.norm(s, axis=1, keepdims=True)
         share = generator.uniform(size=(count, len(low)))
         share[::2] = np.round(share[::2])

@@ -53,7 +53,7 @@ RESULT_TYPES = {"divide_box": ctypes.c_int64, "search_box": ctypes.c_int}
 """Function of a kernel -> the C type of its result, which is negative if it has not run."""
 
 
-class WorstBox(NamedTuple):
+class SearchedBox(NamedTuple):
     """The box that has the largest bound at its centre, of those that are left."""
 
     lower: np.ndarray
@@ -77,7 +77,7 @@ class SearchResult(NamedTuple):
     seconds: float
     done: float
     """Part of the volume on which the statement is proved."""
-    worst: WorstBox | None
+    worst: SearchedBox | None
     """None if the statement is proved."""
 
     @property
@@ -102,7 +102,7 @@ class _Found(NamedTuple):
     boxes: int
     status: int
     done: float
-    worst: WorstBox | None
+    worst: SearchedBox | None
 
 
 class _Problem:
@@ -178,7 +178,7 @@ class _Problem:
         found, _ = self._call("search_box", max_boxes, unit)
         return found._replace(done=found.done / len(self.lower))
 
-    def worst(self, units: np.ndarray) -> WorstBox | None:
+    def worst(self, units: np.ndarray) -> SearchedBox | None:
         """The worst of some units."""
         found = self._result_type()()
         self.kernel.library.worst_box(
@@ -219,11 +219,11 @@ class _Problem:
         ]
         return type("Result", (ctypes.Structure,), {"_fields_": fields})
 
-    def _worst_of(self, found: Any) -> WorstBox | None:
+    def _worst_of(self, found: Any) -> SearchedBox | None:
         """The worst box of a result; None if there is none."""
         if found.value == -math.inf:
             return None
-        return WorstBox(np.array(found.low), np.array(found.high), found.bound, found.value)
+        return SearchedBox(np.array(found.low), np.array(found.high), found.bound, found.value)
 
 
 class _Results:

@@ -85,7 +85,6 @@ from iblf_jax.control.controllers import Backstepping
 from iblf_jax.control.controllers._base import decay_of
 from iblf_jax.control.decays._base import energy_gain, gain_at
 from iblf_jax.control.observers import AsPublished, Momentum
-from iblf_jax.core import programs
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.status import Status
 from iblf_jax.simulation.results import Rollout
@@ -605,7 +604,6 @@ def eigenvalues_in(summary: Summary, domain: str) -> Any:
     return {"run": summary.reductions, "box": summary.over_box}[domain]
 
 
-@programs.jit(static_argnames="case")
 def rho_terms(gains: Gains, lambda_max: jax.typing.ArrayLike, case: int) -> jax.Array:
     """The three terms of which rho is the least, (3,) [1/s].
     (3.19), (3.27)

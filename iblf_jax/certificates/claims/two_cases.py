@@ -21,9 +21,10 @@ from iblf_jax.certificates.summary import (
     Summary,
     weighted_lyapunov,
 )
-from iblf_jax.certificates.terms import Point, TorquePoint, adaptive_law, on_position
+from iblf_jax.certificates.terms import Point, TorquePoint, adaptive_law
 from iblf_jax.control.barriers import Barrier
 from iblf_jax.control.controllers import Backstepping, TrackingLaw
+from iblf_jax.control.controllers._base import position_barrier
 from iblf_jax.control.observers import AsPublished, Momentum
 from iblf_jax.core import programs
 from iblf_jax.core.pytree import unwrapped
@@ -161,7 +162,7 @@ class TwoCases(Claim):
         return {
             "e2": np.sqrt(2 * V / summary.reductions.lambda_min),
             "xi, by V1": xi_bound_along(segment, V),
-            "xi": np.sqrt(2 * V[:, None] / np.asarray(on_position(summary.law)[1])),
+            "xi": np.sqrt(2 * V[:, None] / np.asarray(position_barrier(summary.law)[1])),
             "f_tilde": np.sqrt(2 * V / w_f),
         }
 
@@ -202,7 +203,7 @@ def largest_f_rate(summary: Summary) -> float:
 @programs.jit
 def _xi_bound(scenario: Scenario, t: jax.Array, V: jax.Array) -> jax.Array | None:
     """The barrier's own bound on |xi_i| where w_i V1_i <= V, (T, n), or None if it states none."""
-    barrier, weight = on_position(unwrapped(scenario.controller))
+    barrier, weight = position_barrier(unwrapped(scenario.controller))
     return jax.vmap(lambda t, V: barrier.xi_bound(V / weight, scenario.context.tube(t)))(t, V)
 
 
