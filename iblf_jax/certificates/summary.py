@@ -341,8 +341,9 @@ def _envelope(
     shrinking = np.exp(-max(rho, 0.0) * dt)
     errors, carried = [], anchor.carried
     for restart, defect in zip(starts.tolist(), defects.tolist(), strict=True):
-        errors.append(0.0 if restart else carried)
-        carried = shrinking * errors[-1] + defect
+        error = 0.0 if restart else carried
+        errors.append(error)
+        carried = shrinking * error + defect
     after = _Anchor(start_t[-1], start_V[-1], start_noise[-1], carried)
     if not rho > 0:
         unclaimed = np.full(t.size, np.nan)

@@ -88,12 +88,10 @@ class ArmRate(OfStructure):
     def __call__(self, point: jax.Array, constants: list[jax.Array]) -> jax.Array:
         """V_w', () [N m rad/s]; infinite where the torque is not defined, such as log(-1)."""
         numbers: Constants = jax.tree.unflatten(self.structure, constants)
-        found = point_of(self.places, jnp.asarray(point), numbers)
-        rate = arm_motion.lyapunov_rate(
-            found.parts, numbers.weight, found.errors, found.f_tilde, found.rate
-        )
-        now = arm_motion.motion(found.parts, found.errors, found.f_tilde).now
-        return infinite_unless_defined(rate, arm_motion.required_torque(found.parts, now))
+        at = point_of(self.places, jnp.asarray(point), numbers)
+        rate = arm_motion.lyapunov_rate(at.parts, numbers.weight, at.errors, at.f_tilde, at.rate)
+        now = arm_motion.motion(at.parts, at.errors, at.f_tilde).now
+        return infinite_unless_defined(rate, arm_motion.required_torque(at.parts, now))
 
 
 class ArmPoint(NamedTuple):
@@ -186,13 +184,13 @@ def _physical(
     bound: ArmBound, point: jax.Array, constants: list[jax.Array]
 ) -> dict[str, jax.Array]:
     """Time, position, velocity, f_tilde, f_hat, eta and the further rate at a point."""
-    found = point_of(bound.places, point, jax.tree.unflatten(bound.structure, constants))
-    parts, errors = found.parts, found.errors
-    now = arm_motion.motion(parts, errors, found.f_tilde).now
-    f_hat = arm_motion.mismatch_torque(parts, now) - found.f_tilde
+    at = point_of(bound.places, point, jax.tree.unflatten(bound.structure, constants))
+    parts, errors = at.parts, at.errors
+    now = arm_motion.motion(parts, errors, at.f_tilde).now
+    f_hat = arm_motion.mismatch_torque(parts, now) - at.f_tilde
     eta = f_hat - parts.kf * matvec(parts.model.mass_matrix(now.q), now.v)
-    vectors = dict(zip(VECTORS, (now.q, now.v, found.f_tilde, f_hat, eta), strict=True))
-    return {"t": errors.t, "rate": jnp.asarray(found.rate), **vectors}
+    vectors = dict(zip(VECTORS, (now.q, now.v, at.f_tilde, f_hat, eta), strict=True))
+    return {"t": errors.t, "rate": jnp.asarray(at.rate), **vectors}
 
 
 def arm_problem(
@@ -229,13 +227,13 @@ def arm_problem(
         length, is_period = time_interval(varying, duration, uncertain)
         digests = _digests(parts, uncertain)
         barriers = {"barrier": (parts.law.barrier, parts.law.o)}
-        found = examined(scenario, digests, agreement_of_robot, barriers, homogeneous=True)
+        examination = examined(scenario, digests, agreement_of_robot, barriers, homogeneous=True)
         _check_tube(scenario, length)
         _check_mass_matrices(parts, uncertain)
         zero = jnp.zeros(())
         structure = jax.tree.structure(Constants(parts, uncertain.numbers, zero, zero))
-    of_structure = (structure, uncertain.places, tuple(found.digests))
-    assumptions = (*ASSUMPTIONS, *claim_sentences([parts.law.barrier]), *found.assumed)
+    of_structure = (structure, uncertain.places, tuple(examination.digests))
+    assumptions = (*ASSUMPTIONS, *claim_sentences([parts.law.barrier]), *examination.assumed)
     functions = (ArmBound(*of_structure), ArmRate(*of_structure))
     return ArmProblem(scenario, uncertain, *functions, length, is_period, assumptions, parts)
 

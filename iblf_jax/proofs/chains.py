@@ -90,9 +90,9 @@ class ChainRate(OfStructure):
     def __call__(self, point: jax.Array, constants: list[jax.Array]) -> jax.Array:
         """V', (); infinite where d is not defined."""
         numbers: Constants = jax.tree.unflatten(self.structure, constants)
-        true, found = point_of(self.places, self.observed, jnp.asarray(point), numbers)
-        rate = lyapunov_rate(numbers, self.observed, true, found)
-        return infinite_unless_defined(rate, jnp.stack(found.now.d))
+        true, at = point_of(self.places, self.observed, jnp.asarray(point), numbers)
+        rate = lyapunov_rate(numbers, self.observed, true, at)
+        return infinite_unless_defined(rate, jnp.stack(at.now.d))
 
 
 def point_of(
@@ -186,16 +186,16 @@ class ChainProblem(LevelSetProblem):
             self.bound.structure, list(map(jnp.asarray, constants))
         )
         x = jnp.asarray(point, float)
-        _, found = point_of(self.uncertain.places, self.bound.observed, x, numbers)
-        y = found.now.y
+        _, at = point_of(self.uncertain.places, self.bound.observed, x, numbers)
+        y = at.now.y
         d_hat = np.stack(y.d_hat)
         return ChainLevelSetState(
             t=float(y.t),
-            x=np.asarray(found.x),
-            u=np.asarray(found.u),
-            d_tilde=np.stack(found.now.d_tilde),
+            x=np.asarray(at.x),
+            u=np.asarray(at.u),
+            d_tilde=np.stack(at.now.d_tilde),
             d_hat=d_hat,
-            eta=d_hat - np.asarray(self.parts.kappa) * np.asarray(found.x),
+            eta=d_hat - np.asarray(self.parts.kappa) * np.asarray(at.x),
             parameters=self.uncertain.values(np.asarray(point)[1 + self.term_count :]),
         )
 
@@ -252,14 +252,14 @@ def chain_problem(
             f"barriers[{i}]": pair for i, pair in enumerate(zip(law.barriers, gains, strict=True))
         }
         digests = _digests(scenario, uncertain)
-        found = examined(scenario, digests, agreement_of_plant, barriers, homogeneous=False)
+        examination = examined(scenario, digests, agreement_of_plant, barriers, homogeneous=False)
         observed = tuple(bool(gain > 0.0) for gain in np.asarray(parts.kappa)[:, 0])
         true = (cast(plants.Plant, scenario.plant), scenario.disturbance)
         zero = jnp.zeros(())
         structure = jax.tree.structure(Constants(parts, *true, uncertain.numbers, zero, zero))
-    of_structure = (structure, uncertain.places, tuple(found.digests), observed)
+    of_structure = (structure, uncertain.places, tuple(examination.digests), observed)
     claims = (*claim_sentences(law.barriers), *_without_claim(scenario))
-    assumptions = (*ASSUMPTIONS, *claims, *found.assumed)
+    assumptions = (*ASSUMPTIONS, *claims, *examination.assumed)
     functions = (ChainBound(*of_structure), ChainRate(*of_structure))
     return ChainProblem(scenario, uncertain, *functions, length, is_period, assumptions, parts)
 

@@ -43,12 +43,12 @@ class Uncertain(NamedTuple):
 
     def values(self, z: Sequence[float] | np.ndarray) -> dict[str, float]:
         """Path -> value of the entries at coordinates."""
-        found = {}
+        values = {}
         for k, names in enumerate(self.paths):
             for i, name in enumerate(names):
                 base, slope = float(self.numbers.base[k][i]), float(self.numbers.slope[k][i])
-                found[name] = base + slope * float(z[k])
-        return found
+                values[name] = base + slope * float(z[k])
+        return values
 
     def scales(self) -> dict[str, tuple[float, float]]:
         """Path of each uncertain entry -> its least and its greatest value."""

@@ -74,11 +74,11 @@ def replaced(leaves: list[jax.Array], new: dict[Place, jax.Array]) -> list[jax.A
 
 def values_at(places: Places, numbers: Numbers, z: jax.Array) -> dict[Place, jax.Array]:
     """The entries at coordinates z, (m,)."""
-    found = {}
+    values = {}
     for k, entries in enumerate(places.entries):
         for i, place in enumerate(entries):
-            found[place] = numbers.base[k][i] + numbers.slope[k][i] * z[k]
-    return found
+            values[place] = numbers.base[k][i] + numbers.slope[k][i] * z[k]
+    return values
 
 
 def leaves_at(places: Places, numbers: Numbers, part: P, z: jax.Array) -> P:

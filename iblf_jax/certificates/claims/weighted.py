@@ -246,7 +246,9 @@ def best_constants(
     # Axes: rates rho, then fractions of the largest b.
     rho = rho_limit * GRID[:, None]
     a = 1.0 - rho / (2.0 * mu)
-    fractions = {1: np.zeros((1, 1)), 2: GRID[None, :]}[case]
+    fractions = np.zeros((1, 1))
+    if case == 2:
+        fractions = GRID[None, :]
     b = 2.0 * (np.min(kf) - rho / 2.0) * fractions
     kf_margin = kf - (b + rho)[..., None] / 2.0
     w_f = np.max(0.25 / (a[..., None] * K2 * kf_margin), axis=-1)
