@@ -212,12 +212,6 @@ def _replayed(study: Study, index: int) -> Rollout:
 
 def _certificate_of(run: Rollout) -> Certificate:
     """The certificate of one run, its arrays on the host."""
-    inaccurate = int(has_flag(int(run.status), Status.INACCURATE))
-    return dataclasses.replace(_checked_claims(run), inaccurate=inaccurate)
-
-
-def _checked_claims(run: Rollout) -> Certificate:
-    """The certificate of one run, without its flags."""
     if run.scenario.process_noise is not None:
         return _certificate_by_comparison(run, "noisy", NOISY)
     if run.scenario.sampling is not None:
@@ -254,7 +248,13 @@ def _checked_claims(run: Rollout) -> Certificate:
         joints=plants.component_names(scenario.plant),
         claim=main.in_words,
         levels=main.labels(scenario),
+        inaccurate=_inaccurate(run),
     )
+
+
+def _inaccurate(run: Rollout) -> int:
+    """`Certificate.inaccurate` of one run."""
+    return int(has_flag(int(run.status), Status.INACCURATE))
 
 
 def _heading_of(scenario: Scenario) -> str:
@@ -306,7 +306,7 @@ def _certificate_by_comparison(run: Rollout, kind: str, reason: str) -> Certific
         )
     continuous = _on_host(simulated)
     certificate = _certificate_of(continuous)
-    cleared: dict[str, Any] = dict.fromkeys(("margin", "value", "joint", "time", "first"))
+    cleared: dict[str, Any] = dict.fromkeys(("margin", "value", "joint", "time", "first_broken"))
     unclaimed = tuple(
         dataclasses.replace(line, verdict=NOT_APPLICABLE, note=reason, **cleared)
         for line in certificate.lines
@@ -315,6 +315,7 @@ def _certificate_by_comparison(run: Rollout, kind: str, reason: str) -> Certific
         certificate,
         lines=(*unclaimed, *_compared(run, continuous, kind), *_trigger_lines(run)),
         traces=main_claim(scenario).unclaimed_traces(run),
+        inaccurate=_inaccurate(run),
     )
 
 

@@ -27,16 +27,18 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.certificates.claims._base import Claim
 from iblf_jax.certificates.claims.levels import LEVELS
 from iblf_jax.certificates.claims.theorem import LOWEST_K2, LOWEST_KF, THEOREM
 from iblf_jax.certificates.claims.two_cases import gains_of
 from iblf_jax.certificates.eigenvalues import maximise
-from iblf_jax.certificates.terms import TORQUE, receives_q_dq, terms_and_sample
+from iblf_jax.certificates.terms import TORQUE, Terms, receives_q_dq, terms_and_sample
 from iblf_jax.core import checks
 from iblf_jax.core.presentation import Content, Result
 from iblf_jax.simulation.closed_loop import initial_state
@@ -65,24 +67,45 @@ class Counterexample(Result):
         return [f"Counterexample(growth {self.growth:+.4g})", *"\n".join(drawn).splitlines()]
 
 
-def _growth(scenario: Scenario) -> tuple[jax.Array, jax.Array]:
-    """The growth g at the start of a scenario, (), and whether the claim excludes the start.
-    (3.24), (S.3)
-    """
-    t, state = jnp.zeros((), scenario.initial.q.dtype), initial_state(scenario)
-    if not receives_q_dq(scenario):
-        terms, _ = terms_and_sample(scenario, t, state, (LEVELS,))
-        claim = terms.claims[LEVELS.key]
-        growth = terms.dV - claim.disturbance_terms - claim.lag
-        return growth / (claim.dissipation + claim.by_slopes), terms.excluded
-    terms, _ = terms_and_sample(scenario, t, state, (THEOREM,))
+class ClaimOnStates(NamedTuple):
+    """A claim that a start may break."""
+
+    claim: Claim
+    relative_rate: Callable[[Scenario, Terms], jax.Array]
+    """The g of the head of this module, ()."""
+
+
+def _rate_of_levels(scenario: Scenario, terms: Terms) -> jax.Array:
+    """The rate (V' - T) / Q of (S.3)."""
+    claim = terms.claims[LEVELS.key]
+    rate = terms.dV - claim.disturbance_terms - claim.lag
+    return rate / (claim.dissipation + claim.by_slopes)  # type: ignore[no-any-return]
+
+
+def _rate_of_theorem(scenario: Scenario, terms: Terms) -> jax.Array:
+    """The rate (V2' - 1/2 |f'|^2) / Q of (3.24)."""
     gains, e2, f_tilde = gains_of(scenario), terms.e[1], terms.d_tilde
     M0 = terms.claims[TORQUE].M0
     V1 = terms.V - 0.5 * (e2 @ (M0 @ e2) + f_tilde @ f_tilde)
     by_e2 = e2 @ ((gains.K2 - LOWEST_K2) * e2)
     by_f = f_tilde @ ((gains.kf - LOWEST_KF[2]) * f_tilde)
     Q = jnp.min(gains.decay_rate) * V1 + by_e2 + by_f
-    return (terms.dV - 0.5 * terms.dd @ terms.dd) / Q, terms.excluded
+    return (terms.dV - 0.5 * terms.dd @ terms.dd) / Q  # type: ignore[no-any-return]
+
+
+def _claim_of(scenario: Scenario) -> ClaimOnStates:
+    """The claim about a scenario, whether or not it applies."""
+    if receives_q_dq(scenario):
+        return ClaimOnStates(THEOREM, _rate_of_theorem)
+    return ClaimOnStates(LEVELS, _rate_of_levels)
+
+
+def _relative_rate(scenario: Scenario) -> tuple[jax.Array, jax.Array]:
+    """The relative rate g at the start of a scenario, (), and whether the claim excludes it."""
+    t, state = jnp.zeros((), scenario.initial.q.dtype), initial_state(scenario)
+    claim, relative_rate = _claim_of(scenario)
+    terms, _ = terms_and_sample(scenario, t, state, (claim,))
+    return relative_rate(scenario, terms), terms.excluded
 
 
 @checks.known_keywords
@@ -126,8 +149,7 @@ def counterexample(
 
 def _check_claimed(scenario: Scenario) -> None:
     """Raises ValueError for a scenario about which neither Theorem 2 nor (S.3) makes a claim."""
-    claim = THEOREM if receives_q_dq(scenario) else LEVELS
-    reason = claim.why_not(scenario)
+    reason = _claim_of(scenario).claim.why_not(scenario)
     if reason:
         got = type(scenario.controller).__name__
         raise checks.fail("scenario", got, "a scenario with a claim", f"{reason}.")
@@ -138,13 +160,13 @@ def _losses_of(scenario: Scenario, cube: Cube) -> Callable[[np.ndarray], Losses]
     excludes the start.
     """
 
-    def growth_at(u: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return _growth(with_parameters(scenario, cube.values(u)))
+    def rate_at(u: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return _relative_rate(with_parameters(scenario, cube.values(u)))
 
-    growth = jax.jit(jax.value_and_grad(growth_at, has_aux=True))
+    rate_and_gradient = jax.jit(jax.value_and_grad(rate_at, has_aux=True))
 
     def losses(u: np.ndarray) -> Losses:
-        (g, excluded), gradient = growth(jnp.asarray(u[0], scenario.initial.q.dtype))
+        (g, excluded), gradient = rate_and_gradient(jnp.asarray(u[0], scenario.initial.q.dtype))
         loss = np.inf if excluded or not np.isfinite(g) else -float(g)
         return Losses(np.array([loss]), -np.asarray(gradient)[None], np.asarray([excluded]))
 

@@ -8,16 +8,33 @@ was broken. `check_positive` and `check_margins` make lines from numbers.
 from __future__ import annotations
 
 import dataclasses
+import enum
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 HOLDS, FAILS, NOT_APPLICABLE = "holds", "fails", "not applicable"
-OWN_INEQUALITY = "inequality, own V"
-"""Name of the inequality that a law states about itself."""
 OBSERVED_ONLY = "no claim, only observed ("
 """Beginning of the note of a line that holds on the run although no theorem claims it."""
+
+
+class Role(enum.StrEnum):
+    """What a line is for the verdict of a certificate."""
+
+    INEQUALITY = "inequality"
+    """The differential inequality of a claim, from which the rest follows."""
+    OWN_INEQUALITY = "own inequality"
+    """That of the claim that the law states about itself."""
+    WEIGHTED_INEQUALITY = "weighted inequality"
+    """That of the claim with weights."""
+    WEIGHTED = "weighted"
+    """Any other line of the claim with weights."""
+    OTHER = "other"
+    """An assumption, a gain condition, or what follows from the inequality."""
+
+
+INEQUALITIES = frozenset({Role.INEQUALITY, Role.OWN_INEQUALITY, Role.WEIGHTED_INEQUALITY})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,27 +65,30 @@ class Line:
     """In a certificate over many runs: the run with the smallest margin."""
     note: str = ""
     """The reason of "not applicable", or a remark."""
-    counts: bool = True
-    """Whether the verdict enters `Certificate.verdict`; a mere measurement does not."""
-    first: float | None = None
+    enters_verdict: bool = True
+    """Whether the verdict enters `Certificate.verdict`; that of a mere measurement does not."""
+    first_broken: float | None = None
     """The first instant at which the inequality is broken [s]; None if there is none."""
+    role: Role = Role.OTHER
 
     @property
     def has_weights(self) -> bool:
         """Whether it belongs to the claim with weights."""
-        return self.name.startswith("weighted")
+        return self.role in (Role.WEIGHTED_INEQUALITY, Role.WEIGHTED)
 
     @property
     def is_inequality(self) -> bool:
         """Whether it is the differential inequality of a claim, from which the rest follows."""
-        return "inequality" in self.name
+        return self.role in INEQUALITIES
 
     @property
     def applies(self) -> bool:
         """Whether the line is informative about this run: it has a verdict, or a measured number
         beside the claims.
         """
-        return self.verdict != NOT_APPLICABLE or (self.value is not None and not self.counts)
+        return self.verdict != NOT_APPLICABLE or (
+            self.value is not None and not self.enters_verdict
+        )
 
     def where(self, joints: Sequence[str] = ()) -> str:
         """Run, joint and time of the smallest margin, and when the line was first broken, in
@@ -83,7 +103,7 @@ class Line:
             ("run {}", self.run),
             ("{}", joint),
             ("t = {:.4g} s", self.time),
-            ("first broken at t = {:.4g} s", self.first),
+            ("first broken at t = {:.4g} s", self.first_broken),
         )
         return ", ".join(text.format(value) for text, value in parts if value is not None)
 
@@ -95,10 +115,19 @@ class Statement(NamedTuple):
     equation: str
     text: str
     unit: str = "1"
+    role: Role = Role.OTHER
 
     def line(self, verdict: str, **fields: Any) -> Line:
         """The line with this verdict."""
-        return Line(self.name, self.equation, self.text, verdict, unit=self.unit, **fields)
+        return Line(
+            self.name,
+            self.equation,
+            self.text,
+            verdict,
+            unit=self.unit,
+            role=self.role,
+            **fields,
+        )
 
 
 def verdict_of(holds: bool) -> str:
@@ -113,7 +142,7 @@ def not_applicable(statement: Statement, reason: str, **fields: Any) -> Line:
 
 def measured(statement: Statement, note: str, **fields: Any) -> Line:
     """The line of a number that is measured beside the claims."""
-    return not_applicable(statement, note, counts=False, **fields)
+    return not_applicable(statement, note, enters_verdict=False, **fields)
 
 
 def check_positive(statement: Statement, margin: float, **fields: Any) -> Line:
@@ -165,7 +194,7 @@ def check_margins(
     place = np.unravel_index(np.argmin(compared), margins.shape)
     broken_rows = np.flatnonzero(broken.reshape(margins.shape[0], -1).any(axis=1))
     if broken_rows.size:
-        fields["first"] = float(t[broken_rows[0]])
+        fields["first_broken"] = float(t[broken_rows[0]])
     if per_joint:
         fields["joint"] = int(place[1])
     return statement.line(
@@ -218,8 +247,8 @@ def over_segments(same: list[Line]) -> Line:
     """
     worst = min(same, key=lambda line: rank(line, WITHIN_RUN))
     values = [line.value for line in same if line.value is not None]
-    broken = [line.first for line in same if line.first is not None]
-    worst = dataclasses.replace(worst, first=min(broken, default=None))
+    broken = [line.first_broken for line in same if line.first_broken is not None]
+    worst = dataclasses.replace(worst, first_broken=min(broken, default=None))
     if worst.value is None:
         return worst
     return dataclasses.replace(worst, value=max(values))

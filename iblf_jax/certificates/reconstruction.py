@@ -166,13 +166,14 @@ def _integrated_again(run: Rollout, grid: TimeGrid) -> Iterator[tuple[np.ndarray
     recorded = _recorded_states(run)
     count, every = run.t.size, grid.record_every
     intervals, length = max(1, BLOCK_STEPS // every), min(every, BLOCK_STEPS)  # of a block
+    offsets = range(0, every, length)
     start = jax.tree.map(lambda x: np.asarray(x)[None], initial_state(run.scenario))
     _check_arrival(run, _rows(recorded, slice(0, 1)), start, np.zeros(1, int))
     for first_row in range(0, count, intervals):
         samples = np.arange(first_row, first_row + intervals)
         rows = np.minimum(samples, count - 1)  # the last block repeats the last sample
         states = _rows(recorded, rows)
-        for offset in range(0, every, length):
+        for offset in offsets:
             first = rows * every + offset
             states, path = _advance(run, first, states, length)
             index = first[:, None] + np.arange(length)
@@ -184,7 +185,7 @@ def _integrated_again(run: Rollout, grid: TimeGrid) -> Iterator[tuple[np.ndarray
             yield index[keep], _rows(path, keep)
         # The last part of an interval may be shorter than `length`: its end lies on the path.
         arrived = jax.tree.map(np.asarray, states)
-        remaining = every - offset
+        remaining = every - offsets[-1]
         if remaining < length:
             arrived = _rows(path, (slice(None), remaining))
         has_next = samples < count - 1
@@ -296,8 +297,9 @@ def terms_along(
     terms, sample = jax.tree.map(lambda x: np.asarray(x)[:, 0], found)
     defect, defect_f = map(_defect, energies)
     energy = scenario.loop.model.energy_of_errors
-    if "levels" in terms.claims and not is_default(energy, Plant.energy_of_errors):
-        # V of a sample then includes |f_tilde|^2/2, which the sum of w_i V_i does not.
+    omits_f_tilde = any(claim.omits_f_tilde and claim.key in terms.claims for claim in claims)
+    if omits_f_tilde and not is_default(energy, Plant.energy_of_errors):
+        # V of a sample then includes |f_tilde|^2/2, which V of the claim does not.
         defect = defect + defect_f
     return terms, sample, defect, defect_f
 

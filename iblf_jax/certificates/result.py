@@ -15,8 +15,8 @@ from iblf_jax.certificates.lines import (
     HOLDS,
     NOT_APPLICABLE,
     OBSERVED_ONLY,
-    OWN_INEQUALITY,
     Line,
+    Role,
 )
 from iblf_jax.core import checks, tables
 from iblf_jax.core.presentation import Content, Result, present
@@ -65,7 +65,7 @@ class LevelTraces(NamedTuple):
     disturbance_terms: np.ndarray
     """T of (S.3), with the lag of filters [1/s]."""
     error: np.ndarray
-    """Xi of levels with bounds, e_i of the others, (T, r, n)."""
+    """The error xi_i of levels with bounds, e_i of the others, (T, r, n)."""
     error_bound: np.ndarray
     """Bounds on |error| by the envelope, (T, r, n)."""
     d_tilde: np.ndarray
@@ -93,7 +93,9 @@ class Certificate(Result):
     """Law, barrier, variant and observer of the certificate."""
     lines: tuple[Line, ...]
     numbers: dict[str, Any]
-    """The constants of the claim: rho, rho2, lambda_min, lambda_max, V2(0), F_d, F_m, the case."""
+    """Constants of the claim by name.  Theorem 2 and (F.3): rho_{run,box}_case_{1,2}, case, F_m,
+    F_d, rho2, V2_start, V2_end, lambda_{min,max}_{run,box}.  (S.3): rho, rho2, V_start, V_end,
+    d_largest, d_tilde_largest.  All: samples, samples_left_out."""
     traces: Traces | LevelTraces
     """Of the run, or of the worst of many."""
     runs: tuple[int, ...] = ()
@@ -115,10 +117,10 @@ class Certificate(Result):
         """The overall verdict: "fails" if a line fails, "holds" if none fails and the inequality
         was checked, else "not applicable".
         """
-        counted = [line for line in self.lines if line.counts]
-        if any(line.verdict == FAILS for line in counted):
+        deciding = [line for line in self.lines if line.enters_verdict]
+        if any(line.verdict == FAILS for line in deciding):
             return FAILS
-        checked = any(line.verdict == HOLDS and line.is_inequality for line in counted)
+        checked = any(line.verdict == HOLDS and line.is_inequality for line in deciding)
         return HOLDS if checked else NOT_APPLICABLE
 
     @property
@@ -128,8 +130,8 @@ class Certificate(Result):
         """
         if self.verdict != FAILS:
             return self.verdict
-        failing = [f'"{x.name}"' for x in self.lines if x.counts and x.verdict == FAILS]
-        verdicts = {x.verdict for x in self.lines if x.has_weights and x.counts}
+        failing = [f'"{x.name}"' for x in self.lines if x.enters_verdict and x.verdict == FAILS]
+        verdicts = {x.verdict for x in self.lines if x.has_weights and x.enters_verdict}
         if HOLDS in verdicts and FAILS not in verdicts:
             return f"{self.claim} fails in {_listed(failing)}; the claim with weights holds"
         return f"fails in {_listed(failing)}"
@@ -144,8 +146,8 @@ class Certificate(Result):
         """Whether the checked inequality is one that the law states about itself, and not that of
         the paper's theorem.
         """
-        inequalities = [x.name for x in self.applicable if x.is_inequality and not x.has_weights]
-        return inequalities == [OWN_INEQUALITY]
+        roles = [x.role for x in self.applicable if x.is_inequality and not x.has_weights]
+        return roles == [Role.OWN_INEQUALITY]
 
     def __getitem__(self, name: str) -> Line:
         for line in self.lines:

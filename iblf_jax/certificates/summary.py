@@ -74,7 +74,7 @@ class Summary:
     run: Rollout
     """Its arrays are on the host."""
     claims: tuple[Claim, ...]
-    extrema: Extrema
+    reductions: RunReductions
     """Over all steps."""
     duration: float
     """[s]."""
@@ -106,12 +106,12 @@ class Summary:
     @property
     def samples(self) -> int:
         """Number of samples, one for each step and one for the last instant."""
-        return self.extrema.samples
+        return self.reductions.samples
 
     @property
     def excluded(self) -> int:
         """Number of samples that the claims exclude."""
-        return self.extrema.excluded
+        return self.reductions.excluded
 
     @cached_property
     def why_excluded(self) -> str:
@@ -143,23 +143,9 @@ class Summary:
 
     @cached_property
     def over_box(self) -> Extremes:
-        """Extreme eigenvalues of M0 over the admissible box of positions."""
-        extrema = self.extrema
-        return eigenvalues_over(self.run.scenario.model, extrema.low, extrema.high)
-
-    @cached_property
-    def case(self) -> int:
-        """1 if f' = 0, else 2."""
-        return 1 if self.extrema.steady else 2
-
-    def counts(self, case: int) -> bool:
-        """Whether a case enters the verdict: where f' = 0, case 1 decides."""
-        return case == 1 or self.case == 2
-
-    @property
-    def F_d(self) -> float:
-        """Largest |f'| [N m/s]; 0 in case 1."""
-        return 0.0 if self.case == 1 else float(self.extrema.dd)
+        """Extreme eigenvalues of M0 of a robot over the admissible box of positions."""
+        reductions = self.reductions
+        return eigenvalues_over(self.run.scenario.model, reductions.low, reductions.high)
 
     @cached_property
     def constants(self) -> dict[str, Any]:
@@ -226,45 +212,45 @@ def summarise(run: Rollout, claims: Sequence[Claim]) -> tuple[Summary, Iterator[
 # --- first pass: extremes over all steps ---------------------------------------------------------
 
 
-class Extremum(NamedTuple):
-    """A quantity at some steps, and how it is combined with that of the steps before."""
+class Reduction(NamedTuple):
+    """A quantity of some steps, and how it is combined with that of the steps before."""
 
-    combined: Callable[[Any, Any], Any]
+    combine: Callable[[Any, Any], Any]
     value: Any
 
 
-class Extrema(SimpleNamespace):
-    """Running extrema over the steps of a run, by name, those of its claims (`Claim.extrema`)
-    included.  NaN propagates.
+class RunReductions(SimpleNamespace):
+    """Extrema, sums, and first and last values over the steps of a run, by name, those of its
+    claims (`Claim.reductions`) included.  NaN propagates.
 
-    low, high        bounds on positions over the run, (n,) [rad]
-    bound_distance   smallest distance to a bound, () [rad]
-    d, d_tilde       sup of the norms: of a torque, (), or of each level, (r,)
-    V_start, V_end   V at the first and at the last step
+    low, high                    bounds on positions over the run, (n,) [rad]
+    bound_distance               smallest distance to a bound, () [rad]
+    d_largest, d_tilde_largest   sup of the norms: of a torque, (), or of each level, (r,)
+    V_start, V_end               V at the first and at the last step
     """
 
     samples: int = 0
     excluded: int = 0
 
     def add(self, steps: Steps, scenario: Scenario, claims: Sequence[Claim]) -> None:
-        """Updates the extrema with some steps."""
+        """Updates the reductions with some steps."""
         sample, terms = steps.sample, steps.terms
-        found = {
-            "low": Extremum(np.minimum, sample.lower.min(axis=0)),
-            "high": Extremum(np.maximum, sample.upper.max(axis=0)),
-            "bound_distance": Extremum(np.minimum, terms.distance[:, 0].min()),
-            "d": Extremum(np.maximum, largest_norm(terms.d)),
-            "d_tilde": Extremum(np.maximum, largest_norm(terms.d_tilde)),
-            "samples": Extremum(operator.add, steps.t.size),
-            "excluded": Extremum(operator.add, int(terms.excluded.sum())),
-            "V_start": Extremum(lambda first, _: first, terms.V[0]),
-            "V_end": Extremum(lambda _, last: last, terms.V[-1]),
+        reductions = {
+            "low": Reduction(np.minimum, sample.lower.min(axis=0)),
+            "high": Reduction(np.maximum, sample.upper.max(axis=0)),
+            "bound_distance": Reduction(np.minimum, terms.distance[:, 0].min()),
+            "d_largest": Reduction(np.maximum, largest_norm(terms.d)),
+            "d_tilde_largest": Reduction(np.maximum, largest_norm(terms.d_tilde)),
+            "samples": Reduction(operator.add, steps.t.size),
+            "excluded": Reduction(operator.add, int(terms.excluded.sum())),
+            "V_start": Reduction(lambda first, _: first, terms.V[0]),
+            "V_end": Reduction(lambda _, last: last, terms.V[-1]),
         }
         for claim in claims:
-            found |= claim.extrema(scenario, terms)
-        kept = vars(self)
-        for name, (combined, value) in found.items():
-            kept[name] = combined(kept[name], value) if name in kept else value
+            reductions |= claim.reductions(scenario, terms)
+        so_far = vars(self)
+        for name, (combine, value) in reductions.items():
+            so_far[name] = combine(so_far[name], value) if name in so_far else value
 
 
 def largest_norm(values: np.ndarray) -> np.ndarray:
@@ -276,12 +262,12 @@ def _summary(
     run: Rollout, grid: TimeGrid, claims: tuple[Claim, ...], all_steps: Iterable[Steps]
 ) -> Summary:
     """Extremes over all steps, and the constants that follow from them."""
-    extrema = Extrema()
+    reductions = RunReductions()
     for steps in all_steps:
-        extrema.add(steps, run.scenario, claims)
+        reductions.add(steps, run.scenario, claims)
     if is_valid(run):
-        check_status(run, float(extrema.bound_distance))
-    return Summary(run, claims, extrema, grid.duration)
+        check_status(run, float(reductions.bound_distance))
+    return Summary(run, claims, reductions, grid.duration)
 
 
 # --- second pass: envelopes ----------------------------------------------------------------------
@@ -355,8 +341,9 @@ def _envelope(
     shrinking = np.exp(-max(rho, 0.0) * dt)
     errors, carried = [], anchor.carried
     for restart, defect in zip(starts.tolist(), defects.tolist(), strict=True):
-        errors.append(0.0 if restart else carried)
-        carried = shrinking * errors[-1] + defect
+        error = 0.0 if restart else carried
+        errors.append(error)
+        carried = shrinking * error + defect
     after = _Anchor(start_t[-1], start_V[-1], start_noise[-1], carried)
     if not rho > 0:
         unclaimed = np.full(t.size, np.nan)

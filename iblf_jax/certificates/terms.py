@@ -15,7 +15,7 @@ claim adds its own (`Claim.with_terms_of_claim`).  Two kinds of points differ in
 derivatives:
 
     TorquePoint   for claims about a robot and the torque f: the signals of the loop and their rates
-    LevelPoint    for claims about levels: the arguments (t, x, d_hat, state of the law) of V and
+    ChainPoint    for claims about levels: the arguments (t, x, d_hat, state of the law) of V and
                   their rates, because these claims need dV/dx and dV/dd_hat one by one
 
 Rounding: V' is a sum of large terms that cancel, so its error is some units in the last place of
@@ -33,17 +33,15 @@ import jax
 import jax.numpy as jnp
 from jax.typing import DTypeLike
 
-from iblf_jax.control.barriers import Barrier
 from iblf_jax.control.controllers import (
     AdaptiveParameters,
     Backstepping,
     BarrierBackstepping,
     LawContext,
-    RobotLaw,
     Saturated,
     TrackingLaw,
 )
-from iblf_jax.control.controllers._base import law_of_x, layers_with_states
+from iblf_jax.control.controllers._base import law_of_x, layers_with_states, position_barrier
 from iblf_jax.core.linalg import matvec, solve_spd
 from iblf_jax.core.pytree import layers, unwrapped
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, plant_input, rate
@@ -98,7 +96,8 @@ class Terms(NamedTuple):
     sqrt_V_size: Any = ()
     """Error of sqrt(2 V) for a relative error of 1, ()."""
     claims: Any = ()
-    """Terms that claims add, a dict: by the key of the claim, TORQUE or ESTIMATED."""
+    """Terms of single claims: TORQUE for Theorem 2 and (F.3), ESTIMATED for the estimate of levels,
+    else `Claim.key`."""
 
 
 def rounding(dtype: DTypeLike) -> float:
@@ -116,10 +115,12 @@ def terms_and_sample(
       scenario: canonical.
       t: time, () [s].
       state: state of the loop at t.
-      claims: claims about the scenario, in any order.
+      claims: claims about the scenario, in any order, with one kind of points.
     """
-    kind = TorquePoint if any(claim.about_torque for claim in claims) else LevelPoint
-    point = kind(scenario, t, state)
+    kinds = {claim.point for claim in claims if claim.point is not None}
+    if len(kinds) != 1:
+        raise ValueError(f"claims of one kind of points are needed, not of {len(kinds)}")
+    point = kinds.pop()(scenario, t, state)
     terms = point.terms()
     for claim in claims:
         terms = claim.with_terms_of_claim(point, terms)
@@ -268,7 +269,7 @@ def _signals(scenario: Scenario, t: jax.Array, state: LoopState) -> tuple[dict[s
     law: TrackingLaw = unwrapped(scenario.controller)
     barrier_slope = jnp.zeros_like(state.q)
     if isinstance(law, Backstepping | BarrierBackstepping):
-        barrier, weight = on_position(law)
+        barrier, weight = position_barrier(law)
         barrier_slope = weight * barrier.slope(scenario.context.tube(t), state.q)
     # All of f where the plant is the model: the torques besides that of the law.
     external = jnp.zeros_like(state.q)
@@ -292,13 +293,6 @@ def _signals(scenario: Scenario, t: jax.Array, state: LoopState) -> tuple[dict[s
     return signals, sample
 
 
-def on_position(law: Any) -> tuple[Barrier, Any]:
-    """The barrier on the position, and its weight, (n,)."""
-    if law.barriers:
-        return law.barriers[0], law.weights[0]
-    return law.barrier, law.weight
-
-
 def relative_gap(xi: jax.Array, guard: float) -> jax.Array:
     """Distance to the bound relative to the width of the tube, in [guard, 1]; 1 for a barrier
     without a guard.  Relative errors grow by 1/gap near the bound.
@@ -320,9 +314,9 @@ class Arguments(NamedTuple):
     law_state: Any
 
 
-class LevelPoint(Point):
-    """A state of a loop whose law receives levels: of a plant in strict-feedback form, or of a
-    robot as one of order 2.
+class ChainPoint(Point):
+    """A state of a loop, with the arguments (t, x, d_hat, state of the law) of V and their
+    rates.
     """
 
     def __init__(self, scenario: Scenario, t: jax.Array, state: LoopState) -> None:
@@ -465,7 +459,7 @@ def inner_context(scenario: Scenario, state: Any) -> LawContext:
 
 def receives_q_dq(scenario: Scenario) -> bool:
     """Whether the law of a scenario receives q and q', and not all levels."""
-    return isinstance(unwrapped(scenario.controller), RobotLaw)
+    return not unwrapped(scenario.controller).receives_x
 
 
 def adaptive_law(scenario: Scenario) -> AdaptiveParameters | None:

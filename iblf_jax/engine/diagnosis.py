@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.control.barriers import Quadratic
-from iblf_jax.control.controllers import Law
 from iblf_jax.core import checks, notices
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.status import FAILED, LOST, Status, describe
@@ -68,7 +67,7 @@ def report(result: Rollout, steps: int, throw: bool) -> None:
     failed = status & FAILED
     reported = failed | status & REPORTED
     law = unwrapped(result.scenario.controller)
-    knows_bounds = law.needs_velocity_bounds or isinstance(law, Law)
+    knows_bounds = law.needs_velocity_bounds or law.receives_x
     if knows_bounds or _fast_reference(result):
         reported |= status & Status.ALPHA_INFEASIBLE
     if not reported:
@@ -156,7 +155,7 @@ def _level_remedy(scenario: Scenario, level: int) -> str:
     """How the bounds of a level above the first can be kept, in words."""
     law = unwrapped(scenario.controller)
     field = f"bounds[{level - 1}]"
-    if not isinstance(law, Law):
+    if not law.receives_x:
         return (
             f"{type(law).__name__} knows no bounds of that level; controllers.BarrierBackstepping"
             " keeps them."

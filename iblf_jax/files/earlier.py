@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.certificates.lines import Role
 from iblf_jax.core import checks
 from iblf_jax.files.values import NONE, Words
 from iblf_jax.simulation.scenario import Scenario
@@ -151,3 +152,22 @@ def fields_of_run(stored: dict[str, Any]) -> dict[str, Any]:
     others = {name: x for name, x in stored.items() if name not in earlier}
     as_stored = jnp.asarray if isinstance(stored["q"], jax.Array) else np.asarray
     return {**others, **{signal: as_stored(levels(stored, signal)) for signal in LEVEL_SIGNALS}}
+
+
+def fields_of_line(stored: dict[str, Any]) -> dict[str, Any]:
+    """The fields of a stored line of a certificate.  Its name said what it is in earlier versions,
+    which named two of its fields otherwise.
+    """
+    if "role" in stored:
+        return stored
+    former = {"counts": "enters_verdict", "first": "first_broken"}
+    present = {former.get(name, name): x for name, x in stored.items()}
+    name = str(stored.get("name"))
+    role = Role.OTHER
+    if name == "inequality, own V":
+        role = Role.OWN_INEQUALITY
+    elif name.startswith("weighted"):
+        role = Role.WEIGHTED_INEQUALITY if "inequality" in name else Role.WEIGHTED
+    elif "inequality" in name:
+        role = Role.INEQUALITY
+    return present | {"role": role}

@@ -83,7 +83,7 @@ RECORDS: dict[str, tuple[str, str]] = {
     "Block": ("tuning.parameters", "Block"),
     "Certificate": ("certificates.result", "Certificate"),
     "Change": ("tuning.report", "Change"),
-    "ChainLevelState": ("proofs.chains", "ChainLevelState"),
+    "ChainLevelState": ("proofs.chains", "ChainLevelSetState"),
     "Comparison": ("studies.comparison", "Comparison"),
     "Counterexample": ("certificates._counterexample", "Counterexample"),
     "EffortSearch": ("studies.equal_effort", "EffortSearch"),
@@ -102,10 +102,11 @@ RECORDS: dict[str, tuple[str, str]] = {
     "Interval": ("studies.distributions", "Interval"),
     "Level": ("studies.rare_events.limit_state", "Level"),
     "LevelLabel": ("certificates.result", "LevelLabel"),
-    "LevelState": ("proofs.problem", "LevelState"),
+    "LevelState": ("proofs.problem", "LevelSetState"),
     "LevelTraces": ("certificates.result", "LevelTraces"),
     "LikelyFailure": ("studies.rare_events.result", "LikelyFailure"),
     "Line": ("certificates.lines", "Line"),
+    "LineRole": ("certificates.lines", "Role"),
     "Measurement": ("control.sensors._base", "Measurement"),
     "Metrics": ("simulation.results", "Metrics"),
     "Number": ("identification.result", "Number"),
@@ -734,6 +735,7 @@ def _restored_failure(stored: dict[str, Any]) -> dict[str, Any]:
 
 
 CONVERTERS: dict[str, Converter] = {
+    "Line": Converter(_fields_of, earlier.fields_of_line),
     "LikelyFailure": Converter(_stored_failure, _restored_failure),
     "Rollout": Converter(_stored_rollout, _restored_rollout),
     "Study": Converter(_stored_study, _restored_study),

@@ -292,7 +292,7 @@ def _verdicts(axes: Axes, shown: Certificate) -> None:
     lines = [
         line
         for line in applicable
-        if line.counts
+        if line.enters_verdict
         and (line.name.startswith(tuple(names)) or (only_weighted and line.has_weights))
     ]
     growth = axes.get_figure().get_figwidth() / WIDTH  # type: ignore[union-attr]

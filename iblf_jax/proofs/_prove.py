@@ -34,8 +34,7 @@ from iblf_jax.proofs.chains import chain_problem
 from iblf_jax.proofs.periods import AperiodicError
 from iblf_jax.proofs.problem import LevelSetProblem
 from iblf_jax.proofs.result import GrowthPoint, Proof, Verdict, Violation, WorstBox
-from iblf_jax.proofs.search import SearchResult, search
-from iblf_jax.proofs.search import WorstBox as SearchedBox
+from iblf_jax.proofs.search import SearchedBox, SearchResult, search
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.distributions import Perturbation
@@ -141,27 +140,39 @@ def prove(
     Source: design of this package; branch and bound with interval arithmetic as in R. E. Moore,
       R. B. Kearfott, M. J. Cloud, Introduction to Interval Analysis, 2009.
     """
-    options = _Options.of(weight, max_boxes, threads, progress, checkpoint, runs, seed)
+    if weight is not None:
+        checks.positive_number("weight", weight, "rad/(N m)")
+    max_boxes = checks.positive_integer("max_boxes", max_boxes, most=10**15)
+    if threads is not None:
+        threads = checks.positive_integer("threads", threads, most=1024)
+    progress = checks.boolean("progress", progress, optional=True)
+    if checkpoint is not None:
+        checkpoint = checks.file_to_write("checkpoint", checkpoint)
+    runs = checks.positive_integer("runs", runs, least=0, most=PARENTS)
+    seed = checks.seed(seed)
+    options = _Options(
+        max_boxes=max_boxes, threads=threads, progress=progress, checkpoint=checkpoint, seed=seed
+    )
     level, parameters = _chosen(level, parameters)
     problem = problem_of(scenario, parameters, duration, disturbance_rate)
     start = time.monotonic()
     with jax.enable_x64(True):
         scenario = canonical(scenario)
-        sampled = sample_weights(problem, level, weights_of(scenario, weight), options.seed)
-        best = min(sampled, key=lambda found: found.largest)
+        sampled = sample_weights(problem, level, weights_of(scenario, weight), seed)
+        best = min(sampled, key=lambda each: each.largest)
         result, worst, growth_points = None, None, []
         if best.largest <= 0.0:
-            best, result = _searched(problem, level, sampled, best, options)
+            best, result = _search_best_weight(problem, level, sampled, best, options)
             worst = result.worst
         else:
             # For each weight, V_w' > 0 at a point of the set.
-            for found in sampled:
-                constants = problem.constants(found.weight, level)
-                state = problem.state_of(found.points[0], constants)
-                growth_points.append(GrowthPoint(found.weight, found.largest, state))
+            for each in sampled:
+                constants = problem.constants(each.weight, level)
+                state = problem.state_of(each.points[0], constants)
+                growth_points.append(GrowthPoint(each.weight, each.largest, state))
         violation, verdict = None, Verdict.PROVED
         if result is None or not result.proved:
-            violation = _refuted(problem, level, best, options.runs)
+            violation = _refuted(problem, level, best, runs)
             verdict = Verdict.NOT_PROVED if result is None else Verdict.UNDECIDED
         if violation is not None:
             verdict = Verdict.REFUTED
@@ -177,7 +188,7 @@ def prove(
             boxes=0 if result is None else result.boxes,
             done=0.0 if result is None else result.done,
             seconds=time.monotonic() - start,
-            rates={found.weight: found.largest for found in sampled},
+            rates={each.weight: each.largest for each in sampled},
             growth_points=tuple(growth_points),
             worst_box=None if worst is None else _worst_box(problem, level, best.weight, worst),
             violation=violation,
@@ -209,37 +220,13 @@ def _chosen(
 
 
 class _Options(NamedTuple):
-    """The options of a search, checked."""
+    """The options of the searches at all weights."""
 
     max_boxes: int
     threads: int | None
     progress: bool | None
     checkpoint: str | PathLike | None
-    runs: int
     seed: int
-
-    @classmethod
-    def of(
-        cls,
-        weight: float | None,
-        max_boxes: int,
-        threads: int | None,
-        progress: bool | None,
-        checkpoint: str | PathLike | None,
-        runs: int,
-        seed: int,
-    ) -> _Options:
-        """Raises ValueError for an option that is not admissible."""
-        if weight is not None:
-            checks.positive_number("weight", weight, "rad/(N m)")
-        max_boxes = checks.positive_integer("max_boxes", max_boxes, most=10**15)
-        if threads is not None:
-            threads = checks.positive_integer("threads", threads, most=1024)
-        progress = checks.boolean("progress", progress, optional=True)
-        if checkpoint is not None:
-            checkpoint = checks.file_to_write("checkpoint", checkpoint)
-        runs = checks.positive_integer("runs", runs, least=0, most=PARENTS)
-        return cls(max_boxes, threads, progress, checkpoint, runs, checks.seed(seed))
 
 
 def problem_of(
@@ -295,12 +282,12 @@ def sample_weights(
     level set.
     """
     points = problem.sample(seed, POINTS)
-    found = []
+    of_weights = []
     for weight in weights:
         sampled = _largest_rates(problem, problem.constants(weight, level), weight, points, seed)
         points = np.concatenate([sampled.points, points[: POINTS - PARENTS]])
-        found.append(sampled)
-    return found
+        of_weights.append(sampled)
+    return of_weights
 
 
 def _largest_rates(
@@ -339,7 +326,7 @@ def _best(points: np.ndarray, rates: np.ndarray) -> tuple[np.ndarray, np.ndarray
 # --- branch and bound ----------------------------------------------------------------------------
 
 
-def _searched(
+def _search_best_weight(
     problem: LevelSetProblem,
     level: float,
     sampled: Sequence[_Sampled],
@@ -351,26 +338,27 @@ def _searched(
     if len(sampled) > 1:
         neighbours = [factor * best.weight for factor in REFINEMENTS]
         more = sample_weights(problem, level, neighbours, options.seed)
-        candidates += [found for found in more if found.largest < 0.0]
+        candidates += [each for each in more if each.largest < 0.0]
     trials = min(TRIAL_BOXES, options.max_boxes)
-    found = []
+    results = []
     for candidate in candidates:
-        result = _search(problem, level, candidate.weight, trials, options, checkpoint=None)
+        result = _search_at(candidate.weight, problem, level, trials, options, checkpoint=None)
         if result.proved:
             return candidate, result
-        found.append((result.done, candidate, result))
-    _, candidate, result = max(found, key=lambda each: each[0])
+        results.append((candidate, result))
+    candidate, result = max(results, key=lambda pair: pair[1].done)
     if trials == options.max_boxes:
         return candidate, result
-    return candidate, _search(
-        problem, level, candidate.weight, options.max_boxes, options, options.checkpoint
+    result = _search_at(
+        candidate.weight, problem, level, options.max_boxes, options, options.checkpoint
     )
+    return candidate, result
 
 
-def _search(
+def _search_at(
+    weight: float,
     problem: LevelSetProblem,
     level: float,
-    weight: float,
     max_boxes: int,
     options: _Options,
     checkpoint: str | PathLike | None,
@@ -393,25 +381,23 @@ def _search(
         raise checks.fail("prove: scenario", checks.Words(str(error)), expected) from error
 
 
-def _worst_box(
-    problem: LevelSetProblem, level: float, weight: float, found: SearchedBox
-) -> WorstBox:
+def _worst_box(problem: LevelSetProblem, level: float, weight: float, box: SearchedBox) -> WorstBox:
     """The worst box with the names of its coordinates, and its bounds with narrower intervals."""
     intervals = {
         name: (float(low), float(high))
-        for name, low, high in zip(problem.names, found.lower, found.upper, strict=True)
+        for name, low, high in zip(problem.names, box.lower, box.upper, strict=True)
     }
     wide = [problem.names.index(name) for name in problem.uncertain.names]
-    lower, upper = (np.tile(corner, (len(wide), 1)) for corner in (found.lower, found.upper))
+    lower, upper = (np.tile(corner, (len(wide), 1)) for corner in (box.lower, box.upper))
     for row, k in enumerate(wide):
-        lower[row, k] = upper[row, k] = 0.5 * (found.lower[k] + found.upper[k])
+        lower[row, k] = upper[row, k] = 0.5 * (box.lower[k] + box.upper[k])
     narrowed = {}
     if wide:
         constants = problem.constants(weight, level)
         _, bounds = enclose(problem.bound, lower, upper, constants)
         least = bounds[0].min(axis=1)
         narrowed = {problem.names[k]: float(x) for k, x in zip(wide, least, strict=True)}
-    return WorstBox(intervals, float(found.bound), float(found.value), narrowed)
+    return WorstBox(intervals, float(box.bound), float(box.value), narrowed)
 
 
 # --- runs ----------------------------------------------------------------------------------------
@@ -435,16 +421,25 @@ def _refuted(
         except AperiodicError as error:
             notices.warn(f"No run tried to refute the bounds: {error}.")
             return None
-        for dt in TIME_STEPS:
-            run = _run(scenario, duration, dt)
-            if not int(run.status) & Status.INACCURATE:
-                break
+        run, dt = _accurate_run(scenario, duration)
         if int(run.status) & UNRELIABLE or not int(run.status) & Status.BOUND_VIOLATED:
             continue
         margin = float(np.min(np.asarray(run.metrics["margin"])))
         state = problem.state_of(point, constants)
         return Violation(scenario, state, int(run.steps or 0) * dt, dt, margin)
     return None
+
+
+def _accurate_run(scenario: Scenario, duration: float) -> tuple[Rollout, float]:
+    """The run with the largest time step with which it is accurate, or with the smallest one, and
+    this step [s].
+    """
+    *larger, smallest = TIME_STEPS
+    for dt in larger:
+        run = _run(scenario, duration, dt)
+        if not int(run.status) & Status.INACCURATE:
+            return run, dt
+    return _run(scenario, duration, smallest), smallest
 
 
 def _run(scenario: Scenario, duration: float, dt: float) -> Rollout:

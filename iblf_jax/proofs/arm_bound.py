@@ -11,7 +11,7 @@ so that every x lies on the level set.  sign_i is the side of the tube on which 
 
 **f_tilde.**  With f' = f0 + H f_tilde of (P.3), b = |f_tilde| and the best direction of f_tilde,
 
-    V_w' <= -decay - e2^T K2 e2 + b |e2 + w_f f0| - w_f lambda b^2,                           (B.1)
+    V_w' <= -D - e2^T K2 e2 + b |e2 + w_f f0| - w_f lambda b^2,                               (B.1)
     lambda = least eigenvalue of diag(kf) - (H + H^T)/2
 
 **Parameters.**  For fixed derivatives in (U.1), f0 and H are affine in the coordinates z,
@@ -38,8 +38,7 @@ from iblf_jax.proofs import uncertainty
 from iblf_jax.proofs.arm_motion import (
     ArmParts,
     Errors,
-    along,
-    decay,
+    dissipation,
     error_at,
     external_torque,
     inverse_mass,
@@ -48,7 +47,7 @@ from iblf_jax.proofs.arm_motion import (
     rate_along_motion,
     required_torque,
 )
-from iblf_jax.proofs.forms import centre
+from iblf_jax.proofs.forms import along, centre
 from iblf_jax.proofs.matrices import (
     least_eigenvalue,
     norm,
@@ -64,9 +63,9 @@ class Constants(NamedTuple):
     """The numbers of a problem; a pytree."""
 
     parts: ArmParts
-    numbers: Numbers
+    coordinates: Numbers
     weight: jax.Array
-    """w_f [1/(N m)^2 N m rad]."""
+    """w_f [rad/(N m)]."""
     level: jax.Array
     """c [N m rad]."""
 
@@ -91,7 +90,7 @@ def coordinates(x: jax.Array, n: int, m: int) -> Coordinates:
     return Coordinates(x[-1] + x[0], theta, x[1 + n], phi, z, sign)
 
 
-class LevelPoint(NamedTuple):
+class ArmErrors(NamedTuple):
     """What coordinates mean physically."""
 
     errors: Errors
@@ -101,7 +100,7 @@ class LevelPoint(NamedTuple):
     """|f_tilde|, () [N m]."""
 
 
-def level_point(constants: Constants, at: Coordinates) -> LevelPoint:
+def arm_errors(constants: Constants, at: Coordinates) -> ArmErrors:
     """Errors and |f_tilde| at coordinates."""
     parts, level = constants.parts, constants.level
     *sides, rest = sphere(at.theta)
@@ -109,12 +108,12 @@ def level_point(constants: Constants, at: Coordinates) -> LevelPoint:
     xi = with_sign(error_at(parts, at.t, energy, at.sign), at.sign)
     radius = jnp.sqrt(2.0 * level) * rest
     direction = jnp.stack(sphere(at.phi))
-    scaled = radius * jnp.cos(at.psi) * direction
-    errors = Errors(at.t, xi, scaled)
+    scaled_e2 = radius * jnp.cos(at.psi) * direction
+    errors = Errors(at.t, xi, scaled_e2)
     U = upper_factor(parts.model.mass_matrix(position(parts, errors)))
-    errors = errors._replace(e2=solve_transposed(U, scaled))
+    errors = errors._replace(e2=solve_transposed(U, scaled_e2))
     b = radius * jnp.sin(at.psi) / jnp.sqrt(constants.weight)
-    return LevelPoint(errors, energy, b)
+    return ArmErrors(errors, energy, b)
 
 
 class Affine(NamedTuple):
@@ -173,30 +172,29 @@ class MismatchRate(NamedTuple):
 
 def mismatch(constants: Constants, places: Places, at: Errors, z: jax.Array) -> Mismatch:
     """The rate f' over a box of parameters; see the head of this module."""
-    numbers, n = constants.numbers, at.xi.shape[-1]
-    found = torque_columns(constants, places, at, z)
-    columns, shares = found.columns, found.shares
+    numbers, n = constants.coordinates, at.xi.shape[-1]
+    external, columns, mass_ratios = torque_columns(constants, places, at, z)
     # The first ones belong to the difference of the scenario's plant from its model.
     fixed = len(columns) - places.coordinates
 
     def solution_at(z: jax.Array) -> tuple[jax.Array, Affine]:
         """I + dM M0^-1 and f' at coordinates z."""
         size = jnp.concatenate([jnp.ones(fixed), z - numbers.reference])
-        total, right = jnp.eye(n), found.external
-        for k, (column, share) in enumerate(zip(columns, shares, strict=True)):
-            total = total + size[k] * share
+        total, right = jnp.eye(n), external
+        for k, (column, ratio) in enumerate(zip(columns, mass_ratios, strict=True)):
+            total = total + size[k] * ratio
             right = add(right, scaled(-size[k], column))
         return total, on_columns(lambda column: solve_general(total, column), right)
 
     total, constant = solution_at(centre(z))
     _, everywhere = solution_at(z)
 
-    def affine_column(column: Affine, share: jax.Array) -> Affine:
-        product = on_columns(lambda column: matvec(share, column), everywhere)
+    def affine_column(column: Affine, mass_ratio: jax.Array) -> Affine:
+        product = on_columns(lambda column: matvec(mass_ratio, column), everywhere)
         force = scaled(jnp.asarray(-1.0), add(column, product))
         return on_columns(lambda column: solve_general(total, column), force)
 
-    pairs = zip(columns[fixed:], shares[fixed:], strict=True)
+    pairs = zip(columns[fixed:], mass_ratios[fixed:], strict=True)
     return Mismatch(constant, [affine_column(*pair) for pair in pairs])
 
 
@@ -207,19 +205,19 @@ class TorqueColumns(NamedTuple):
     """d0'."""
     columns: list[Affine]
     """W_k with j0, of the fixed difference first, where there is one."""
-    shares: list[jax.Array]
+    mass_ratios: list[jax.Array]
     """M_k M0^-1 of each."""
 
 
 def torque_columns(constants: Constants, places: Places, at: Errors, z: jax.Array) -> TorqueColumns:
     """The columns of f' over a box of parameters."""
-    parts, numbers = constants.parts, constants.numbers
+    parts, numbers = constants.parts, constants.coordinates
     n = at.xi.shape[-1]
     nominal = (parts.plant, parts.disturbance)
-    known = (parts.model, parts.disturbance)
-    inside = uncertainty.between(places, numbers, nominal, known, z)
-    fixed = uncertainty.fixed_difference(places, numbers, nominal, known)
-    directions = uncertainty.directions(places, numbers, known)
+    of_model = (parts.model, parts.disturbance)
+    inside = uncertainty.between(places, numbers, nominal, of_model, z)
+    fixed = uncertainty.fixed_difference(places, numbers, nominal, of_model)
+    directions = uncertainty.directions(places, numbers, of_model)
     q, M0_inverse = position(parts, at), inverse_mass(parts, at)
     if fixed is not None:
         directions = [fixed, *directions]
@@ -235,7 +233,7 @@ def torque_columns(constants: Constants, places: Places, at: Errors, z: jax.Arra
             return rate_along_motion(required_torque, with_plant(p), moved.now, moved.alpha_jerk)
 
         external = rate_along_motion(
-            external_torque, with_plant(known), moved.now, moved.alpha_jerk
+            external_torque, with_plant(of_model), moved.now, moved.alpha_jerk
         )
         columns = [along(torque_rate, (inside,), (direction,)) for direction in directions]
         return MismatchRate(external, columns, moved.slow, moved.force)
@@ -243,32 +241,30 @@ def torque_columns(constants: Constants, places: Places, at: Errors, z: jax.Arra
     def mass_along(direction: Any) -> jax.Array:
         return along(lambda p: p[0].mass_matrix(q), (inside,), (direction,))
 
-    found = in_f_tilde(rates, n)
+    affine = in_f_tilde(rates, n)
     # M_k M0^-1, of which the inverse is a narrow interval where q is one
-    shares = [matmul(mass_along(direction), M0_inverse) for direction in directions]
+    mass_ratios = [matmul(mass_along(direction), M0_inverse) for direction in directions]
 
-    def torque_column(column: Affine, share: jax.Array) -> Affine:
-        fast = matmul(share * parts.law.K2, M0_inverse)
-        with_slow = add(column, on_columns(lambda slow: matvec(share, slow), found.slow))
-        return add(with_slow, on_columns(lambda force: -matvec(fast, force), found.force))
+    def torque_column(column: Affine, mass_ratio: jax.Array) -> Affine:
+        fast = matmul(mass_ratio * parts.law.K2, M0_inverse)
+        with_slow = add(column, on_columns(lambda slow: matvec(mass_ratio, slow), affine.slow))
+        return add(with_slow, on_columns(lambda force: -matvec(fast, force), affine.force))
 
-    columns = [
-        torque_column(column, share) for column, share in zip(found.columns, shares, strict=True)
-    ]
+    columns = list(map(torque_column, affine.columns, mass_ratios))
     # The rate of a further disturbance is a coordinate without entries.
     columns += [Affine(-unit, jnp.zeros((n, n))) for unit in jnp.eye(n)[: places.rates]]
-    shares += [jnp.zeros((n, n))] * places.rates
-    return TorqueColumns(found.external, columns, shares)
+    mass_ratios += [jnp.zeros((n, n))] * places.rates
+    return TorqueColumns(affine.external, columns, mass_ratios)
 
 
-def corners(found: Mismatch, z: jax.Array) -> list[Affine]:
+def corners(f_rate: Mismatch, z: jax.Array) -> list[Affine]:
     """The rate f' at each corner of the box of parameters."""
     size = z - centre(z)
-    ends = [(lower(size[k]), upper(size[k])) for k in range(len(found.columns))]
+    ends = [(lower(size[k]), upper(size[k])) for k in range(len(f_rate.columns))]
     vertices = []
     for choice in itertools.product(*ends):
-        vertex = found.constant
-        for factor, column in zip(choice, found.columns, strict=True):
+        vertex = f_rate.constant
+        for factor, column in zip(choice, f_rate.columns, strict=True):
             vertex = add(vertex, scaled(factor, column))
         vertices.append(vertex)
     return vertices
@@ -292,7 +288,7 @@ class Corner(NamedTuple):
 
 
 def corner_terms(
-    constants: Constants, places: Places, point: LevelPoint, z: jax.Array
+    constants: Constants, places: Places, point: ArmErrors, z: jax.Array
 ) -> list[Corner]:
     """The terms of (B.1) at each corner of the box of parameters."""
     parts, weight, b = constants.parts, constants.weight, point.b
@@ -313,10 +309,10 @@ def corner_terms(
     return terms
 
 
-def decay_bound(constants: Constants, point: LevelPoint) -> jax.Array:
-    """A lower bound of the decay of the barriers, ()."""
+def dissipation_bound(constants: Constants, point: ArmErrors) -> jax.Array:
+    """A lower bound of the dissipation of the barriers, ()."""
     parts = constants.parts
-    exact = decay(parts, point.errors)
+    exact = dissipation(parts, point.errors)
     claimed = parts.law.barrier.decay_rate(parts.law.k1) * point.energy  # type: ignore[operator]
     return jnp.sum(jnp.maximum(exact, claimed))
 
@@ -326,9 +322,9 @@ def arm_bound(places: Places, n: int, x: jax.Array, constants: Constants) -> jax
     be active.
     """
     at = coordinates(x, n, places.coordinates)
-    point = level_point(constants, at)
+    point = arm_errors(constants, at)
     e2, b = point.errors.e2, point.b
-    losses = decay_bound(constants, point)
+    losses = dissipation_bound(constants, point)
     terms = corner_terms(constants, places, point, at.z)
     coupling = jnp.max(jnp.stack([jnp.minimum(term.coupling, term.square) for term in terms]))
     direct = coupling - losses - inner(e2, constants.parts.law.K2 * e2)
@@ -339,7 +335,7 @@ def arm_bound(places: Places, n: int, x: jax.Array, constants: Constants) -> jax
 
 
 def _squares(constants: Constants, a: jax.Array, b: jax.Array, terms: list[Corner]) -> jax.Array:
-    """A bound of (B.1) without its decay from completed squares, ().
+    """A bound of (B.1) without D from completed squares, ().
 
     -K a^2 + a b + w_f |f0| b - w_f lambda b^2
         = -K (a - b/(2K))^2 - mu (b - w_f |f0|/(2 mu))^2 + (w_f |f0|)^2/(4 mu),

@@ -8,9 +8,9 @@ The law is the corrected variant of `controllers.Backstepping`, the observer is 
 With (2.1) the motion does not depend on the parameters p of the plant:
 
     M0 e2' = -C0 e2 - K2 e2 - w s + f_tilde,   q" = alpha' + e2'                              (P.1)
-    V_w' = -decay - e2^T K2 e2 + e2 . f_tilde - w_f f_tilde^T kf f_tilde + w_f f_tilde . f'   (P.2)
+    V_w' = -D - e2^T K2 e2 + e2 . f_tilde - w_f f_tilde^T kf f_tilde + w_f f_tilde . f'       (P.2)
 
-decay is -(w V1)' at e2 = 0.  The parameters enter through f alone.  With
+D is the dissipation of the barriers, -(w V1)' at e2 = 0.  The parameters enter through f.  With
 
     Z(p; t, q, v, a) = M a + C v + G - friction - disturbance      of the plant,
     f = M0 q" + C0 q' + G0 - Z(p) = d0 - (Z(p) - Z(p0)),
@@ -35,15 +35,14 @@ Over a box, the width k of the tube then occurs once in each of them.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from iblf_jax.control import controllers
-from iblf_jax.control.barriers import Barrier
 from iblf_jax.core.linalg import inner, matvec
-from iblf_jax.proofs.forms import enclosed
+from iblf_jax.proofs.forms import along, degree, enclosed
 from iblf_jax.proofs.matrices import inverse
 from iblf_jax.world.bounds import Bounds, Tube
 from iblf_jax.world.disturbances import Disturbance
@@ -57,7 +56,7 @@ class ArmParts(NamedTuple):
 
     model: Robot
     plant: Robot
-    """With the parameters of `Uncertainty` at any value."""
+    """The model, with the uncertain parameters at any value."""
     disturbance: Disturbance
     law: controllers.Backstepping
     """Its barrier has no guard."""
@@ -122,7 +121,7 @@ class Side(NamedTuple):
 
     k: jax.Array
     """Its width [rad]."""
-    growth: jax.Array
+    width_rate: jax.Array
     """k'/k [1/s]."""
     scaled: Tube
     """The tube in the frame of the reference, divided by k."""
@@ -132,18 +131,24 @@ def side_of(parts: ArmParts, t: jax.Array, xi: jax.Array) -> Side:
     """The tube on the sides on which errors with the sign of `xi` are."""
     now, rate = jax.jvp(lambda t: course(parts, t), (t,), (jnp.ones_like(t),))
     above = xi > 0
-    k, dk = jnp.where(above, now.k_u, now.k_l), jnp.where(above, rate.k_u, rate.k_l)
-    other, dother = jnp.where(above, now.k_l, now.k_u), jnp.where(above, rate.k_l, rate.k_u)
+    k = jnp.where(above, now.k_u, now.k_l)
+    dk = jnp.where(above, rate.k_u, rate.k_l)
+    other_k = jnp.where(above, now.k_l, now.k_u)
+    other_dk = jnp.where(above, rate.k_l, rate.k_u)
     one, zero = jnp.ones_like(k), jnp.zeros_like(k)
-    ratio, growth, other_growth = other / k, dk / k, dother / k
-    k_l, k_u = jnp.where(above, ratio, one), jnp.where(above, one, ratio)
-    dk_l, dk_u = jnp.where(above, other_growth, growth), jnp.where(above, growth, other_growth)
-    return Side(k, growth, Tube(zero, zero, -k_l, k_u, -dk_l, dk_u))
-
-
-def degree(barrier: Barrier) -> int:
-    """d: V1 is homogeneous of this degree in lengths."""
-    return 2 if barrier.value_unit == "rad^2" else 0
+    # Widths and their rates of the scaled tube, on this side and on the other one.
+    width_rate = dk / k
+    other_width = other_k / k
+    other_rate = other_dk / k
+    scaled = Tube(
+        q_d=zero,
+        dq_d=zero,
+        lower=-jnp.where(above, other_width, one),
+        upper=jnp.where(above, one, other_width),
+        dlower=-jnp.where(above, other_rate, width_rate),
+        dupper=jnp.where(above, width_rate, other_rate),
+    )
+    return Side(k, width_rate, scaled)
 
 
 def scaled_alpha(parts: ArmParts, t: jax.Array, xi: jax.Array) -> jax.Array:
@@ -153,19 +158,19 @@ def scaled_alpha(parts: ArmParts, t: jax.Array, xi: jax.Array) -> jax.Array:
 
 
 def relative_alpha(parts: ArmParts, t: jax.Array, xi: jax.Array) -> jax.Array:
-    """Alpha - q_d', (n,) [rad/s]."""
+    """The difference alpha - q_d', (n,) [rad/s]."""
     return side_of(parts, t, xi).k * scaled_alpha(parts, t, xi)
 
 
 def slope(parts: ArmParts, t: jax.Array, xi: jax.Array) -> jax.Array:
-    """W s, (n,) [N m]."""
+    """The weighted slope w s, (n,) [N m]."""
     law, side = parts.law, side_of(parts, t, xi)
     scaled = law.weight * law.barrier.slope(side.scaled, xi)
     return scaled * side.k if degree(law.barrier) == 2 else scaled / side.k
 
 
-def energy(parts: ArmParts, t: jax.Array, xi: jax.Array) -> jax.Array:
-    """W V1, (n,) [N m rad]."""
+def weighted_barrier(parts: ArmParts, t: jax.Array, xi: jax.Array) -> jax.Array:
+    """The weighted barrier w V1, (n,) [N m rad]."""
     law, side = parts.law, side_of(parts, t, xi)
     return law.weight * law.barrier.value(side.scaled, xi) * side.k ** degree(law.barrier)
 
@@ -173,19 +178,14 @@ def energy(parts: ArmParts, t: jax.Array, xi: jax.Array) -> jax.Array:
 def error_at(parts: ArmParts, t: jax.Array, energy: jax.Array, sign: jax.Array) -> jax.Array:
     """The xi with the sign of `sign` at which w V1 = energy, (n,) [1]."""
     law, side = parts.law, side_of(parts, t, sign)
-    scaled = energy / (law.weight * side.k ** degree(law.barrier))
-    return law.barrier.error_at(scaled, side.scaled, sign > 0)  # type: ignore[return-value]
-
-
-def along(function: Callable, point: tuple, rates: tuple) -> Any:
-    """The derivative of a function along rates of its arguments."""
-    return jax.jvp(function, point, rates)[1]
+    value = energy / (law.weight * side.k ** degree(law.barrier))
+    return law.barrier.error_at(value, side.scaled, sign > 0)  # type: ignore[return-value]
 
 
 def xi_rate(parts: ArmParts, at: Errors) -> jax.Array:
-    """Xi' = A - xi k'/k + e2/k, (n,) [1/s]."""
+    """The rate xi' = A - xi k'/k + e2/k, (n,) [1/s]."""
     side = side_of(parts, at.t, at.xi)
-    return scaled_alpha(parts, at.t, at.xi) - side.growth * at.xi + at.e2 / side.k
+    return scaled_alpha(parts, at.t, at.xi) - side.width_rate * at.xi + at.e2 / side.k
 
 
 def velocity(parts: ArmParts, at: Errors) -> jax.Array:
@@ -275,9 +275,9 @@ def motion(parts: ArmParts, at: Errors, f_tilde: jax.Array) -> Motion:
 
 def jerk(parts: ArmParts, at: Errors, moved: Motion) -> jax.Array:
     """j0, (n,) [rad/s^3]."""
-    inverse = inverse_mass(parts, at)
-    rest = moved.slow - parts.law.K2 * matvec(inverse, moved.force)
-    return moved.alpha_jerk + matvec(inverse, rest)
+    M0_inverse = inverse_mass(parts, at)
+    rest = moved.slow - parts.law.K2 * matvec(M0_inverse, moved.force)
+    return moved.alpha_jerk + matvec(M0_inverse, rest)
 
 
 def required_torque(parts: ArmParts, now: Kinematics) -> jax.Array:
@@ -301,14 +301,14 @@ def rate_along_motion(
     return along(lambda now: torque(parts, now), (now,), (rates,))
 
 
-def decay(parts: ArmParts, at: Errors) -> jax.Array:
+def dissipation(parts: ArmParts, at: Errors) -> jax.Array:
     """-(w V1)' of each joint at e2 = 0, (n,) [N m rad/s]."""
     rates = (jnp.ones_like(at.t), xi_rate(parts, at._replace(e2=jnp.zeros_like(at.e2))))
-    return -along(lambda t, xi: energy(parts, t, xi), (at.t, at.xi), rates)
+    return -along(lambda t, xi: weighted_barrier(parts, t, xi), (at.t, at.xi), rates)
 
 
 def mismatch_torque(parts: ArmParts, now: Kinematics) -> jax.Array:
-    """F = M0 q" + C0 q' + G0 - Z, (n,) [N m]."""
+    """The uncertain torque f = M0 q" + C0 q' + G0 - Z, (n,) [N m]."""
     model = parts.model
     inertial = matvec(model.mass_matrix(now.q), now.a) + model.coriolis(now.q, now.v, now.v)
     return inertial + model.gravity(now.q) - required_torque(parts, now)
@@ -333,7 +333,7 @@ def mismatch_rate(
     return matvec(M0, matvec(inverse(M), rate))
 
 
-def level_rate(
+def lyapunov_rate(
     parts: ArmParts,
     weight: jax.Array,
     at: Errors,
@@ -345,4 +345,4 @@ def level_rate(
     """
     f_tilde_rate = mismatch_rate(parts, at, f_tilde, extra) - parts.kf * f_tilde
     velocity_part = inner(at.e2, f_tilde - parts.law.K2 * at.e2)
-    return velocity_part - jnp.sum(decay(parts, at)) + weight * inner(f_tilde, f_tilde_rate)
+    return velocity_part - jnp.sum(dissipation(parts, at)) + weight * inner(f_tilde, f_tilde_rate)

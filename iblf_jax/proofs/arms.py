@@ -29,7 +29,7 @@ from iblf_jax.proofs.matrices import solve_transposed, upper_factor
 from iblf_jax.proofs.parameters import Uncertain, uncertain_coordinates
 from iblf_jax.proofs.problem import (
     LevelSetProblem,
-    LevelState,
+    LevelSetState,
     OfStructure,
     split_point,
 )
@@ -42,7 +42,7 @@ from iblf_jax.proofs.support import (
     check_exponential,
     check_same_structure,
     check_unchanging,
-    claims_of,
+    claim_sentences,
     examined,
     infinite_unless_defined,
     operations_of_plant,
@@ -69,7 +69,7 @@ ASSUMPTIONS = (
     " noise.",
 )
 VECTORS = ("q", "dq", "f_tilde", "f_hat", "eta")
-"""Vectors of a point in physical numbers, as in `LevelState`."""
+"""Vectors of a point in physical numbers, as in `LevelSetState`."""
 
 
 class ArmBound(OfStructure):
@@ -88,12 +88,10 @@ class ArmRate(OfStructure):
     def __call__(self, point: jax.Array, constants: list[jax.Array]) -> jax.Array:
         """V_w', () [N m rad/s]; infinite where the torque is not defined, such as log(-1)."""
         numbers: Constants = jax.tree.unflatten(self.structure, constants)
-        found = point_of(self.places, jnp.asarray(point), numbers)
-        rate = arm_motion.level_rate(
-            found.parts, numbers.weight, found.errors, found.f_tilde, found.rate
-        )
-        now = arm_motion.motion(found.parts, found.errors, found.f_tilde).now
-        return infinite_unless_defined(rate, arm_motion.required_torque(found.parts, now))
+        at = point_of(self.places, jnp.asarray(point), numbers)
+        rate = arm_motion.lyapunov_rate(at.parts, numbers.weight, at.errors, at.f_tilde, at.rate)
+        now = arm_motion.motion(at.parts, at.errors, at.f_tilde).now
+        return infinite_unless_defined(rate, arm_motion.required_torque(at.parts, now))
 
 
 class ArmPoint(NamedTuple):
@@ -123,7 +121,7 @@ def point_of(places: Places, point: jax.Array, constants: Constants) -> ArmPoint
     f_tilde = size / jnp.sqrt(constants.weight) * s[2 * n :]
     m = len(places.entries)
     uncertain = (parts.plant, parts.disturbance)
-    plant, disturbance = uncertainty.leaves_at(places, constants.numbers, uncertain, z[:m])
+    plant, disturbance = uncertainty.leaves_at(places, constants.coordinates, uncertain, z[:m])
     rate = z[m:] if places.rates else 0.0
     true = parts._replace(plant=plant, disturbance=disturbance)
     return ArmPoint(true, errors._replace(e2=e2), f_tilde, rate)
@@ -135,13 +133,13 @@ class ArmProblem(LevelSetProblem):
 
     bound: ArmBound
     parts: ArmParts
-    units: ClassVar[tuple[str, str]] = ("1/(N m)^2 N m rad", "N m rad")
+    units: ClassVar[tuple[str, str]] = ("rad/(N m)", "N m rad")
     first_barrier: ClassVar[str] = "barrier"
 
     @property
     def angles(self) -> list[tuple[str, float, float]]:
         """The theta of V1, psi, and the phi of e2."""
-        n = self.signs
+        n = self.sign_count
         right, full = np.nextafter(0.5 * math.pi, 2.0), np.nextafter(2.0 * math.pi, 7.0)
         theta = [(f"theta[{i}]", 0.0, right) for i in range(n)]
         if n == 1:
@@ -151,32 +149,32 @@ class ArmProblem(LevelSetProblem):
         return [*theta, ("psi", 0.0, right), *phi]
 
     @property
-    def signs(self) -> int:
+    def sign_count(self) -> int:
         """Number of joints: each e1 has a sign."""
         return self.scenario.n
 
     @property
-    def terms(self) -> int:
+    def term_count(self) -> int:
         """3 n: those of V1, of e2 and of f_tilde."""
         return 3 * self.scenario.n
 
-    def numbers(self, weight: float, level: float) -> Constants:
+    def constants_of(self, weight: float, level: float) -> Constants:
         """The constants of a weight w_f and a level."""
-        numbers = jnp.asarray(weight), jnp.asarray(level)
-        return Constants(self.parts, self.uncertain.numbers, *numbers)
+        coordinates = self.uncertain.numbers
+        return Constants(self.parts, coordinates, jnp.asarray(weight), jnp.asarray(level))
 
-    def state_of(self, point: np.ndarray, constants: Sequence[np.ndarray]) -> LevelState:
+    def state_of(self, point: np.ndarray, constants: Sequence[np.ndarray]) -> LevelSetState:
         """A point in physical numbers."""
         with jax.enable_x64(True):
             numbers = _physical(self.bound, np.asarray(point, float), list(constants))
-            return LevelState(
+            return LevelSetState(
                 t=float(numbers["t"]),
                 **{name: np.asarray(numbers[name]) for name in VECTORS},
-                parameters=self.uncertain.values(np.asarray(point)[1 + self.terms :]),
+                parameters=self.uncertain.values(np.asarray(point)[1 + self.term_count :]),
                 rate=np.broadcast_to(np.asarray(numbers["rate"]), (self.bound.places.rates,)),
             )
 
-    def initial(self, state: LevelState) -> Initial:
+    def initial(self, state: LevelSetState) -> Initial:
         """Position and velocity of a state."""
         return Initial(q=state.q, dq=state.dq)
 
@@ -186,13 +184,13 @@ def _physical(
     bound: ArmBound, point: jax.Array, constants: list[jax.Array]
 ) -> dict[str, jax.Array]:
     """Time, position, velocity, f_tilde, f_hat, eta and the further rate at a point."""
-    found = point_of(bound.places, point, jax.tree.unflatten(bound.structure, constants))
-    parts, errors = found.parts, found.errors
-    now = arm_motion.motion(parts, errors, found.f_tilde).now
-    f_hat = arm_motion.mismatch_torque(parts, now) - found.f_tilde
+    at = point_of(bound.places, point, jax.tree.unflatten(bound.structure, constants))
+    parts, errors = at.parts, at.errors
+    now = arm_motion.motion(parts, errors, at.f_tilde).now
+    f_hat = arm_motion.mismatch_torque(parts, now) - at.f_tilde
     eta = f_hat - parts.kf * matvec(parts.model.mass_matrix(now.q), now.v)
-    vectors = dict(zip(VECTORS, (now.q, now.v, found.f_tilde, f_hat, eta), strict=True))
-    return {"t": errors.t, "rate": jnp.asarray(found.rate), **vectors}
+    vectors = dict(zip(VECTORS, (now.q, now.v, at.f_tilde, f_hat, eta), strict=True))
+    return {"t": errors.t, "rate": jnp.asarray(at.rate), **vectors}
 
 
 def arm_problem(
@@ -229,13 +227,13 @@ def arm_problem(
         length, is_period = time_interval(varying, duration, uncertain)
         digests = _digests(parts, uncertain)
         barriers = {"barrier": (parts.law.barrier, parts.law.o)}
-        found = examined(scenario, digests, agreement_of_robot, barriers, homogeneous=True)
+        examination = examined(scenario, digests, agreement_of_robot, barriers, homogeneous=True)
         _check_tube(scenario, length)
         _check_mass_matrices(parts, uncertain)
         zero = jnp.zeros(())
         structure = jax.tree.structure(Constants(parts, uncertain.numbers, zero, zero))
-    of_structure = (structure, uncertain.places, tuple(found.digests))
-    assumptions = (*ASSUMPTIONS, *claims_of([parts.law.barrier]), *found.assumed)
+    of_structure = (structure, uncertain.places, tuple(examination.digests))
+    assumptions = (*ASSUMPTIONS, *claim_sentences([parts.law.barrier]), *examination.assumed)
     functions = (ArmBound(*of_structure), ArmRate(*of_structure))
     return ArmProblem(scenario, uncertain, *functions, length, is_period, assumptions, parts)
 
@@ -348,8 +346,8 @@ def _digests(parts: ArmParts, uncertain: Uncertain) -> list[str]:
 
     vector = jnp.zeros(parts.kf.shape)
     inputs = [jnp.zeros(()), vector, vector, vector]
-    known = (parts.plant, parts.disturbance, parts.model)
-    return [operations_of_plant(torque, inputs, known, uncertain).digest]
+    leaves = (parts.plant, parts.disturbance, parts.model)
+    return [operations_of_plant(torque, inputs, leaves, uncertain).digest]
 
 
 def _check_tube(scenario: Scenario, duration: float) -> None:

@@ -9,11 +9,12 @@ so that every x lies on the level set.  sign_i is the side of the tube on which 
 
 **Errors.**  The centre of the tube of row i is affine in the error of the row,
 
-    alpha_{i-1} = alpha_0 + rho e_i,   rho = G0_{i-1}/G_{i-1} - 1,
+    alpha_{i-1} = alpha_0 + gamma e_i,   gamma = G0_{i-1}/G_{i-1} - 1,
 
-because d_hat_{i-1} contains x_{i-1}', and rho = 0 where it is no estimate.  The error at which
-V_i has its value is the fixed point of e = error_at(V_i; tube around alpha_0 + rho e).  On
-intervals the iteration begins with all errors inside the bounds, sign_i e_i in [0, k_0/(1 + rho)].
+because d_hat_{i-1} contains x_{i-1}', and gamma = 0 where it is no estimate.  The error at which
+V_i has its value is the fixed point of e = error_at(V_i; tube around alpha_0 + gamma e).  On
+intervals the iteration begins with all errors inside the bounds, so that sign_i e_i is in
+[0, k_0/(1 + gamma)].
 """
 
 from __future__ import annotations
@@ -26,7 +27,6 @@ import jax.numpy as jnp
 from iblf_jax.control.barriers import Quadratic
 from iblf_jax.kernels import hull, meet, with_sign
 from iblf_jax.proofs import chain_motion, uncertainty
-from iblf_jax.proofs.arm_motion import along
 from iblf_jax.proofs.chain_motion import (
     ChainParts,
     ChainState,
@@ -35,7 +35,7 @@ from iblf_jax.proofs.chain_motion import (
     Motion,
     OpenTube,
 )
-from iblf_jax.proofs.forms import centre, derivative
+from iblf_jax.proofs.forms import along, centre, derivative
 from iblf_jax.proofs.matrices import sphere
 from iblf_jax.proofs.uncertainty import Numbers, Places
 from iblf_jax.world import plants
@@ -43,7 +43,7 @@ from iblf_jax.world.bounds import Tube, bounds_at
 from iblf_jax.world.disturbances import Disturbance
 
 CONTRACTIONS = 3
-"""Iterations for the error on intervals; each reduces the width of what it began with by rho."""
+"""Iterations for the error on intervals; each reduces the width of what it began with by gamma."""
 ITERATIONS = 60
 """Iterations for the error at a point."""
 
@@ -54,7 +54,7 @@ class Constants(NamedTuple):
     parts: ChainParts
     plant: plants.Plant
     disturbance: Disturbance
-    numbers: Numbers
+    coordinates: Numbers
     weights: jax.Array
     """v_i of each level, (r, 1)."""
     level: jax.Array
@@ -75,13 +75,13 @@ class TruePlant:
         self.parts = constants.parts
         self.equations = LevelEquations(constants.parts)
         self.is_box = is_box
-        numbers = constants.numbers
+        numbers = constants.coordinates
         nominal = (constants.plant, constants.disturbance)
-        self.known = (constants.parts.model, constants.disturbance)
-        self.true = uncertainty.leaves_at(places, numbers, nominal, z)
+        self.of_model = (constants.parts.model, constants.disturbance)
+        self.leaves = uncertainty.leaves_at(places, numbers, nominal, z)
         if is_box:
-            self.inside = uncertainty.between(places, numbers, nominal, self.known, z)
-            self.difference = uncertainty.difference(places, numbers, nominal, self.known, z)
+            self.inside = uncertainty.between(places, numbers, nominal, self.of_model, z)
+            self.difference = uncertainty.difference(places, numbers, nominal, self.of_model, z)
 
     def above(
         self,
@@ -100,8 +100,8 @@ class TruePlant:
         model = self.parts.model
         if not self.is_box:
             desired = plants.level_input(model, i + 1, t, x, rate)
-            return desired - self.above(self.true, i, t, x, rate)
-        external = chain_motion.external_at(self.known[1], t, x, model, model)
+            return desired - self.above(self.leaves, i, t, x, rate)
+        external = chain_motion.external_at(self.of_model[1], t, x, model, model)
         # I0_i is affine in the rate; a difference of intervals would be too wide.
         of_level = along(
             lambda rate: plants.level_input(model, i + 1, t, x, rate),
@@ -116,17 +116,17 @@ class TruePlant:
     def ratio(self, i: int, t: jax.Array, x: jax.Array) -> jax.Array:
         """G_i/G0_i of row i."""
         one = jnp.ones(1)
-        true = plants.gain_times(self.true[0], i + 1, t, x, one)
+        true = plants.gain_times(self.leaves[0], i + 1, t, x, one)
         return true / plants.gain_times(self.parts.model, i + 1, t, x, one)
 
     def slope_of_centre(self, i: int, t: jax.Array, x: jax.Array) -> jax.Array:
-        """Rho of the centre of the row above row i, G0_i/G_i - 1."""
+        """The slope gamma of the centre of the row above row i, G0_i/G_i - 1."""
         zero, one = jnp.zeros(1), jnp.ones(1)
         slope = along(lambda rate: self.mismatch(i, t, x, rate), (zero,), (one,))
         return -plants.gain_times(self.parts.model, i + 1, t, x, slope)
 
 
-class LevelPoint(NamedTuple):
+class ChainMotionPoint(NamedTuple):
     """What coordinates mean physically."""
 
     now: Motion
@@ -138,14 +138,14 @@ class LevelPoint(NamedTuple):
     """The input, (1,)."""
 
 
-def level_point(
+def chain_motion_point(
     constants: Constants,
     observed: tuple[bool, ...],
     true: TruePlant,
     t: jax.Array,
-    shares: list[jax.Array],
+    unit_vector: list[jax.Array],
     signs: jax.Array,
-) -> LevelPoint:
+) -> ChainMotionPoint:
     """The motion at coordinates.
 
     Args:
@@ -153,16 +153,16 @@ def level_point(
       observed: of each level, whether it has an estimate.
       true: the plant.
       t: time.
-      shares: N numbers whose squares have the sum 1.
+      unit_vector: N numbers whose squares have the sum 1.
       signs: of the errors, (r,).
     """
     level, equations = constants.level, true.equations
     order = len(observed)
-    energy = tuple((level * share**2).reshape(1) for share in shares[:order])
-    places = [i for i in range(order) if observed[i]]
+    energy = tuple((level * x**2).reshape(1) for x in unit_vector[:order])
+    observed_rows = [i for i in range(order) if observed[i]]
     given: list[Any] = [None] * order
-    for i, share in zip(places, shares[order:], strict=True):
-        given[i] = (jnp.sqrt(2.0 * level / constants.weights[i, 0]) * share).reshape(1)
+    for i, x in zip(observed_rows, unit_vector[order:], strict=True):
+        given[i] = (jnp.sqrt(2.0 * level / constants.weights[i, 0]) * x).reshape(1)
     y = ChainState(t, (), ())
     d: list[jax.Array] = []
     d_tilde: list[jax.Array] = []
@@ -180,17 +180,17 @@ def level_point(
         e = _error(constants, observed, true, i, at_centre, slope, energy[i], signs[i])
         y = y._replace(e=(*y.e, e))
         if i > 0:
-            y, *found = estimated(y, i - 1)
-            d.append(found[0])
-            d_tilde.append(found[1])
-    y, *found = estimated(y, order - 1)
-    d.append(found[0])
-    d_tilde.append(found[1])
+            y, d_below, d_tilde_below = estimated(y, i - 1)
+            d.append(d_below)
+            d_tilde.append(d_tilde_below)
+    y, d_last, d_tilde_last = estimated(y, order - 1)
+    d.append(d_last)
+    d_tilde.append(d_tilde_last)
     now = chain_motion.motion(equations, observed, y, tuple(d), tuple(d_tilde))
     x = equations.state(order, y)
     desired = equations.desired_rate(order - 1, y) - y.d_hat[order - 1]
     u = plants.level_input(constants.parts.model, order, t, x, desired)
-    return LevelPoint(now, energy, x, u)
+    return ChainMotionPoint(now, energy, x, u)
 
 
 def _error(
@@ -209,7 +209,7 @@ def _error(
       constants, observed, true: of the problem.
       i: row.
       at_centre: the state for e_i = 0.
-      slope: rho.
+      slope: gamma.
       energy: w_i V_i.
       sign: side of the tube.
     """
@@ -264,8 +264,8 @@ def _first_error(parts: ChainParts, value: jax.Array, sign: jax.Array, t: jax.Ar
     return error(c) + derivative(error)(t) * (t - c)
 
 
-def level_rate(
-    constants: Constants, observed: tuple[bool, ...], true: TruePlant, point: LevelPoint
+def lyapunov_rate(
+    constants: Constants, observed: tuple[bool, ...], true: TruePlant, point: ChainMotionPoint
 ) -> jax.Array:
     """V' of (C.5), ()."""
     parts, now, equations = constants.parts, point.now, true.equations
@@ -273,7 +273,7 @@ def level_rate(
     total = jnp.zeros(1)
     for i in range(parts.order):
         slope = equations.barrier_slope(i, y)
-        total = total - equations.weighted_decay(i, y, point.energy[i])
+        total = total - equations.weighted_dissipation(i, y, point.energy[i])
         total = total - law.c[i] * law.weights[i] * slope**2
         push = slope * now.d_tilde[i]
         if i > 0:
@@ -293,11 +293,11 @@ def chain_bound(
     """Upper bounds of V' over the box x, (1,)."""
     order = constants.parts.order
     angles = order + sum(observed) - 1
-    shares = sphere([x[1 + k] for k in range(angles)])
+    unit_vector = sphere([x[1 + k] for k in range(angles)])
     start = 1 + angles
     z = x[start : start + places.coordinates]
     signs = x[start + places.coordinates : -1]
     true = TruePlant(constants, places, z, is_box=True)
-    point = level_point(constants, observed, true, x[-1] + x[0], shares, signs)
-    rate = level_rate(constants, observed, true, point)
+    point = chain_motion_point(constants, observed, true, x[-1] + x[0], unit_vector, signs)
+    rate = lyapunov_rate(constants, observed, true, point)
     return jnp.where(true.equations.inside_guards(point.now.y), rate, jnp.inf)

@@ -12,8 +12,8 @@ The last sum has the levels with kappa_i > 0; at the others d_hat_i = 0 and d_ti
 **Motion.**  With R_i, the rate that the law desires (`controllers._levels`), and
 I0_i(rate) = (rate - f0_i)/G0_i, the law is alpha_i = I0_i(R_i - d_hat_i), and
 
-    rho_i = R_i + G0_i e_{i+1}   is the rate of x_i in the model's flow,
-    x_i' = rho_i + d_tilde_i,   e_i' = x_i' - alpha_{i-1}'                                    (C.1)
+    nu_i = R_i + G0_i e_{i+1}   is the rate of x_i in the model's flow,
+    x_i' = nu_i + d_tilde_i,   e_i' = x_i' - alpha_{i-1}'                                    (C.1)
 
 alpha_{i-1}' differs from its rate beta_{i-1} in the model's flow, with d_hat held, by
 
@@ -32,7 +32,7 @@ so that with the barriers' decay
 which is affine in the parameters of most plants.  With m_i(p; rate) = I0_i(rate) - Z_i(p; rate),
 
     d_i = G0_i m_i(p; x_i')   where d_hat_i is an estimate,
-    d_i = G_i m_i(p; rho_i)   where d_hat_i = 0                                               (C.3)
+    d_i = G_i m_i(p; nu_i)   where d_hat_i = 0                                               (C.3)
 
 m_i is the external part at p0 less Z_i(p) - Z_i(p0), which is formed by (U.1).  x_i'' contains
 d_tilde_i' = d_i' - kappa_i d_tilde_i.  With q_i its value for d_i' = 0,
@@ -56,7 +56,7 @@ import jax.numpy as jnp
 from iblf_jax.control import controllers
 from iblf_jax.control.barriers import Quadratic
 from iblf_jax.core import taylor
-from iblf_jax.proofs.arm_motion import along
+from iblf_jax.proofs.forms import along
 from iblf_jax.world import plants
 from iblf_jax.world.bounds import NARROWEST, Bounds, Tube, bounds_at
 from iblf_jax.world.disturbances import Disturbance
@@ -124,7 +124,7 @@ def remembered(errors: int, estimates: int) -> Callable:
 
     def decorated(method: Callable) -> Callable:
         @functools.wraps(method)
-        def found(self: LevelEquations, i: int, y: ChainState) -> Any:
+        def once(self: LevelEquations, i: int, y: ChainState) -> Any:
             needed = ChainState(y.t, y.e[: i + errors], y.d_hat[: max(i + estimates, 0)])
             leaves = jax.tree.leaves(needed)
             key = (method.__name__, i, *map(id, leaves))
@@ -133,15 +133,15 @@ def remembered(errors: int, estimates: int) -> Callable:
                 self.kept[key] = (method(self, i, needed), leaves)
             return self.kept[key][0]
 
-        return found
+        return once
 
     return decorated
 
 
 def derivative(function: Callable, y: ChainState, rates: ChainState) -> Any:
     """The derivative of a function of the first rows of y along their rates."""
-    rows, known = len(rates.e), len(rates.d_hat)
-    first = ChainState(y.t, y.e[:rows], y.d_hat[:known])
+    rows, estimates = len(rates.e), len(rates.d_hat)
+    first = ChainState(y.t, y.e[:rows], y.d_hat[:estimates])
     return along(function, (first,), (rates,))
 
 
@@ -247,12 +247,12 @@ class LevelEquations:
 
     @remembered(errors=2, estimates=0)
     def model_error_rate(self, i: int, y: ChainState) -> jax.Array:
-        """e_i' of row i in the model's flow, rho_i - beta_{i-1}."""
+        """e_i' of row i in the model's flow, nu_i - beta_{i-1}."""
         pull = self.model_gain(i, y, error_above(y, i, self.parts.order))
         return self.relative_desired_rate(i, y) + pull
 
     def model_state_rate(self, i: int, y: ChainState) -> jax.Array:
-        """rho_i of row i."""
+        """nu_i of row i."""
         return self.centre_rate(i, y) + self.model_error_rate(i, y)
 
     def model_rates(self, i: int, y: ChainState) -> ChainState:
@@ -268,7 +268,7 @@ class LevelEquations:
         moved = OpenTube(zero, zero, -one, -one, zero, zero)
         return along(barrier.value, (tube, y.e[i]), (moved, -one))
 
-    def weighted_decay(self, i: int, y: ChainState, energy: jax.Array) -> jax.Array:
+    def weighted_dissipation(self, i: int, y: ChainState, energy: jax.Array) -> jax.Array:
         """w_i decay_i of row i, or a lower bound of it.
 
         Args:
@@ -281,9 +281,9 @@ class LevelEquations:
         claimed = barrier.decay_rate(law.k[i]) * energy  # type: ignore[operator]
         if barrier.exact_decay:
             return claimed
-        return jnp.maximum(self.exact_decay(i, y), claimed)
+        return jnp.maximum(self.exact_dissipation(i, y), claimed)
 
-    def exact_decay(self, i: int, y: ChainState) -> jax.Array:
+    def exact_dissipation(self, i: int, y: ChainState) -> jax.Array:
         """-w_i V_i' of row i for e_i' = a_i - beta_{i-1}."""
         law = self.parts.law
         tube = self.relative_tube(i, y)
@@ -310,7 +310,7 @@ class Motion(NamedTuple):
 def with_estimate(
     equations: LevelEquations,
     observed: tuple[bool, ...],
-    truth: Any,
+    true: Any,
     i: int,
     y: ChainState,
     d_tilde: jax.Array,
@@ -320,18 +320,18 @@ def with_estimate(
     Args:
       equations: of the law.
       observed: of each row, whether its kappa is positive.
-      truth: the plant's difference from the model, a `chain_bound.TruePlant`.
+      true: the plant's difference from the model, a `chain_bound.TruePlant`.
       i: row.
       y: with e_{i+1} of the row and d_hat of the rows below.
       d_tilde: of the row, where it is observed.
     """
-    rho = equations.model_state_rate(i, y)
+    nu = equations.model_state_rate(i, y)
     x = equations.state(i + 1, y)
     if observed[i]:
-        d = equations.model_gain(i, y, truth.mismatch(i, y.t, x, rho + d_tilde))
+        d = equations.model_gain(i, y, true.mismatch(i, y.t, x, nu + d_tilde))
         return y._replace(d_hat=(*y.d_hat, d - d_tilde)), d, d_tilde
-    m = truth.mismatch(i, y.t, x, rho)
-    d = truth.ratio(i, y.t, x) * equations.model_gain(i, y, m)
+    m = true.mismatch(i, y.t, x, nu)
+    d = true.ratio(i, y.t, x) * equations.model_gain(i, y, m)
     return y._replace(d_hat=(*y.d_hat, jnp.zeros(1))), d, d
 
 
@@ -362,22 +362,22 @@ def motion(
     return Motion(y, tuple(x_rates), d, d_tilde, tuple(error_rates), tuple(deltas), estimates)
 
 
-def mismatch_rate(equations: LevelEquations, truth: Any, i: int, now: Motion) -> jax.Array:
+def mismatch_rate(equations: LevelEquations, true: Any, i: int, now: Motion) -> jax.Array:
     """d_i' of (C.4) of an observed row."""
     y = now.y
     rates = ChainState(jnp.ones_like(y.t), now.error_rate[: i + 2], now.d_hat_rate[:i])
-    # G0_i e_{i+1} is in rho_i, so that one more row moves.
-    rho_rate = derivative(lambda y: equations.model_state_rate(i, y), y, rates)
-    q = rho_rate - equations.parts.kappa[i] * now.d_tilde[i]
+    # G0_i e_{i+1} is in nu_i, so that one more row moves.
+    nu_rate = derivative(lambda y: equations.model_state_rate(i, y), y, rates)
+    q = nu_rate - equations.parts.kappa[i] * now.d_tilde[i]
     x = equations.state(i + 1, y)
     x_rate = equations.column(now.x_rate[: i + 1])
 
-    def scaled(t: jax.Array, x: jax.Array, rate: jax.Array) -> jax.Array:
+    def rate_of_mismatch(t: jax.Array, x: jax.Array, rate: jax.Array) -> jax.Array:
         model = equations.parts.model
-        return plants.gain_times(model, i + 1, t, x, truth.mismatch(i, t, x, rate))
+        return plants.gain_times(model, i + 1, t, x, true.mismatch(i, t, x, rate))
 
     point = (y.t, x, now.x_rate[i])
-    return truth.ratio(i, y.t, x) * along(scaled, point, (jnp.ones_like(y.t), x_rate, q))
+    return true.ratio(i, y.t, x) * along(rate_of_mismatch, point, (jnp.ones_like(y.t), x_rate, q))
 
 
 class External(NamedTuple):

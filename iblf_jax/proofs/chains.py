@@ -22,15 +22,16 @@ from iblf_jax.core.families import is_default
 from iblf_jax.core.pytree import astype
 from iblf_jax.proofs import chain_motion
 from iblf_jax.proofs.chain_bound import (
+    ChainMotionPoint,
     Constants,
-    LevelPoint,
     TruePlant,
     chain_bound,
-    level_point,
-    level_rate,
+    chain_motion_point,
+    lyapunov_rate,
 )
 from iblf_jax.proofs.chain_motion import ChainParts
 from iblf_jax.proofs.examination import operations
+from iblf_jax.proofs.forms import along
 from iblf_jax.proofs.parameters import Uncertain, uncertain_coordinates
 from iblf_jax.proofs.problem import LevelSetProblem, OfStructure, split_point
 from iblf_jax.proofs.support import (
@@ -41,7 +42,7 @@ from iblf_jax.proofs.support import (
     check_exponential,
     check_same_structure,
     check_unchanging,
-    claims_of,
+    claim_sentences,
     examined,
     infinite_unless_defined,
     operations_of_plant,
@@ -89,25 +90,25 @@ class ChainRate(OfStructure):
     def __call__(self, point: jax.Array, constants: list[jax.Array]) -> jax.Array:
         """V', (); infinite where d is not defined."""
         numbers: Constants = jax.tree.unflatten(self.structure, constants)
-        true, found = point_of(self.places, self.observed, jnp.asarray(point), numbers)
-        rate = level_rate(numbers, self.observed, true, found)
-        return infinite_unless_defined(rate, jnp.stack(found.now.d))
+        true, at = point_of(self.places, self.observed, jnp.asarray(point), numbers)
+        rate = lyapunov_rate(numbers, self.observed, true, at)
+        return infinite_unless_defined(rate, jnp.stack(at.now.d))
 
 
 def point_of(
     places: Places, observed: tuple[bool, ...], point: jax.Array, constants: Constants
-) -> tuple[TruePlant, LevelPoint]:
+) -> tuple[TruePlant, ChainMotionPoint]:
     """The plant and the motion at a point (t, s, z); s/|s| = (sqrt(w_i V_i/c) with the signs of
     e_i, sqrt(v_i/(2c)) d_tilde_i).
     """
     order = len(observed)
-    t, shares, z = split_point(point, order + sum(observed))
+    t, s, z = split_point(point, order + sum(observed))
     true = TruePlant(constants, places, z, is_box=False)
-    signs = jnp.where(shares[:order] > 0, 1.0, -1.0)
-    return true, level_point(constants, observed, true, t, list(shares), signs)
+    signs = jnp.where(s[:order] > 0, 1.0, -1.0)
+    return true, chain_motion_point(constants, observed, true, t, list(s), signs)
 
 
-class ChainLevelState(NamedTuple):
+class ChainLevelSetState(NamedTuple):
     """A point of the level set in physical numbers."""
 
     t: float
@@ -142,30 +143,30 @@ class ChainProblem(LevelSetProblem):
         Terms of d_tilde have both signs, and those of the barriers the signs of a pattern.
         """
         right, half = np.nextafter(0.5 * math.pi, 2.0), np.nextafter(math.pi, 4.0)
-        count, estimates = self.terms - 1, self.terms - self.signs
+        count, estimates = self.term_count - 1, self.term_count - self.sign_count
         lower, upper = np.zeros(count), np.full(count, right)
         if estimates == 1:
             lower[-1] = -right
         if estimates > 1:
-            upper[self.signs :] = half
+            upper[self.sign_count :] = half
             lower[-1] = -half
         return [(f"theta[{i}]", lower[i], upper[i]) for i in range(count)]
 
     @property
-    def signs(self) -> int:
+    def sign_count(self) -> int:
         """Order of the plant: the error of each level has a sign."""
         return self.parts.order
 
     @property
-    def terms(self) -> int:
+    def term_count(self) -> int:
         """Number of levels and of estimates."""
-        return self.signs + sum(self.bound.observed)
+        return self.sign_count + sum(self.bound.observed)
 
-    def numbers(self, weight: float, level: float) -> Constants:
+    def constants_of(self, weight: float, level: float) -> Constants:
         """The constants of a weight, with v_i = weight w_i s_i'(0)/(k_i kappa_i), and a level."""
         law = self.parts.law
         # The weight of a level that is not observed is `weight`.
-        scales = np.ones((self.signs, 1))
+        scales = np.ones((self.sign_count, 1))
         for i in np.flatnonzero(self.bound.observed).tolist():
             slope = _slope_at_centre(self.parts, i)
             scales[i] = np.asarray(law.weights[i] * slope / (law.k[i] * self.parts.kappa[i]))
@@ -179,26 +180,26 @@ class ChainProblem(LevelSetProblem):
         )
 
     @jax.enable_x64(True)
-    def state_of(self, point: np.ndarray, constants: Sequence[np.ndarray]) -> ChainLevelState:
+    def state_of(self, point: np.ndarray, constants: Sequence[np.ndarray]) -> ChainLevelSetState:
         """A point in physical numbers."""
         numbers: Constants = jax.tree.unflatten(
             self.bound.structure, list(map(jnp.asarray, constants))
         )
         x = jnp.asarray(point, float)
-        _, found = point_of(self.uncertain.places, self.bound.observed, x, numbers)
-        y = found.now.y
+        _, at = point_of(self.uncertain.places, self.bound.observed, x, numbers)
+        y = at.now.y
         d_hat = np.stack(y.d_hat)
-        return ChainLevelState(
+        return ChainLevelSetState(
             t=float(y.t),
-            x=np.asarray(found.x),
-            u=np.asarray(found.u),
-            d_tilde=np.stack(found.now.d_tilde),
+            x=np.asarray(at.x),
+            u=np.asarray(at.u),
+            d_tilde=np.stack(at.now.d_tilde),
             d_hat=d_hat,
-            eta=d_hat - np.asarray(self.parts.kappa) * np.asarray(found.x),
-            parameters=self.uncertain.values(np.asarray(point)[1 + self.terms :]),
+            eta=d_hat - np.asarray(self.parts.kappa) * np.asarray(at.x),
+            parameters=self.uncertain.values(np.asarray(point)[1 + self.term_count :]),
         )
 
-    def initial(self, state: ChainLevelState) -> Initial:
+    def initial(self, state: ChainLevelSetState) -> Initial:
         """All levels of a state."""
         return Initial(x=state.x)
 
@@ -212,7 +213,7 @@ def _slope_at_centre(parts: ChainParts, i: int) -> jax.Array:
         lower, upper = (side.at(jnp.zeros(()), zero) for side in (bounds.lower, bounds.upper))
         half = 0.5 * (upper - lower) * one
         tube = tube._replace(lower=-half, upper=half)
-    return chain_motion.along(lambda e: parts.law.barriers[i].slope(tube, e), (zero,), (one,))
+    return along(lambda e: parts.law.barriers[i].slope(tube, e), (zero,), (one,))
 
 
 def chain_problem(
@@ -251,14 +252,14 @@ def chain_problem(
             f"barriers[{i}]": pair for i, pair in enumerate(zip(law.barriers, gains, strict=True))
         }
         digests = _digests(scenario, uncertain)
-        found = examined(scenario, digests, agreement_of_plant, barriers, homogeneous=False)
+        examination = examined(scenario, digests, agreement_of_plant, barriers, homogeneous=False)
         observed = tuple(bool(gain > 0.0) for gain in np.asarray(parts.kappa)[:, 0])
         true = (cast(plants.Plant, scenario.plant), scenario.disturbance)
         zero = jnp.zeros(())
         structure = jax.tree.structure(Constants(parts, *true, uncertain.numbers, zero, zero))
-    of_structure = (structure, uncertain.places, tuple(found.digests), observed)
-    claims = (*claims_of(law.barriers), *_without_claim(scenario))
-    assumptions = (*ASSUMPTIONS, *claims, *found.assumed)
+    of_structure = (structure, uncertain.places, tuple(examination.digests), observed)
+    claims = (*claim_sentences(law.barriers), *_without_claim(scenario))
+    assumptions = (*ASSUMPTIONS, *claims, *examination.assumed)
     functions = (ChainBound(*of_structure), ChainRate(*of_structure))
     return ChainProblem(scenario, uncertain, *functions, length, is_period, assumptions, parts)
 
@@ -367,7 +368,7 @@ def _digests(scenario: Scenario, uncertain: Uncertain) -> list[str]:
     The law differentiates what it reads of the levels below the last one.
     """
     order = plants.order_of(scenario.plant)
-    known = (scenario.plant, scenario.disturbance, scenario.model)
+    parts = (scenario.plant, scenario.disturbance, scenario.model)
     inputs = [jnp.zeros(()), jnp.zeros((order, 1))]
 
     def external(
@@ -379,7 +380,7 @@ def _digests(scenario: Scenario, uncertain: Uncertain) -> list[str]:
     ) -> chain_motion.External:
         return chain_motion.external_at(disturbance, t, x, plant, model)
 
-    digests = [operations_of_plant(external, inputs, known, uncertain).digest]
+    digests = [operations_of_plant(external, inputs, parts, uncertain).digest]
     for method in _functions_of(scenario.plant):
 
         def function(
@@ -388,7 +389,7 @@ def _digests(scenario: Scenario, uncertain: Uncertain) -> list[str]:
             return _functions_of(plant)[method](t, x)  # type: ignore[no-any-return]
 
         kinks = method.endswith(f"level {order}")
-        found = operations_of_plant(function, inputs, known, uncertain, kinks=kinks)
+        found = operations_of_plant(function, inputs, parts, uncertain, kinks=kinks)
         digests.append(found.digest)
     return digests
 

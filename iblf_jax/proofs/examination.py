@@ -131,10 +131,10 @@ def interpreted(
     """
     jaxpr, values = jaxprs.opened(function)
     constants = [constant(x) for x in values]
-    known = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*constants, *inputs], strict=True))
+    by_variable = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*constants, *inputs], strict=True))
 
     def read(atom: Any) -> Value:
-        return known[atom] if jaxprs.is_variable(atom) else constant(atom.val)
+        return by_variable[atom] if jaxprs.is_variable(atom) else constant(atom.val)
 
     live = jaxprs.needed(jaxpr)
     for eqn in jaxpr.eqns:
@@ -145,7 +145,7 @@ def interpreted(
             results = interpreted(jaxprs.called(eqn), operands, rule, constant)
         else:
             results = rule(eqn, operands)
-        known.update(zip(eqn.outvars, results, strict=True))
+        by_variable.update(zip(eqn.outvars, results, strict=True))
     return [read(v) for v in jaxpr.outvars]
 
 

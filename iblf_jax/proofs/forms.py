@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from iblf_jax.control.barriers import Barrier
 from iblf_jax.kernels import lower, meet, upper
 
 
@@ -24,6 +25,16 @@ def derivative(function: Callable) -> Callable:
         return jax.jvp(function, (t,), (jnp.ones_like(t),))[1]
 
     return rate
+
+
+def along(function: Callable, point: tuple, rates: tuple) -> Any:
+    """The derivative of a function along rates of its arguments."""
+    return jax.jvp(function, point, rates)[1]
+
+
+def degree(barrier: Barrier) -> int:
+    """d: V1 is homogeneous of this degree in lengths."""
+    return 2 if barrier.value_unit == "rad^2" else 0
 
 
 def enclosed(function: Callable, continuous_derivatives: float = math.inf) -> Callable:

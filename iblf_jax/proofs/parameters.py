@@ -43,12 +43,12 @@ class Uncertain(NamedTuple):
 
     def values(self, z: Sequence[float] | np.ndarray) -> dict[str, float]:
         """Path -> value of the entries at coordinates."""
-        found = {}
+        values = {}
         for k, names in enumerate(self.paths):
             for i, name in enumerate(names):
                 base, slope = float(self.numbers.base[k][i]), float(self.numbers.slope[k][i])
-                found[name] = base + slope * float(z[k])
-        return found
+                values[name] = base + slope * float(z[k])
+        return values
 
     def scales(self) -> dict[str, tuple[float, float]]:
         """Path of each uncertain entry -> its least and its greatest value."""
@@ -185,9 +185,9 @@ def _differing(
         at = numbers.base[k] + numbers.slope[k] * numbers.reference[k]
         at_reference |= dict(zip(together, np.asarray(at).tolist(), strict=True))
     actual = jax.tree.leaves((scenario.plant, scenario.disturbance))
-    known = jax.tree.leaves((scenario.model, scenario.disturbance))
+    model_leaves = jax.tree.leaves((scenario.model, scenario.disturbance))
     found = []
-    for leaf, pair in enumerate(zip(actual, known, strict=True)):
+    for leaf, pair in enumerate(zip(actual, model_leaves, strict=True)):
         values, expected = (np.ravel(np.asarray(x)).tolist() for x in pair)
         for entry, value in enumerate(values):
             place = (leaf, entry)

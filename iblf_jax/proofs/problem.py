@@ -29,7 +29,7 @@ PARTS_OF_TIME = 32
 have no positive width, so that no bisection would be better than another."""
 
 
-class LevelState(NamedTuple):
+class LevelSetState(NamedTuple):
     """A point of the level set in physical numbers."""
 
     t: float
@@ -72,8 +72,8 @@ class LevelSetProblem(abc.ABC):
 
     A box is one of coordinates x = (`lower`, `upper`) together with a row of `patterns`, which are
     the last coordinates and are not divided.  `bound(x, constants)` returns upper bounds of V_w'
-    over a box, of which one must be negative, (k,), and numbers of which one is positive if the box
-    holds no point of the level set, (0,) here.
+    over the box, (k,); the box is proved if any is negative.  It also returns an empty region
+    (`search.search`).
 
     A point is a vector (t, s, z) with s of any length: s/|s| divides the level among the terms
     of V_w, and z are the parameters.
@@ -104,16 +104,16 @@ class LevelSetProblem(abc.ABC):
 
     @property
     @abc.abstractmethod
-    def signs(self) -> int:
+    def sign_count(self) -> int:
         """Number of errors with a sign."""
 
     @property
     @abc.abstractmethod
-    def terms(self) -> int:
+    def term_count(self) -> int:
         """Number of terms of V_w, the length of s."""
 
     @abc.abstractmethod
-    def numbers(self, weight: float, level: float) -> Any:
+    def constants_of(self, weight: float, level: float) -> Any:
         """The constants of a weight and a level, as a pytree."""
 
     @abc.abstractmethod
@@ -128,7 +128,7 @@ class LevelSetProblem(abc.ABC):
     def names(self) -> tuple[str, ...]:
         """Of the coordinates and of the patterns."""
         angles = [name for name, _, _ in self.angles]
-        sides = [f"side[{i}]" for i in range(self.signs)]
+        sides = [f"side[{i}]" for i in range(self.sign_count)]
         return ("time since start", *angles, *self.uncertain.names, *sides, "start")
 
     @property
@@ -149,7 +149,7 @@ class LevelSetProblem(abc.ABC):
         """The signs of the errors and the start of each part of the time interval, (p, signs +
         1).
         """
-        sides = itertools.product((-1.0, 1.0), repeat=self.signs)
+        sides = itertools.product((-1.0, 1.0), repeat=self.sign_count)
         starts = np.arange(PARTS_OF_TIME) * (self.duration / PARTS_OF_TIME)
         return np.array([[*side, start] for side in sides for start in starts])
 
@@ -164,11 +164,13 @@ class LevelSetProblem(abc.ABC):
         weight = checks.positive_number("weight", weight, self.units[0])
         level = checks.positive_number("level", level, self.units[1])
         check_level(level, self.scenario, self.duration, self.first_barrier)
-        return [np.asarray(x, float) for x in jax.tree.leaves(self.numbers(weight, level))]
+        return [np.asarray(x, float) for x in jax.tree.leaves(self.constants_of(weight, level))]
 
     @jax.enable_x64(True)
     def rate(self, points: np.ndarray, constants: Sequence[np.ndarray]) -> np.ndarray:
-        """V_w' at points, (count, p) -> (count,) [N m rad/s], in plain floating-point numbers."""
+        """V_w' at points, (count, p) -> (count,), in the unit of V_w per second and in plain
+        floating-point numbers.
+        """
         return np.asarray(_rates(self.point_rate, np.asarray(points, float), list(constants)))
 
     def sample(self, seed: int, count: int) -> np.ndarray:
@@ -178,7 +180,7 @@ class LevelSetProblem(abc.ABC):
         low, high = self.uncertain.low, self.uncertain.high
         generator = np.random.default_rng(seed)
         t = generator.uniform(0.0, self.duration, (count, 1))
-        s = generator.normal(size=(count, self.terms))
+        s = generator.normal(size=(count, self.term_count))
         s /= np.linalg.norm(s, axis=1, keepdims=True)
         share = generator.uniform(size=(count, len(low)))
         share[::2] = np.round(share[::2])

@@ -13,12 +13,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.control.controllers._base import position_barrier
 from iblf_jax.core import checks, tables
 from iblf_jax.core.presentation import Content, Result, present
 from iblf_jax.core.pytree import astype
 from iblf_jax.engine.simulate import simulate
 from iblf_jax.proofs.problem import LevelSetProblem
-from iblf_jax.proofs.support import position_barrier
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.distributions import Perturbation
@@ -344,7 +344,7 @@ def _numbers(value: np.ndarray | float | Mapping[str, float]) -> str:
 def tube_of_level(scenario: Scenario, level: float, duration: float) -> GuaranteedTube:
     """Positions in {V_w <= level} over time."""
     scenario = canonical(astype(scenario, jnp.float64))
-    barrier, weight = position_barrier(scenario)
+    barrier, weight = position_barrier(scenario.controller)
     times = jnp.linspace(0.0, duration or AT_REST, INSTANTS)
 
     def ends(t):

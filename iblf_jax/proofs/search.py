@@ -53,7 +53,7 @@ RESULT_TYPES = {"divide_box": ctypes.c_int64, "search_box": ctypes.c_int}
 """Function of a kernel -> the C type of its result, which is negative if it has not run."""
 
 
-class WorstBox(NamedTuple):
+class SearchedBox(NamedTuple):
     """The box that has the largest bound at its centre, of those that are left."""
 
     lower: np.ndarray
@@ -77,7 +77,7 @@ class SearchResult(NamedTuple):
     seconds: float
     done: float
     """Part of the volume on which the statement is proved."""
-    worst: WorstBox | None
+    worst: SearchedBox | None
     """None if the statement is proved."""
 
     @property
@@ -102,7 +102,7 @@ class _Found(NamedTuple):
     boxes: int
     status: int
     done: float
-    worst: WorstBox | None
+    worst: SearchedBox | None
 
 
 class _Problem:
@@ -156,10 +156,10 @@ class _Problem:
         for low, high in zip(self.lower, self.upper, strict=True):
             room = np.zeros((2 * target, self.size))
             room[0, : 2 * self.dimension] = np.concatenate([low, high])
-            found, count = self._call("divide_box", left, room, ctypes.c_int64(target))
-            left = max(left - found.boxes, 0)
+            result, count = self._call("divide_box", left, room, ctypes.c_int64(target))
+            left = max(left - result.boxes, 0)
             records.append(room[:count])
-            parts.append(found)
+            parts.append(result)
         units = np.concatenate(records)
         division = _Found(
             sum(part.boxes for part in parts),
@@ -175,19 +175,19 @@ class _Problem:
 
     def searched(self, unit: np.ndarray, max_boxes: int) -> _Found:
         """The result of a unit."""
-        found, _ = self._call("search_box", max_boxes, unit)
-        return found._replace(done=found.done / len(self.lower))
+        result, _ = self._call("search_box", max_boxes, unit)
+        return result._replace(done=result.done / len(self.lower))
 
-    def worst(self, units: np.ndarray) -> WorstBox | None:
+    def worst(self, units: np.ndarray) -> SearchedBox | None:
         """The worst of some units."""
-        found = self._result_type()()
+        result = self._result_type()()
         self.kernel.library.worst_box(
             pointer(self.kernel.numbers),
             pointer(units),
             ctypes.c_int64(len(units)),
-            ctypes.byref(found),
+            ctypes.byref(result),
         )
-        return self._worst_of(found)
+        return self._worst_of(result)
 
     def _call(self, name: str, max_boxes: int, boxes: np.ndarray, *more: Any) -> tuple[_Found, int]:
         """Calls a function of the kernel."""
@@ -219,11 +219,11 @@ class _Problem:
         ]
         return type("Result", (ctypes.Structure,), {"_fields_": fields})
 
-    def _worst_of(self, found: Any) -> WorstBox | None:
+    def _worst_of(self, result: Any) -> SearchedBox | None:
         """The worst box of a result; None if there is none."""
-        if found.value == -math.inf:
+        if result.value == -math.inf:
             return None
-        return WorstBox(np.array(found.low), np.array(found.high), found.bound, found.value)
+        return SearchedBox(np.array(result.low), np.array(result.high), result.bound, result.value)
 
 
 class _Results:

@@ -11,10 +11,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.control import controllers
 from iblf_jax.control.actuators import Ideal
 from iblf_jax.control.barriers import Barrier, Quadratic
 from iblf_jax.control.controllers import TrackingLaw
+from iblf_jax.control.controllers._base import position_barrier
 from iblf_jax.control.decays import Exponential
 from iblf_jax.core import checks
 from iblf_jax.core.time import jump_times_of
@@ -97,7 +97,7 @@ def check_absent(scenario: Scenario, reasons: Mapping[str, str], *, input: str, 
         raise unsupported("jump_times()", times, "no jumps", f"{rate} is not defined at a jump.")
 
 
-def claims_of(barriers: Sequence[Any]) -> list[str]:
+def claim_sentences(barriers: Sequence[Any]) -> list[str]:
     """Sentences on the claims of barriers that are not members of the package."""
     names = {type(barrier).__name__ for barrier in barriers if type(barrier) not in BARRIERS}
     return [
@@ -130,15 +130,6 @@ def time_interval(
         raise checks.fail("duration", None, "a duration", remedy) from None
 
 
-def position_barrier(scenario: Scenario) -> tuple[Barrier, jax.Array]:
-    """The barrier of the positions and the weight of its V1."""
-    law = scenario.controller
-    if isinstance(law, controllers.BarrierBackstepping):
-        return law.barriers[0], law.weights[0]
-    assert isinstance(law, controllers.Backstepping)
-    return law.barrier, law.weight
-
-
 @jax.enable_x64(True)
 def check_level(level: float, scenario: Scenario, duration: float, of: str) -> None:
     """Raises ValueError if a level set reaches the guard of the barrier of the positions at one of
@@ -150,7 +141,7 @@ def check_level(level: float, scenario: Scenario, duration: float, of: str) -> N
       duration: length of the time interval [s].
       of: the barrier in words.
     """
-    barrier, weight = position_barrier(scenario)
+    barrier, weight = position_barrier(scenario.controller)
     if isinstance(barrier, Quadratic):
         return
     value = level / weight * jnp.ones(scenario.n)
@@ -221,7 +212,7 @@ def examined(
 def operations_of_plant(
     function: Callable,
     inputs: Sequence[jax.Array],
-    known: tuple[Any, ...],
+    parts: tuple[Any, ...],
     uncertain: Uncertain,
     *,
     kinks: bool = True,
@@ -231,11 +222,11 @@ def operations_of_plant(
     Args:
       function: of the inputs, plant, disturbance and model.
       inputs: arrays of the shapes of its first arguments, all of which vary.
-      known: plant, disturbance and model.
+      parts: plant, disturbance and model.
       uncertain: parameters.
       kinks: whether its derivative may jump.
     """
-    leaves, structure = jax.tree.flatten(known)
+    leaves, structure = jax.tree.flatten(parts)
     count = len(inputs)
 
     def of_numbers(*x: jax.Array) -> Any:

@@ -74,11 +74,11 @@ def replaced(leaves: list[jax.Array], new: dict[Place, jax.Array]) -> list[jax.A
 
 def values_at(places: Places, numbers: Numbers, z: jax.Array) -> dict[Place, jax.Array]:
     """The entries at coordinates z, (m,)."""
-    found = {}
+    values = {}
     for k, entries in enumerate(places.entries):
         for i, place in enumerate(entries):
-            found[place] = numbers.base[k][i] + numbers.slope[k][i] * z[k]
-    return found
+            values[place] = numbers.base[k][i] + numbers.slope[k][i] * z[k]
+    return values
 
 
 def leaves_at(places: Places, numbers: Numbers, part: P, z: jax.Array) -> P:
@@ -100,12 +100,12 @@ def between(places: Places, numbers: Numbers, nominal: P, model: P, z: jax.Array
       model: those of the model, p0, of the same structure.
       z: coordinates, (m,).
     """
-    known = jax.tree.leaves(model)
+    model_leaves = jax.tree.leaves(model)
     ends = values_at(places, numbers, z)
     for place in places.differing:
         ends.setdefault(place, _entry(jax.tree.leaves(nominal), place))
-    new = {place: hull(_entry(known, place), end) for place, end in ends.items()}
-    return jax.tree.unflatten(jax.tree.structure(model), replaced(known, new))
+    new = {place: hull(_entry(model_leaves, place), end) for place, end in ends.items()}
+    return jax.tree.unflatten(jax.tree.structure(model), replaced(model_leaves, new))
 
 
 def _direction(model: P, entries: dict[Place, jax.Array]) -> P:
@@ -129,14 +129,14 @@ def fixed_difference(places: Places, numbers: Numbers, nominal: P, model: P) -> 
     """
     if not places.differing:
         return None
-    known = jax.tree.leaves(model)
+    model_leaves = jax.tree.leaves(model)
     at_reference = values_at(places, numbers, numbers.reference)
     new = {}
     for place in places.differing:
         end = at_reference.get(place)
         if end is None:
             end = _entry(jax.tree.leaves(nominal), place)
-        new[place] = end - _entry(known, place)
+        new[place] = end - _entry(model_leaves, place)
     return _direction(model, new)
 
 

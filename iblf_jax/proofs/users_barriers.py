@@ -22,7 +22,6 @@ from jax.extend.core import primitives
 from iblf_jax.control.barriers import Barrier
 from iblf_jax.core import checks
 from iblf_jax.kernels import jaxprs
-from iblf_jax.proofs.arm_motion import degree
 from iblf_jax.proofs.chain_motion import OpenTube
 from iblf_jax.proofs.examination import (
     CASES,
@@ -33,6 +32,7 @@ from iblf_jax.proofs.examination import (
     interpreted,
     traced,
 )
+from iblf_jax.proofs.forms import degree
 from iblf_jax.proofs.users_parts import ACCURACY, check_agreement
 
 SAMPLES = 256

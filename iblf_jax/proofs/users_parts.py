@@ -129,7 +129,7 @@ def agreement_of_robot(robot: robots.Robot) -> list[str]:
     Raises:
       ValueError: they disagree.
     """
-    if _is_known(robot):
+    if _is_of_package(robot):
         return []
     generator = np.random.default_rng(0)
     n = robot.n
@@ -144,10 +144,10 @@ def agreement_of_robot(robot: robots.Robot) -> list[str]:
     ]
 
 
-def _is_known(robot: robots.Robot) -> bool:
+def _is_of_package(robot: robots.Robot) -> bool:
     """Whether a robot is one of the package."""
     if type(robot) is robots.WithMotors:
-        return _is_known(robot.robot)
+        return _is_of_package(robot.robot)
     return type(robot) in ROBOTS
 
 
@@ -197,13 +197,13 @@ def check_agreement(
       ValueError: a larger difference.
     """
     given, expected = np.asarray(given), np.asarray(expected)
-    is_known = np.isfinite(given) & np.isfinite(expected)
-    is_unknown = ~np.isfinite(given) & ~np.isfinite(expected)
+    are_finite = np.isfinite(given) & np.isfinite(expected)
+    are_not_finite = ~np.isfinite(given) & ~np.isfinite(expected)
     size = np.where(np.isfinite(size), size, 0.0)
-    scale = np.maximum(np.abs(expected), size)[is_known]
-    distance = np.abs(given[is_known] - expected[is_known])
+    scale = np.maximum(np.abs(expected), size)[are_finite]
+    distance = np.abs(given[are_finite] - expected[are_finite])
     is_equal = np.all(distance <= accuracy * scale)
-    if is_equal and np.all(is_known | is_unknown) and np.any(is_known | (given.size == 0)):
+    if is_equal and np.all(are_finite | are_not_finite) and np.any(are_finite | (given.size == 0)):
         return
     got = f"a difference of {np.max(distance, initial=0.0):.3g}"
     words = "methods that agree with the formulas of `Robot`, `Plant` or `Barrier`"
@@ -258,7 +258,7 @@ def _plant_pairs(
         found = plants.transposed_gain(plant, level, t, x, above)
         terms = jnp.abs(G.T) @ jnp.abs(above)
         yield f"transposed_gain of level {level}", (found, G.T @ above, terms)
-        known = jnp.where(jnp.arange(plant.order)[:, None] < level, x, 0.0)
-        without_levels = plants.level_rate(plant, level, t, known, above)
+        up_to_level = jnp.where(jnp.arange(plant.order)[:, None] < level, x, 0.0)
+        without_levels = plants.level_rate(plant, level, t, up_to_level, above)
         name = f"drift and gain of level {level} without the levels above"
         yield name, (without_levels, rate, size)

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.controllers import Law
 from iblf_jax.control.observers import Observer
 from iblf_jax.control.sensors._base import Measurement, measurement_of
 from iblf_jax.core import checks, taylor
@@ -111,7 +110,7 @@ def estimate(
     """
     model = scenario.loop.model
     found = observer.estimate(t, x, model, state)
-    if isinstance(unwrapped(scenario.controller), Law):
+    if unwrapped(scenario.controller).receives_x:
         return found
     return model.as_uncertain(x, found)  # type: ignore[no-any-return]
 

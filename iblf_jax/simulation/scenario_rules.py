@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.control.actuators import Actuator
-from iblf_jax.control.controllers import Law, TrackingLaw
+from iblf_jax.control.controllers import TrackingLaw
 from iblf_jax.control.controllers._base import check_law
 from iblf_jax.control.observers import NoObserver, Observer
 from iblf_jax.control.observers import _base as observers
@@ -160,7 +160,7 @@ def _other_components(s: Combination) -> Found | None:
 
 
 def _law_without_robot(s: Combination) -> Found | None:
-    if s.model.is_robot or isinstance(s.law, Law):
+    if s.model.is_robot or s.law.receives_x:
         return None
     others = "" if s.model.robot is None else ", or model=plant.robot"
     return Found(s.model_kind, {"others": others})

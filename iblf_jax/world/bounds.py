@@ -253,7 +253,9 @@ class Tube(NamedTuple):
         return self.dupper - self.dq_d
 
     def xi(self, q: jax.Array) -> jax.Array:
-        """Xi = h e1/k_u + (1 - h) e1/k_l, h = 1 if e1 > 0 else 0, (n,) [1].    (2.4), (2.5)"""
+        """The relative error h e1/k_u + (1 - h) e1/k_l, h = 1 if e1 > 0 else 0, (n,) [1].
+        (2.4), (2.5)
+        """
         e1 = q - self.q_d
         return e1 / jnp.where(e1 > 0, self.k_u, self.k_l)
 

@@ -8,9 +8,9 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+from claim_terms import terms_at
 
 import iblf_jax as ij
-from iblf_jax.certificates.claims import terms_at
 from iblf_jax.certificates.terms import Terms
 from iblf_jax.simulation.closed_loop import LoopState
 from iblf_jax.simulation.scenario import canonical

@@ -14,13 +14,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from certificate_states import loop, random_loops, terms_of
+from claim_terms import terms_at
 from conftest import PAPER, SHORT
 
 import iblf_jax as ij
 from iblf_jax.certificates import Certificate, certify, counterexample, summary
-from iblf_jax.certificates.claims import claims_of, terms_at, theorem, weighted
+from iblf_jax.certificates.claims import claims_of, theorem, weighted
 from iblf_jax.certificates.claims.two_cases import Gains, gains_of
 from iblf_jax.certificates.eigenvalues import eigenvalues_over
+from iblf_jax.certificates.lines import Role, Statement
 from iblf_jax.certificates.summary import restarts, summarise
 from iblf_jax.certificates.terms import rounding
 from iblf_jax.simulation.closed_loop import LoopState, initial_state
@@ -81,6 +83,12 @@ def left_side(batch, proof):
     """V2' + rho V2 - |f'|^2/2 with lambda_max of each position."""
     rho = jax.vmap(partial(rho_of, case=2))(batch, lambda_max_of(proof))
     return np.asarray(proof.dV + rho * proof.V - 0.5 * jnp.sum(proof.dd**2, axis=-1))
+
+
+def test_the_role_of_a_line_and_not_its_name_decides_the_verdict(paper_certificate):
+    for role, verdict in ((Role.INEQUALITY, "holds"), (Role.OTHER, "not applicable")):
+        line = Statement("decay", "(X.1)", "V' <= -V", role=role).line("holds")
+        assert dataclasses.replace(paper_certificate, lines=(line,)).verdict == verdict
 
 
 # --- states ---------------------------------------------------------------------------------------
@@ -369,7 +377,7 @@ def test_a_law_with_weights_has_a_claim_below_the_conditions_of_theorem_2(correc
     certificate = certify(scenario, ij.simulate(scenario, **SHORT))
     assert certificate.holds, certificate
     for name in ("K2", "kf, case 2", "rho, case 2"):
-        assert (certificate[name].verdict, certificate[name].counts) == ("fails", False)
+        assert (certificate[name].verdict, certificate[name].enters_verdict) == ("fails", False)
         assert "stability is not" in certificate[name].note
     for name in ("rho, case 2", "inequality, case 2", "envelope, case 2", "xi", "e2", "f_tilde"):
         assert certificate[f"weighted {name}"].verdict == "holds", name
@@ -387,7 +395,7 @@ def test_with_the_papers_weights_its_own_conditions_decide(corrected_run):
     papers = ij.with_parameters(corrected_run.scenario, LIGHT | {"controller.weight": 1.0})
     certificate = certify(papers, ij.simulate(papers, **SHORT))
     assert certificate.verdict == "fails"
-    assert certificate["K2"].counts
+    assert certificate["K2"].enters_verdict
     assert certificate["weighted inequality, case 2"].verdict == "holds"
     assert repr(certificate).startswith(
         "Certificate: the paper's theorem fails in 5 lines; the claim with weights holds  (Backst"
@@ -787,12 +795,12 @@ def test_a_claim_that_is_too_strong_fails_and_says_when_first(own):
     certificate = certify(ij.with_parameters(own, {"controller.share": 1.02}), **OWN)
     line = certificate["inequality, own V"]
     assert certificate.verdict == line.verdict == "fails"
-    assert line.first == 0.0
+    assert line.first_broken == 0.0
     late = certify(
         ij.with_parameters(own, {"controller.share": 0.98, "controller.late": 9.0}), **OWN
     )["inequality, own V"]
     assert late.verdict == "fails"
-    assert late.first == pytest.approx(0.051)
+    assert late.first_broken == pytest.approx(0.051)
     assert "first broken at t = 0.051 s" in late.where()
     weak = certify(ij.with_parameters(own, {"controller.share": 0.9}), **OWN)["inequality, own V"]
     assert weak.verdict == "holds"

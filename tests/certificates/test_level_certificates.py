@@ -12,11 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import random_plants
+from claim_terms import terms_at
 from random_plants import random_scenario, random_states
 
 import iblf_jax as ij
 from iblf_jax.certificates import certify, counterexample
-from iblf_jax.certificates.claims import terms_at
 from iblf_jax.certificates.claims.levels import LEVEL_ROUNDING
 from iblf_jax.certificates.terms import rounding
 from iblf_jax.simulation.closed_loop import evaluate

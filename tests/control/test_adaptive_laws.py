@@ -11,10 +11,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from claim_terms import terms_at
 
 import iblf_jax as ij
 from iblf_jax import barriers, controllers
-from iblf_jax.certificates.claims import terms_at
 from iblf_jax.files.scenario import load_scenario, save_scenario
 from iblf_jax.simulation.closed_loop import LoopState, rate
 

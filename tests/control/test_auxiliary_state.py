@@ -12,12 +12,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from claim_terms import terms_at
 from independent import Loop
 from members import two_barriers
 
 import iblf_jax as ij
 from iblf_jax import barriers, controllers
-from iblf_jax.certificates.claims import terms_at
 from iblf_jax.control.controllers.saturated import AuxiliaryState
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state
 from iblf_jax.simulation.scenario import canonical

@@ -18,6 +18,7 @@ import pytest
 import iblf_jax as ij
 from iblf_jax import barriers, controllers, decays, disturbances, observers
 from iblf_jax.certificates.claims import settling
+from iblf_jax.certificates.claims.theorem import THEOREM
 from iblf_jax.core import notices
 from iblf_jax.core.status import Status
 from iblf_jax.simulation import stability
@@ -199,8 +200,8 @@ def test_settling_time_of_an_arm_and_the_case_in_which_it_is_broken():
     summary = SimpleNamespace(
         run=SimpleNamespace(scenario=scenario),
         law=law,
-        claims=(settling.SETTLING,),
-        extrema=SimpleNamespace(mu=20.0),
+        claims=(THEOREM, settling.SETTLING),
+        reductions=SimpleNamespace(mu=20.0),
         jumps=np.zeros(0),
         excluded=0,
         samples=1001,

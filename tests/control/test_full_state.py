@@ -7,13 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from claim_terms import terms_at
 from independent import Loop, sine
 from members import two_barriers
 from scipy.integrate import solve_ivp
 
 import iblf_jax as ij
 from iblf_jax import barriers, bounds, controllers
-from iblf_jax.certificates.claims import terms_at
 from iblf_jax.certificates.terms import rounding
 from iblf_jax.simulation.closed_loop import initial_state
 

@@ -185,7 +185,7 @@ def is_close(name: str, found: Any, stored: Any) -> bool:
         ignored.add("tolerance")
         if stored["margin"] is not None and abs(stored["margin"]) <= stored["tolerance"]:
             slack = max(slack, stored["tolerance"])
-            ignored |= {"joint", "time", "first"}
+            ignored |= {"joint", "time", "first_broken"}
     kept = [{key: x for key, x in field.items() if key not in ignored} for field in (found, stored)]
     return is_same(*kept, slack)
 

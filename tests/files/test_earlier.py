@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import iblf_jax as ij
+from iblf_jax.files.earlier import fields_of_line
 from iblf_jax.simulation.paths import get
 
 EARLIER = Path(__file__).parents[1] / "data" / "earlier"
@@ -73,3 +74,20 @@ def test_a_run_can_be_done_again(kind):
     again = ij.simulate(run.scenario, duration=0.02, dt=1e-3, record_every=5)
     np.testing.assert_allclose(again.x, run.x, rtol=1e-11, atol=1e-13)
     np.testing.assert_allclose(again.level_upper, run.level_upper, rtol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("name", "role"),
+    [
+        ("inequality, case 2", "inequality"),
+        ("inequality, own V", "own inequality"),
+        ("weighted inequality, case 1", "weighted inequality"),
+        ("weighted xi", "weighted"),
+        ("envelope, case 2", "other"),
+    ],
+)
+def test_the_name_of_a_stored_line_says_its_role(name, role):
+    stored = {"name": name, "counts": False, "first": 0.5}
+    found = fields_of_line(stored)
+    assert found == {"name": name, "enters_verdict": False, "first_broken": 0.5, "role": role}
+    assert fields_of_line(found) == found

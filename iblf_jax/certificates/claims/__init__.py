@@ -12,8 +12,6 @@ OwnClaim  what a law states about itself                              own
 
 from __future__ import annotations
 
-import jax
-
 from iblf_jax.certificates.claims._base import Claim as Claim
 from iblf_jax.certificates.claims._base import MainClaim
 from iblf_jax.certificates.claims.levels import LEVELS
@@ -22,8 +20,7 @@ from iblf_jax.certificates.claims.own import OWN
 from iblf_jax.certificates.claims.settling import SETTLING
 from iblf_jax.certificates.claims.theorem import THEOREM
 from iblf_jax.certificates.claims.weighted import WEIGHTED
-from iblf_jax.certificates.terms import Terms, receives_q_dq, terms_and_sample
-from iblf_jax.simulation.closed_loop import LoopState
+from iblf_jax.certificates.terms import receives_q_dq
 from iblf_jax.simulation.scenario import Scenario
 
 
@@ -31,7 +28,9 @@ def main_claim(scenario: Scenario) -> MainClaim:
     """The claim that a certificate of a scenario is about, whether or not it applies."""
     if receives_q_dq(scenario):
         return THEOREM
-    return LEVELS if MATCHED.why_not(scenario) else MATCHED
+    if MATCHED.why_not(scenario):
+        return LEVELS
+    return MATCHED
 
 
 def claims_of(scenario: Scenario) -> tuple[Claim, ...]:
@@ -45,15 +44,3 @@ def claims_of(scenario: Scenario) -> tuple[Claim, ...]:
     if main is LEVELS:
         candidates = (main, SETTLING, OWN)
     return tuple(x for x in candidates if x is main or not x.why_not(scenario))
-
-
-def terms_at(scenario: Scenario, t: jax.Array, state: LoopState) -> Terms:
-    """The terms of all claims about a scenario at one state; pure, for `vmap` over states, times
-    and gains.
-
-    Args:
-      scenario: canonical.
-      t: time, () [s].
-      state: state of the loop at t.
-    """
-    return terms_and_sample(scenario, t, state, claims_of(scenario))[0]

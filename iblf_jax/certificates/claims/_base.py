@@ -22,7 +22,7 @@ from iblf_jax.certificates.lines import (
     verdict_of,
 )
 from iblf_jax.certificates.result import LevelLabel, LevelTraces, Traces
-from iblf_jax.certificates.summary import DecayBound, Extremum, Segment, Summary
+from iblf_jax.certificates.summary import DecayBound, Reduction, Segment, Summary
 from iblf_jax.certificates.terms import Point, Terms
 from iblf_jax.control.actuators import Ideal
 from iblf_jax.control.barriers import Barrier
@@ -49,8 +49,10 @@ class Claim(metaclass=abc.ABCMeta):
 
     key: ClassVar[str]
     """Names the claim among those of a scenario."""
-    about_torque: ClassVar[bool] = False
-    """Whether it is about a robot and the torque f."""
+    point: ClassVar[type[Point] | None] = None
+    """The points at which it has terms; None for one that reads those of other claims."""
+    omits_f_tilde: ClassVar[bool] = False
+    """Whether its V lacks |f_tilde|^2/2, which the V of a sample of a robot contains."""
 
     @abc.abstractmethod
     def why_not(self, scenario: Scenario) -> str:
@@ -64,12 +66,12 @@ class Claim(metaclass=abc.ABCMeta):
         """The terms at a state with those of this claim."""
         return terms
 
-    def extrema(self, scenario: Scenario, terms: Terms) -> dict[str, Extremum]:
-        """Its quantities over some steps of which a summary keeps the extrema, by name."""
+    def reductions(self, scenario: Scenario, terms: Terms) -> dict[str, Reduction]:
+        """What a summary keeps of its quantities at some steps, by name."""
         return {}
 
     def constants(self, summary: Summary) -> Any:
-        """The numbers of the claim for a run, which `Summary.constants` keeps."""
+        """Values that the claim computes once per run for its own methods."""
         return None
 
     def decay_bounds(self, summary: Summary) -> Mapping[int, DecayBound]:
@@ -77,7 +79,7 @@ class Claim(metaclass=abc.ABCMeta):
         return {}
 
     def numbers(self, summary: Summary) -> dict[str, Any]:
-        """The constants of the claim, for `Certificate.numbers`."""
+        """What the claim adds to `Certificate.numbers`."""
         return {}
 
     def assumptions(self, segment: Segment) -> list[Line]:
@@ -114,6 +116,14 @@ class MainClaim(Claim):
 
     in_words: ClassVar[str]
     """The claim in a sentence."""
+
+    @abc.abstractmethod
+    def disturbance_gain_term(self, segment: Segment) -> np.ndarray:
+        """The term g that disturbances may add to the rate of V at every step, (T,)."""
+
+    @abc.abstractmethod
+    def why_no_settling(self, summary: Summary) -> str:
+        """Why no settling time follows from the decays of the law in a run; "" if one does."""
 
     @abc.abstractmethod
     def traces(self, segment: Segment) -> Traces | LevelTraces:

@@ -59,6 +59,7 @@ from iblf_jax.certificates.claims._base import (
 from iblf_jax.certificates.claims.own import OWN
 from iblf_jax.certificates.lines import (
     Line,
+    Role,
     Statement,
     check_positive,
     check_smallest,
@@ -69,11 +70,11 @@ from iblf_jax.certificates.lines import (
     verdict_of,
 )
 from iblf_jax.certificates.result import LevelLabel, LevelTraces
-from iblf_jax.certificates.summary import DecayBound, Extremum, Segment, Summary
+from iblf_jax.certificates.summary import DecayBound, Reduction, Segment, Summary
 from iblf_jax.certificates.terms import (
     ESTIMATED,
     Arguments,
-    LevelPoint,
+    ChainPoint,
     Point,
     Terms,
     adaptive_law,
@@ -106,6 +107,7 @@ INEQUALITY = Statement(
     "(S.3)",
     "V' <= -sum w_i decay_i - sum c_i w_i |s_i|^2 + T,  T = dV/dx . d_tilde + dV/dd_hat . d_hat'",
     "1/s",
+    Role.INEQUALITY,
 )
 SURFACE_INEQUALITY = Statement(
     "inequality, levels",
@@ -113,6 +115,7 @@ SURFACE_INEQUALITY = Statement(
     "V' <= -sum w_i decay_i - sum c_i w_i |s_i|^2 + sum w_i s_i . (d_tilde_i + G_i (beta_i -"
     " alpha_i))",
     "1/s",
+    Role.INEQUALITY,
 )
 EQUALITY = Statement("equality", "(S.3)", "both sides of (S.3) are equal", "1/s")
 ESTIMATE = Statement("estimate", "(S.3)", "d_hat' = kappa d_tilde")
@@ -155,7 +158,7 @@ class LevelTerms(NamedTuple):
     k_u: jax.Array
 
     @property
-    def growth(self) -> jax.Array:
+    def disturbance_gain(self) -> jax.Array:
         """The term g = T - sum c_i w_i |s_i|^2 with the lag of filters in T, ()."""
         return self.disturbance_terms + self.lag - self.by_slopes
 
@@ -174,7 +177,9 @@ class Levels(MainClaim):
     """(S.3) and the bounds that follow from it."""
 
     key: ClassVar[str] = "levels"
+    point: ClassVar[type[Point] | None] = ChainPoint
     in_words: ClassVar[str] = "the claim (S.3)"
+    omits_f_tilde: ClassVar[bool] = True
 
     def why_not(self, scenario: Scenario) -> str:
         """Why (S.3) claims nothing about a scenario, in words; "" if it does."""
@@ -205,6 +210,10 @@ class Levels(MainClaim):
             return f"{summary.why_never}, or alpha was outside the bounds"
         return reason
 
+    def why_no_settling(self, summary: Summary) -> str:
+        """Why no settling time follows; "" if one does."""
+        return self.why_not_in_run(summary)
+
     def exclusion_note(self, summary: Summary) -> str:
         """Which samples the claim excludes, and where it starts again, in words."""
         excluded = summary.exclusion_note("{}, or alpha was outside the bounds")
@@ -214,7 +223,7 @@ class Levels(MainClaim):
 
     def with_terms_of_claim(self, point: Point, terms: Terms) -> Terms:
         """The terms at a state with those of this claim, and with those of the estimate."""
-        assert isinstance(point, LevelPoint)
+        assert isinstance(point, ChainPoint)
         entries = terms.claims | {ESTIMATED: _estimate_terms(point)}
         terms = terms._replace(claims=entries)
         if not isinstance(point.law, BarrierBackstepping):
@@ -226,12 +235,12 @@ class Levels(MainClaim):
 
     # --- the constants ----------------------------------------------------------------------------
 
-    def extrema(self, scenario: Scenario, terms: Terms) -> dict[str, Extremum]:
-        """The largest g of (S.3), at least 0."""
-        growth = np.zeros(1)
+    def reductions(self, scenario: Scenario, terms: Terms) -> dict[str, Reduction]:
+        """The constant rho2, the largest g of (S.3), at least 0."""
+        gain = np.zeros(1)
         if self.key in terms.claims:
-            growth = np.where(terms.excluded, 0.0, terms.claims[self.key].growth)
-        return {"growth": Extremum(np.maximum, np.maximum(0.0, growth.max()))}
+            gain = np.where(terms.excluded, 0.0, terms.claims[self.key].disturbance_gain)
+        return {"rho2": Reduction(np.maximum, np.maximum(0.0, gain.max()))}
 
     def constants(self, summary: Summary) -> np.ndarray:
         """Decay rate of V_i of each level and component, (r, n) [1/s]; empty where (S.3) does not
@@ -248,7 +257,7 @@ class Levels(MainClaim):
         rates = summary.constants[self.key]
         if not rates.size:
             return {}
-        return {2: DecayBound(float(np.min(rates)), float(summary.extrema.growth))}
+        return {2: DecayBound(float(np.min(rates)), float(summary.reductions.rho2))}
 
     def rho(self, summary: Summary) -> float:
         """The rate of (S.4) [1/s]; NaN where (S.3) does not apply."""
@@ -257,14 +266,14 @@ class Levels(MainClaim):
 
     def numbers(self, summary: Summary) -> dict[str, Any]:
         """The constants of the claim."""
-        extrema = summary.extrema
+        reductions = summary.reductions
         return {
             "rho": self.rho(summary),
-            "rho2": float(extrema.growth),
-            "V_start": float(extrema.V_start),
-            "V_end": float(extrema.V_end),
-            "d_largest": extrema.d,
-            "d_tilde_largest": extrema.d_tilde,
+            "rho2": float(reductions.rho2),
+            "V_start": float(reductions.V_start),
+            "V_end": float(reductions.V_end),
+            "d_largest": reductions.d_largest,
+            "d_tilde_largest": reductions.d_tilde_largest,
             "jump_times": summary.jumps,
         }
 
@@ -341,10 +350,15 @@ class Levels(MainClaim):
                 lines.append(_with_unit(line, unit))
         return lines
 
+    def disturbance_gain_term(self, segment: Segment) -> np.ndarray:
+        """The term g of (S.4) at every step, (T,)."""
+        return segment.terms.claims[self.key].disturbance_gain  # type: ignore[no-any-return]
+
     def left_side(self, segment: Segment) -> np.ndarray:
         """The left less the right side of (S.3), which must not be positive, (T,)."""
-        claim = segment.terms.claims[self.key]
-        return segment.terms.dV + claim.dissipation - claim.growth  # type: ignore[no-any-return]
+        dissipation = segment.terms.claims[self.key].dissipation
+        left = segment.terms.dV + dissipation - self.disturbance_gain_term(segment)
+        return left  # type: ignore[no-any-return]
 
     def _inequalities(self, segment: Segment) -> list[Line]:
         """(S.3) at every step, and its equality for barriers that decay exactly."""
@@ -369,7 +383,7 @@ class Levels(MainClaim):
         """The largest disturbance terms, and the largest effect of the filters' lag."""
         summary, reason = segment.summary, self.why_not_in_run(segment.summary)
         if reason:
-            return [not_applicable(TERMS, reason, counts=False)]
+            return [not_applicable(TERMS, reason, enters_verdict=False)]
         claim = segment.terms.claims[self.key]
         lines = [_largest(segment, TERMS, claim.disturbance_terms)]
         if summary.law.filter is not None:
@@ -579,7 +593,7 @@ def _estimate(segment: Segment) -> Line:
         return not_applicable(ESTIMATE, summary.why_invalid)
     statement = ESTIMATE
     if terms.error.ndim == 2:
-        if summary.extrema.d[0] > 0:
+        if summary.reductions.d_largest[0] > 0:
             why = "a torque observer of the robot needs q' = x_2, without d_1"
             return not_applicable(ESTIMATE, why)
         text = "f_hat' = kf f_tilde of the robot inside the plant"
@@ -597,7 +611,7 @@ def _estimate(segment: Segment) -> Line:
 # --- the terms at a state -------------------------------------------------------------------------
 
 
-def _with_claim_terms(point: LevelPoint, terms: Terms) -> Terms:
+def _with_claim_terms(point: ChainPoint, terms: Terms) -> Terms:
     """The terms at a state with V = sum w_i V_i and those of (S.3).
 
     V' is exact: dV/d(t, x, d_hat, state of the law), by forward-mode differentiation, times the
@@ -689,7 +703,7 @@ def _ratio_at_centre(barrier: Barrier, tube: Tube) -> jax.Array:
     return stated  # type: ignore[no-any-return]
 
 
-def _estimate_terms(point: LevelPoint) -> EstimateTerms:
+def _estimate_terms(point: ChainPoint) -> EstimateTerms:
     """The error of d_hat' = kappa d_tilde and the size of its terms; 0 without a stated kappa."""
     scenario, (at, tangent) = point.scenario, point.arguments
     error, sizes = point.d_tilde, point.sizes

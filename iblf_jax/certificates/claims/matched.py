@@ -34,12 +34,18 @@ from iblf_jax.certificates.claims._base import (
 )
 from iblf_jax.certificates.claims.own import own_claim
 from iblf_jax.certificates.claims.theorem import (
-    CASE_1_COUNTS,
+    CASE_1_DECIDES,
     SignalSizes,
     Theorem,
     eigenvalues_in,
 )
-from iblf_jax.certificates.claims.two_cases import CASES, why_no_decay, why_not_in_loop
+from iblf_jax.certificates.claims.two_cases import (
+    CASES,
+    case_of_run,
+    enters_verdict,
+    why_no_decay,
+    why_not_in_loop,
+)
 from iblf_jax.certificates.lines import (
     Line,
     Statement,
@@ -85,7 +91,7 @@ class MatchedTerms(NamedTuple):
     """K of each joint's side, (n,) [rad/s]."""
     alpha_distance: jax.Array
     """Distance of alpha to the velocity bounds, (n,) [rad/s]."""
-    growth: jax.Array
+    disturbance_gain: jax.Array
     """s2 . M0^-1 f_tilde - c |s2|^2, () [1/s]."""
 
 
@@ -139,15 +145,15 @@ class Matched(Theorem):
         for i, (level, tube) in enumerate(zip(levels, tubes, strict=True)):
             of_level, by_slope = level_dissipation(law, i, t, tube, x[i], level.slope)
             dissipation, by_slopes = dissipation + of_level, by_slopes + by_slope
-        growth = levels[1].slope @ solve_spd(point.M0, terms.d_tilde) - by_slopes
+        disturbance_gain = levels[1].slope @ solve_spd(point.M0, terms.d_tilde) - by_slopes
         inner = tubes[1]
         distance = centre_distance(inner)
         entry = MatchedTerms(
-            left=barriers_rate + dissipation - growth,
+            left=barriers_rate + dissipation - disturbance_gain,
             tube=inner,
             side=jnp.where(x[1] > inner.q_d, inner.k_u, inner.k_l),
             alpha_distance=distance,
-            growth=growth,
+            disturbance_gain=disturbance_gain,
         )
         return terms._replace(
             xi=jnp.stack([terms.xi[0], inner.xi(x[1])]),
@@ -185,7 +191,7 @@ class Matched(Theorem):
 
     def gain_conditions(self, summary: Summary) -> list[Line]:
         """The condition of (F.3) on kf and c, in both cases."""
-        scenario, lambda_min = summary.run.scenario, float(summary.extrema.lambda_min)
+        scenario, lambda_min = summary.run.scenario, float(summary.reductions.lambda_min)
         reason = self.why_not(scenario)
         lines = []
         for case in CASES:
@@ -199,10 +205,10 @@ class Matched(Theorem):
             note = f"lambda_min(M0) = {lambda_min:.4g} kg m^2 along the run"
             if margin <= 0 < needed:
                 note += f": c > {0.25 / (needed * lambda_min**2):.4g} would do"
-            if not summary.counts(case):
-                note = CASE_1_COUNTS
-            line = check_positive(statement, margin, counts=summary.counts(case), note=note)
-            lines.append(line)
+            enters = enters_verdict(summary, case)
+            if not enters:
+                note = CASE_1_DECIDES
+            lines.append(check_positive(statement, margin, enters_verdict=enters, note=note))
         return lines
 
     def rate_statement(self, name: str, case: int) -> Statement:
@@ -218,6 +224,10 @@ class Matched(Theorem):
         return f"lambda_min(M0) = {source.lambda_min:.4g} kg m^2"
 
     # --- every step -------------------------------------------------------------------------------
+
+    def disturbance_gain_term(self, segment: Segment) -> np.ndarray:
+        """The term s2 . M0^-1 f_tilde - c |s2|^2 of (F.2) at every step, (T,)."""
+        return segment.terms.claims[self.key].disturbance_gain  # type: ignore[no-any-return]
 
     def assumptions(self, segment: Segment) -> list[Line]:
         """Those of Theorem 2, and those on the virtual velocity and on the velocity at the
@@ -246,7 +256,7 @@ class Matched(Theorem):
         statement = Statement("velocities inside", "(F.3)", "v_l < q' < v_u", "rad/s")
         reason = ""
         if self.case_of(summary) is None:
-            reason = self.why_not_in_case(summary, summary.case)
+            reason = self.why_not_in_case(summary, case_of_run(summary))
         distance, flag = terms.distance[:, 1], Status.VELOCITY_VIOLATED
         velocities = stays_inside(segment, statement, distance, flag, reason)
         return [barriers, *super().lines(segment), velocities]

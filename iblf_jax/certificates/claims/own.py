@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.certificates.claims._base import Claim, check_steps, other_actuator
-from iblf_jax.certificates.lines import OWN_INEQUALITY, Line, Statement, not_applicable
+from iblf_jax.certificates.lines import Line, Role, Statement, not_applicable
 from iblf_jax.certificates.summary import Segment, Summary
 from iblf_jax.certificates.terms import Point, Terms, TorquePoint, receives_q_dq
 from iblf_jax.control.controllers import Law, LyapunovLaw, RobotLaw, Saturated, TrackingLaw
@@ -147,13 +147,14 @@ class OwnClaim(Claim):
         if scenario.loop.observer.completes:
             right_side += TORQUE_OF_ESTIMATES
         decay = "W >= 0: the decay that the law states"
-        inequality = f"V' <= -W + T,  T: {right_side}"
+        text = f"V' <= -W + T,  T: {right_side}"
+        stated = Statement("inequality, own V", "own", text, "1/s", Role.OWN_INEQUALITY)
         W = own.dissipation
         # Near 0, V and W are differences of numbers as large as their largest values.
         checked = (
             (Statement("own V", "own", "V >= 0", "1"), own.V, np.max(np.abs(own.V))),
             (Statement("own decay", "own", decay, "1/s"), W, np.max(np.abs(W))),
-            (Statement(OWN_INEQUALITY, "own", inequality, "1/s"), -own.left_side, own.size),
+            (stated, -own.left_side, own.size),
         )
         reason = self.why_not_in_run(summary)
         if reason:

@@ -11,7 +11,7 @@ without the term of f_tilde, and
     g = e2 . f_tilde (+ 1/2 e2^T M0' e2 in the printed variant)         `Backstepping`
 
 The second step of `Backstepping` has V = W = 1/2 e2^T M0 e2 with w = 1 and
-e2^T K2 e2 + 2 g(t, W) W >= 2 (mu + g(t, W)) W, mu = lambda_min(M0^-1 K2).
+e2^T K2 e2 + 2 k2(t, W) W >= 2 (mu + k2(t, W)) W, mu = lambda_min(M0^-1 K2).
 
 The levels exchange V, so that only its sum is known.  Let D(t, E) be the least value of the sum in
 (D.2) over all V_j >= 0 with sum w_j V_j = E.  Then E(t) <= v(t) with
@@ -26,16 +26,15 @@ grid of shares of E, one joint of one level after the other, and (D.3) is integr
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from functools import partial
 from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.certificates.claims._base import Claim, check_steps, other_actuator
-from iblf_jax.certificates.claims.levels import LEVELS
-from iblf_jax.certificates.claims.matched import MATCHED
-from iblf_jax.certificates.lines import Line, Statement, join_notes, not_applicable
+from iblf_jax.certificates.claims._base import Claim, MainClaim, check_steps
+from iblf_jax.certificates.lines import Line, Role, Statement, join_notes, not_applicable
 from iblf_jax.certificates.summary import ENERGY_ROUNDING, Segment, Summary
 from iblf_jax.certificates.terms import TORQUE
 from iblf_jax.control.controllers import Backstepping, BarrierBackstepping, TrackingLaw
@@ -62,8 +61,9 @@ AT_DEADLINE = Statement("prescribed time", "(D.3)", "E(T) <= v(T),  v' = -D(t, v
 INEQUALITY = Statement(
     "inequality, decays",
     "(D.2)",
-    "E' <= -sum w V1 rate(k1(t, V1)) - e2^T K2 e2 - 2 g(t, W) W + e2 . f_tilde",
+    "E' <= -sum w V1 rate(k1(t, V1)) - e2^T K2 e2 - 2 k2(t, W) W + e2 . f_tilde",
     "1/s",
+    Role.INEQUALITY,
 )
 
 
@@ -93,8 +93,7 @@ def parts_of(law: Backstepping | BarrierBackstepping) -> list[Part]:
 
 def effective_rate(part: Part, t: jax.Array, V: jax.Array) -> jax.Array:
     """Decay rate of the V of each joint at a time and at these values, (n,) [1/s]."""
-    found: jax.Array = part.rate(part.decay.effective_gain(t, part.gain, V))
-    return found
+    return part.rate(part.decay.effective_gain(t, part.gain, V))  # type: ignore[no-any-return]
 
 
 # --- the least decay of a sum -------------------------------------------------------------------
@@ -122,14 +121,14 @@ def least_decay(
     if isinstance(law, Backstepping):
         decay = decay_of(law, 1)
         rows.append(jax.vmap(lambda W: 2.0 * (mu + energy_gain(decay, t, W, law.k1)) * W)(values))
-    # Min-plus convolution: row m of the table has the indices m - i, where i is the share of the
-    # parts before.
-    rest = np.arange(SHARES + 1)[:, None] - np.arange(SHARES + 1)[None, :]
-    total = rows[0]
+    # Min-plus convolution: of a share m of E, the parts before have i and the next part m - i.
+    share = np.arange(SHARES + 1)
+    of_next = share[:, None] - share[None, :]
+    least = rows[0]
     for row in rows[1:]:
-        sums = jnp.where(rest >= 0, total[None, :] + row[np.maximum(rest, 0)], jnp.inf)
-        total = jnp.min(sums, axis=1)
-    return total[-1]
+        sums = least[None, :] + row[np.maximum(of_next, 0)]
+        least = jnp.min(jnp.where(of_next >= 0, sums, jnp.inf), axis=1)
+    return least[-1]
 
 
 def predicted(
@@ -144,22 +143,18 @@ def predicted(
       rho2: of (D.3).
       end: end of the run [s].
     """
-    dtype = jax.tree.leaves(law)[0].dtype
-    gain = jnp.asarray(mu, dtype)
+    number = partial(jnp.asarray, dtype=jax.tree.leaves(law)[0].dtype)
     fastest = max(
-        float(_least_decay(law, gain, jnp.asarray(t, dtype), jnp.asarray(E, dtype))) / E
+        float(_least_decay(law, number(mu), number(t), number(E))) / E
         for t in (0.0, end)
         for E in (start, VANISHING * start)
     )
     count = int(np.clip(np.ceil(end * fastest), *INTERVALS))
-    h = jnp.asarray(end / count, dtype)
-    growth = jnp.asarray(rho2, dtype)
-    logarithm = jnp.log(jnp.asarray(start, dtype))
-    found = [logarithm]
+    constants = (law, number(mu), number(rho2), number(end / count))
+    logarithms = [jnp.log(number(start))]
     for i in range(count):
-        logarithm = _step(law, gain, growth, h, jnp.asarray(i, dtype), logarithm)
-        found.append(logarithm)
-    return np.linspace(0.0, end, count + 1), np.exp(np.asarray(found, float))
+        logarithms.append(_step(*constants, number(i), logarithms[-1]))
+    return np.linspace(0.0, end, count + 1), np.exp(np.asarray(logarithms, float))
 
 
 _least_decay = programs.jit(least_decay)
@@ -197,7 +192,7 @@ class Course(NamedTuple):
     t: np.ndarray
     total: np.ndarray
     """E, the sum of w_j V_j."""
-    growth: np.ndarray
+    disturbance_gain: np.ndarray
     """g of (D.2)."""
     noise: np.ndarray
     """Rounding error of sqrt(2 E)."""
@@ -224,22 +219,18 @@ class Settling(Claim):
 
     def why_not_in_run(self, summary: Summary) -> str:
         """Why (D.2) does not apply to a run; "" if it does."""
-        if LEVELS in summary.claims:
-            return LEVELS.why_not_in_run(summary)
-        actuator = other_actuator(summary.run.scenario)
-        if actuator:
-            return f"(D.2) is about a torque that acts as it is commanded, not about {actuator}"
-        return summary.why_never or summary.why_invalid
+        return _main_claim(summary).why_no_settling(summary)
 
     def segment_data(self, segment: Segment) -> Course:
         """The course of E along a segment."""
         terms = segment.terms
         eps = float(np.finfo(terms.V.dtype).eps)
         noise = ENERGY_ROUNDING * eps * terms.sqrt_V_size
-        E = terms.V
-        if LEVELS not in segment.summary.claims:
+        main, E = _main_claim(segment.summary), terms.V
+        if not main.omits_f_tilde:
             E = E - 0.5 * np.sum(terms.d_tilde**2, axis=1)
-        return Course(segment.t, E, _growth(segment), noise, terms.excluded)
+        gain_term = main.disturbance_gain_term(segment)
+        return Course(segment.t, E, gain_term, noise, terms.excluded)
 
     def lines(self, segment: Segment) -> list[Line]:
         """The inequality (D.2) at every step of a segment, with the gains of each instant, for
@@ -255,7 +246,7 @@ class Settling(Claim):
         rate = terms.dV - np.sum(terms.d_tilde * terms.dd_tilde, axis=1)
         tolerance = summary.eps * (terms.size + np.abs(dissipation))
         note = join_notes(summary.exclusion_note(), summary.restart_note("f"))
-        margins = _growth(segment) - rate - dissipation
+        margins = _main_claim(summary).disturbance_gain_term(segment) - rate - dissipation
         return [check_steps(segment, INEQUALITY, margins, tolerance, note=note)]
 
     def run_lines(
@@ -277,8 +268,8 @@ class Settling(Claim):
             statements.append(AT_DEADLINE)
         if why_not:
             return [not_applicable(statement, why_not) for statement in statements]
-        rho2 = max(float(np.max(course.growth)), 0.0)
-        mu = float(getattr(summary.extrema, "mu", np.inf))  # levels have no K2
+        rho2 = max(float(np.max(course.disturbance_gain)), 0.0)
+        mu = float(getattr(summary.reductions, "mu", np.inf))  # levels have no K2
         times, v = predicted(law, mu, float(course.total[0]), rho2, float(course.t[-1]))
         found = []
         if np.isfinite(band):
@@ -291,14 +282,9 @@ class Settling(Claim):
 SETTLING = Settling()
 
 
-def _growth(segment: Segment) -> np.ndarray:
-    """The term g of (D.2) at every step, (T,)."""
-    terms = segment.terms
-    for claim in (LEVELS, MATCHED):
-        if claim.key in terms.claims:
-            return terms.claims[claim.key].growth  # type: ignore[no-any-return]
-    dropped = terms.claims[TORQUE].dropped_e2
-    return np.sum(terms.e[:, 1] * terms.d_tilde, axis=1) + dropped  # type: ignore[no-any-return]
+def _main_claim(summary: Summary) -> MainClaim:
+    """The claim from whose terms a settling time follows."""
+    return next(claim for claim in summary.claims if isinstance(claim, MainClaim))
 
 
 def _why_not_from_the_start(summary: Summary, course: Course) -> str:
@@ -326,13 +312,9 @@ def _band(law: Backstepping | BarrierBackstepping) -> float:
     return min(found)
 
 
-def _note(rho2: float) -> str:
-    return f"rho2 = {rho2:.4g}"
-
-
 def _time_line(course: Course, times: np.ndarray, v: np.ndarray, band: float, rho2: float) -> Line:
     """The time from which E is inside the band, and the predicted one."""
-    note = f"band {band:.4g}, {_note(rho2)}"
+    note = f"band {band:.4g}, rho2 = {rho2:.4g}"
     reached = np.flatnonzero(v <= band)
     if not reached.size:
         reason = f"the prediction falls to {v.min():.4g} within the run, and not into the {note}"
@@ -364,7 +346,7 @@ def _deadline_line(
     tolerance = 0.5 * (np.sqrt(2.0 * bound) + course.noise[at]) ** 2 - bound
     margin = bound - float(course.total[at])
     verdict = "holds" if margin >= -tolerance else "fails"
-    note = f"T = {deadline:.4g} s, v(T) = {bound:.4g}, {_note(rho2)}"
+    note = f"T = {deadline:.4g} s, v(T) = {bound:.4g}, rho2 = {rho2:.4g}"
     return AT_DEADLINE.line(
         verdict,
         margin=margin,

@@ -39,6 +39,7 @@ from iblf_jax.certificates.claims._base import (
     MainClaim,
     at_recorded,
     check_steps,
+    other_actuator,
     reference_inside,
     stays_inside,
     unclaimed,
@@ -49,7 +50,10 @@ from iblf_jax.certificates.claims.two_cases import (
     NO_BOUND,
     Gains,
     TwoCases,
+    case_of_run,
+    enters_verdict,
     gains_of,
+    largest_f_rate,
     why_no_theorem,
     xi_bound_along,
 )
@@ -57,6 +61,7 @@ from iblf_jax.certificates.claims.weighted import WEIGHTED
 from iblf_jax.certificates.lines import (
     FAILS,
     Line,
+    Role,
     Statement,
     check_margins,
     check_positive,
@@ -66,7 +71,7 @@ from iblf_jax.certificates.lines import (
     not_applicable,
 )
 from iblf_jax.certificates.result import Traces
-from iblf_jax.certificates.summary import DecayBound, Extremum, Segment, Summary, largest_norm
+from iblf_jax.certificates.summary import DecayBound, Reduction, Segment, Summary, largest_norm
 from iblf_jax.certificates.terms import (
     TORQUE,
     Point,
@@ -80,7 +85,6 @@ from iblf_jax.control.controllers import Backstepping
 from iblf_jax.control.controllers._base import decay_of
 from iblf_jax.control.decays._base import energy_gain, gain_at
 from iblf_jax.control.observers import AsPublished, Momentum
-from iblf_jax.core import programs
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.status import Status
 from iblf_jax.simulation.results import Rollout
@@ -103,7 +107,7 @@ NOT_NEEDED = (
     "the paper's own envelope of V2 is lost, stability is not: the claim with weights (W.1) does"
     " not need it"
 )
-CASE_1_COUNTS = "f' = 0 on this run, so case 1 decides"
+CASE_1_DECIDES = "f' = 0 on this run, so case 1 decides"
 BOUNDED = Statement("f bounded", "Assumption 1", "|f| <= F_m", "N m")
 RATE_BOUNDED = Statement("f' bounded", "Assumption 1", "|f'| <= F_d between jumps", "N m/s")
 START_INSIDE = Statement("start inside", "Theorem 2", "k_lc(0) < q(0) < k_uc(0)", "rad")
@@ -112,6 +116,7 @@ LIMITED = Statement(
     "(A.3)",
     "V2' + rho V2 - |f'|^2/2 - w s . lambda <= 0  (without |f'|^2/2 in case 1)",
     "1/s",
+    Role.INEQUALITY,
 )
 DROPPED_BY_LAW = Statement(
     "dropped term of the law",
@@ -142,7 +147,7 @@ class TorqueTerms(NamedTuple):
     auxiliary: Any = ()
     """`AuxiliaryTerms` of a law that takes the shift of the limit around it."""
     dissipation: Any = ()
-    """sum w V1 rate(k1(t, V1)) + e2^T K2 e2 + 2 g(t, W) W of a `Backstepping` law with decays, ()
+    """sum w V1 rate(k1(t, V1)) + e2^T K2 e2 + 2 k2(t, W) W of a `Backstepping` law with decays, ()
     [1/s]."""
 
 
@@ -161,8 +166,11 @@ class Theorem(TwoCases, MainClaim):
     key: ClassVar[str] = "theorem"
     in_words: ClassVar[str] = "the paper's theorem"
     inequalities: ClassVar[Mapping[int, Statement]] = {
-        1: Statement("inequality, case 1", "(3.18)", "V2' + rho V2 <= 0", "1/s"),
-        2: Statement("inequality, case 2", "(3.26)", "V2' + rho V2 - |f'|^2/2 <= 0", "1/s"),
+        case: Statement(f"inequality, case {case}", equation, text, "1/s", Role.INEQUALITY)
+        for case, equation, text in (
+            (1, "(3.18)", "V2' + rho V2 <= 0"),
+            (2, "(3.26)", "V2' + rho V2 - |f'|^2/2 <= 0"),
+        )
     }
     envelopes: ClassVar[Mapping[int, Statement]] = {
         1: Statement("envelope, case 1", "(3.20)", "V2(t) <= V2(0) exp(-rho t)"),
@@ -211,12 +219,12 @@ class Theorem(TwoCases, MainClaim):
         if covers_limit(scenario):
             # The terms of (A.3), with w s of the barrier on e1.
             sample = point.sample
-            is_left_out = jnp.any(sample.guard_active)
+            is_excluded = jnp.any(sample.guard_active)
             if has(sample, "dq_lower"):
                 margin = margin_of(sample, 2, sample.alpha - sample.auxiliary)
-                is_left_out |= jnp.any(margin <= NARROWEST)
+                is_excluded |= jnp.any(margin <= NARROWEST)
             product = jnp.sum(point.now["s"] * sample.auxiliary)
-            entry = entry._replace(auxiliary=AuxiliaryTerms(product, is_left_out))
+            entry = entry._replace(auxiliary=AuxiliaryTerms(product, is_excluded))
         return terms._replace(
             size=size,
             sqrt_V_size=sqrt_V_size,
@@ -244,7 +252,7 @@ class Theorem(TwoCases, MainClaim):
         gains = gains_of(summary.run.scenario)
         return np.asarray(rho_terms(gains, source.lambda_max, case))
 
-    def extrema(self, scenario: Scenario, terms: Terms) -> dict[str, Extremum]:
+    def reductions(self, scenario: Scenario, terms: Terms) -> dict[str, Reduction]:
         """Extreme eigenvalues of M0 [kg m^2] and of M0^-1 K2 [1/s], sup |f'| and whether f' = 0 at
         every step.
         """
@@ -256,12 +264,12 @@ class Theorem(TwoCases, MainClaim):
             mu = (1.0 / _eigenvalues(M0 / (root[:, None] * root[None, :]))[:, -1]).min()
         half_square = 0.5 * np.sum(terms.d_tilde[0] ** 2)
         return {
-            "dd": Extremum(np.maximum, largest_norm(terms.dd)),
-            "steady": Extremum(operator.and_, bool(torque.steady.all())),
-            "lambda_min": Extremum(np.minimum, eigenvalues[:, 0].min()),
-            "lambda_max": Extremum(np.maximum, eigenvalues[:, -1].max()),
-            "mu": Extremum(np.minimum, mu),
-            "half_square_start": Extremum(lambda first, _: first, half_square),
+            "d_rate_largest": Reduction(np.maximum, largest_norm(terms.dd)),
+            "steady": Reduction(operator.and_, bool(torque.steady.all())),
+            "lambda_min": Reduction(np.minimum, eigenvalues[:, 0].min()),
+            "lambda_max": Reduction(np.maximum, eigenvalues[:, -1].max()),
+            "mu": Reduction(np.minimum, mu),
+            "half_square_start": Reduction(lambda first, _: first, half_square),
         }
 
     def constants(self, summary: Summary) -> dict[tuple[int, str], np.ndarray]:
@@ -276,7 +284,7 @@ class Theorem(TwoCases, MainClaim):
 
     def decay_bounds(self, summary: Summary) -> dict[int, DecayBound]:
         """Case -> constants of the decay."""
-        rho2 = {1: 0.0, 2: summary.F_d**2 / 2}
+        rho2 = {1: 0.0, 2: largest_f_rate(summary) ** 2 / 2}
         return {
             case: DecayBound(float(np.min(terms)), rho2[case], 1.0, 0.5)
             for (case, domain), terms in summary.constants[self.key].items()
@@ -285,28 +293,44 @@ class Theorem(TwoCases, MainClaim):
 
     def numbers(self, summary: Summary) -> dict[str, Any]:
         """The constants of the claim."""
-        extrema, over_box = summary.extrema, summary.over_box
+        reductions, over_box = summary.reductions, summary.over_box
+        F_d = largest_f_rate(summary)
         rho = {
             f"rho_{domain}_case_{case}": float(np.min(terms))
             for (case, domain), terms in summary.constants[self.key].items()
         }
         return {
             **rho,
-            "case": summary.case,
-            "F_m": float(extrema.d),
-            "F_d": summary.F_d,
-            "rho2": summary.F_d**2 / 2,
-            "V2_start": float(extrema.V_start),
-            "V2_end": float(extrema.V_end),
-            "lambda_min_run": float(extrema.lambda_min),
-            "lambda_max_run": float(extrema.lambda_max),
+            "case": case_of_run(summary),
+            "F_m": float(reductions.d_largest),
+            "F_d": F_d,
+            "rho2": F_d**2 / 2,
+            "V2_start": float(reductions.V_start),
+            "V2_end": float(reductions.V_end),
+            "lambda_min_run": float(reductions.lambda_min),
+            "lambda_max_run": float(reductions.lambda_max),
             "lambda_min_box": over_box.lambda_min,
             "lambda_max_box": over_box.lambda_max,
             "lambda_searched": over_box.searched,
             "q_of_lambda_max_box": over_box.q_max,
             "jump_times": summary.jumps,
-            "lambda_min_K2_over_M0_run": float(extrema.mu),
+            "lambda_min_K2_over_M0_run": float(reductions.mu),
         }
+
+    # --- for the settling time --------------------------------------------------------------------
+
+    def disturbance_gain_term(self, segment: Segment) -> np.ndarray:
+        """The term e2 . f_tilde + 1/2 e2^T M0' e2 (printed) at every step, (T,)."""
+        terms = segment.terms
+        by_f_tilde = np.sum(terms.e[:, 1] * terms.d_tilde, axis=1)
+        return by_f_tilde + terms.claims[TORQUE].dropped_e2  # type: ignore[no-any-return]
+
+    def why_no_settling(self, summary: Summary) -> str:
+        """Why no settling time follows; "" if one does."""
+        actuator = other_actuator(summary.run.scenario)
+        if actuator:
+            return f"(D.2) is about a torque that acts as it is commanded, not about {actuator}"
+        return summary.why_never or summary.why_invalid
 
     # --- assumptions ------------------------------------------------------------------------------
 
@@ -314,7 +338,7 @@ class Theorem(TwoCases, MainClaim):
         """Bounds of Assumption 1 along the run, and feasibility of the reference, Assumption 2."""
         summary, terms = segment.summary, segment.terms
         df_norm = np.linalg.norm(terms.dd, axis=1)
-        if summary.case == 1:
+        if case_of_run(summary) == 1:
             df_norm = 0.0 * df_norm
         jump_note = ""
         if summary.jumps.size:
@@ -350,17 +374,17 @@ class Theorem(TwoCases, MainClaim):
         conditions = (
             (K2, gains.K2 - LOWEST_K2, True),
             (kf_1, gains.kf - LOWEST_KF[1], True),
-            (kf_2, gains.kf - LOWEST_KF[2], summary.counts(2)),
+            (kf_2, gains.kf - LOWEST_KF[2], enters_verdict(summary, 2)),
         )
         lines = []
-        for statement, above_lowest, counts in conditions:
+        for statement, above_lowest, enters in conditions:
             margins = np.asarray(above_lowest)
             line = check_positive(
                 statement,
                 float(margins.min()),
                 joint=int(margins.argmin()),
-                counts=counts,
-                note="" if counts else CASE_1_COUNTS,
+                enters_verdict=enters,
+                note="" if enters else CASE_1_DECIDES,
             )
             lines.append(_unless_replaced(summary, line))
         return lines
@@ -378,23 +402,24 @@ class Theorem(TwoCases, MainClaim):
 
     def _rate(self, summary: Summary, case: int, domain: str) -> Line:
         """The rate rho of one case, with the eigenvalues of M0 of a domain."""
-        name = f"rho, case {case}" + {"run": "", "box": ", over the box"}[domain]
+        name, searched = f"rho, case {case}", ""
+        if domain == "box":
+            name, searched = f"{name}, over the box", f" ({summary.over_box.searched})"
         statement = self.rate_statement(name, case)
         reason = self.why_not(summary.run.scenario)
-        if case == 1 and summary.case == 2:
+        if case == 1 and case_of_run(summary) == 2:
             reason = self.why_not_in_case(summary, 1)
         if reason:
             return not_applicable(statement, reason)
         terms = summary.constants[self.key][case, domain]
         rho = float(np.min(terms))
         eigenvalue = self.eigenvalue_note(eigenvalues_in(summary, domain))
-        searched = {"run": "", "box": f" ({summary.over_box.searched})"}[domain]
         line = check_positive(
             statement,
             rho,
             value=rho,
             note=f"{eigenvalue}{searched}; set by {self.least[np.argmin(terms)]}",
-            counts=summary.counts(case),
+            enters_verdict=enters_verdict(summary, case),
         )
         return _unless_replaced(summary, line)
 
@@ -413,7 +438,7 @@ class Theorem(TwoCases, MainClaim):
         if case is None and WEIGHTED.replaces_theorem(summary):
             case = WEIGHTED.case_of(summary)
         if case is None:
-            why_unclaimed = self.why_not_in_case(summary, summary.case)
+            why_unclaimed = self.why_not_in_case(summary, case_of_run(summary))
         elif np.all(np.isnan(xi_bound_along(segment, segment.terms.V))):
             why_unclaimed = NO_BOUND
         margins, flag = 1.0 - np.abs(segment.sample.xi), Status.BOUND_VIOLATED
@@ -421,7 +446,7 @@ class Theorem(TwoCases, MainClaim):
 
     def bound_statements(self, summary: Summary) -> dict[str, Statement]:
         """The bounds that follow from the envelope, by name."""
-        case = self.case_of(summary) or summary.case
+        case = self.case_of(summary) or case_of_run(summary)
         by_barrier = "V1 <= Vbar: |xi_i| <= sqrt(1 - exp(-Vbar/w_i)), or as the barrier says"
         statements = (
             Statement("xi, by V1", XI_BOUND[case], by_barrier),
@@ -440,7 +465,7 @@ class Theorem(TwoCases, MainClaim):
         torque included.
         """
         summary, terms = segment.summary, segment.terms
-        case, auxiliary = summary.case, terms.claims[TORQUE].auxiliary
+        case, auxiliary = case_of_run(summary), terms.claims[TORQUE].auxiliary
         reason = self.why_not_in_run(summary)
         if not reason and not summary.decay_bounds[self.key, case].rho > 0:
             reason = "the gain conditions are not met"
@@ -486,18 +511,23 @@ class Theorem(TwoCases, MainClaim):
         summary, terms = segment.summary, segment.terms
         case = self.case_of(summary)
         why_unclaimed = self.why_not_in_run(summary)
-        why_no_case = self.why_not_in_case(summary, case or summary.case)
+        why_no_case = self.why_not_in_case(summary, case or case_of_run(summary))
         lines: list[Line] = []
         for statement, term, why_exact in self._dropped_parts(segment):
             reason = why_unclaimed or why_exact or why_no_case
             if reason or case is None:
-                lines.append(not_applicable(statement, reason, counts=False))
+                lines.append(not_applicable(statement, reason, enters_verdict=False))
                 continue
             margin = self._margin_of_proof(segment, case)
             largest = float(np.max(np.abs(term[~terms.excluded]), initial=0.0))
             tolerance = summary.eps * terms.size
             line = check_steps(
-                segment, statement, margin - term, tolerance, value=largest, counts=False
+                segment,
+                statement,
+                margin - term,
+                tolerance,
+                value=largest,
+                enters_verdict=False,
             )
             lines.append(line)
         return lines
@@ -571,10 +601,9 @@ def _eigenvalues(matrices: np.ndarray) -> np.ndarray:
 
 def eigenvalues_in(summary: Summary, domain: str) -> Any:
     """What has the extreme eigenvalues of M0 of a domain as `lambda_min` and `lambda_max`."""
-    return {"run": summary.extrema, "box": summary.over_box}[domain]
+    return {"run": summary.reductions, "box": summary.over_box}[domain]
 
 
-@programs.jit(static_argnames="case")
 def rho_terms(gains: Gains, lambda_max: jax.typing.ArrayLike, case: int) -> jax.Array:
     """The three terms of which rho is the least, (3,) [1/s].
     (3.19), (3.27)
@@ -597,8 +626,8 @@ def _unless_replaced(summary: Summary, line: Line) -> Line:
     """
     if line.verdict != FAILS or WEIGHTED.case_of(summary) is None:
         return line
-    counts = line.counts and not WEIGHTED.replaces_theorem(summary)
-    return dataclasses.replace(line, counts=counts, note=join_notes(NOT_NEEDED, line.note))
+    enters = line.enters_verdict and not WEIGHTED.replaces_theorem(summary)
+    return dataclasses.replace(line, enters_verdict=enters, note=join_notes(NOT_NEEDED, line.note))
 
 
 def _unclaimed_traces(

@@ -21,9 +21,10 @@ from iblf_jax.certificates.summary import (
     Summary,
     weighted_lyapunov,
 )
-from iblf_jax.certificates.terms import adaptive_law, on_position
+from iblf_jax.certificates.terms import Point, TorquePoint, adaptive_law
 from iblf_jax.control.barriers import Barrier
 from iblf_jax.control.controllers import Backstepping, TrackingLaw
+from iblf_jax.control.controllers._base import position_barrier
 from iblf_jax.control.observers import AsPublished, Momentum
 from iblf_jax.core import programs
 from iblf_jax.core.pytree import unwrapped
@@ -45,7 +46,7 @@ class Gains(NamedTuple):
 class TwoCases(Claim):
     """A claim with a case for f' = 0 and one for a bounded f'."""
 
-    about_torque: ClassVar[bool] = True
+    point: ClassVar[type[Point] | None] = TorquePoint
     inequalities: ClassVar[Mapping[int, Statement]]
     """By case."""
     envelopes: ClassVar[Mapping[int, Statement]]
@@ -65,8 +66,9 @@ class TwoCases(Claim):
         reason = self.why_not_in_run(summary)
         if reason:
             return reason
-        if case == 1 and summary.case == 2:
-            return f"case 1 is for f' = 0; here |f'| reaches {summary.F_d:.4g} N m/s, see case 2"
+        if case == 1 and case_of_run(summary) == 2:
+            reached = f"{largest_f_rate(summary):.4g} N m/s"
+            return f"case 1 is for f' = 0; here |f'| reaches {reached}, see case 2"
         return self.why_no_rate(summary, case) or summary.why_never
 
     def case_of(self, summary: Summary) -> int | None:
@@ -122,7 +124,7 @@ class TwoCases(Claim):
         summary = segment.summary
         case, statements = self.case_of(summary), self.bound_statements(summary)
         if case is None:
-            reason = self.why_not_in_case(summary, summary.case)
+            reason = self.why_not_in_case(summary, case_of_run(summary))
             return [not_applicable(statement, reason) for statement in statements.values()]
         envelope, w_f = segment.envelopes[self.key, case], summary.decay_bounds[self.key, case].w_f
         bounds = self.bounds_along(segment, envelope.bound, w_f)
@@ -158,9 +160,9 @@ class TwoCases(Claim):
         """
         summary = segment.summary
         return {
-            "e2": np.sqrt(2 * V / summary.extrema.lambda_min),
+            "e2": np.sqrt(2 * V / summary.reductions.lambda_min),
             "xi, by V1": xi_bound_along(segment, V),
-            "xi": np.sqrt(2 * V[:, None] / np.asarray(on_position(summary.law)[1])),
+            "xi": np.sqrt(2 * V[:, None] / np.asarray(position_barrier(summary.law)[1])),
             "f_tilde": np.sqrt(2 * V / w_f),
         }
 
@@ -181,10 +183,27 @@ class TwoCases(Claim):
         return ""
 
 
+def case_of_run(summary: Summary) -> int:
+    """The case of a run: 1 if f' = 0, else 2."""
+    return 1 if summary.reductions.steady else 2
+
+
+def enters_verdict(summary: Summary, case: int) -> bool:
+    """Whether a case enters the verdict: where f' = 0, case 1 decides."""
+    return case == 1 or case_of_run(summary) == 2
+
+
+def largest_f_rate(summary: Summary) -> float:
+    """F_d, the largest |f'| [N m/s]; 0 in case 1."""
+    if case_of_run(summary) == 1:
+        return 0.0
+    return float(summary.reductions.d_rate_largest)
+
+
 @programs.jit
 def _xi_bound(scenario: Scenario, t: jax.Array, V: jax.Array) -> jax.Array | None:
     """The barrier's own bound on |xi_i| where w_i V1_i <= V, (T, n), or None if it states none."""
-    barrier, weight = on_position(unwrapped(scenario.controller))
+    barrier, weight = position_barrier(unwrapped(scenario.controller))
     return jax.vmap(lambda t, V: barrier.xi_bound(V / weight, scenario.context.tube(t)))(t, V)
 
 

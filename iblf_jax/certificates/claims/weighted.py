@@ -28,10 +28,12 @@ from iblf_jax.certificates.claims.two_cases import (
     CASES,
     Gains,
     TwoCases,
+    enters_verdict,
     gains_of,
+    largest_f_rate,
     why_no_theorem,
 )
-from iblf_jax.certificates.lines import Line, Statement, check_positive, not_applicable
+from iblf_jax.certificates.lines import Line, Role, Statement, check_positive, not_applicable
 from iblf_jax.certificates.summary import DecayBound, Segment, Summary
 from iblf_jax.control.controllers import Backstepping
 from iblf_jax.control.observers import Momentum
@@ -52,7 +54,11 @@ class Weighted(TwoCases):
     key: ClassVar[str] = "weighted"
     inequalities: ClassVar[Mapping[int, Statement]] = {
         case: Statement(
-            f"weighted inequality, case {case}", "(W.1)", f"V_w' + rho V_w{term} <= 0", "N m rad/s"
+            f"weighted inequality, case {case}",
+            "(W.1)",
+            f"V_w' + rho V_w{term} <= 0",
+            "N m rad/s",
+            Role.WEIGHTED_INEQUALITY,
         )
         for case, term in {1: "", 2: " - w_f |f'|^2/(2 b)"}.items()
     }
@@ -62,6 +68,7 @@ class Weighted(TwoCases):
             "(W.3)",
             f"V_w(t) <= V_w(0) exp(-rho t){term}",
             "N m rad",
+            Role.WEIGHTED,
         )
         for case, term in {1: "", 2: " + rho2/rho"}.items()
     }
@@ -70,9 +77,22 @@ class Weighted(TwoCases):
             "weighted xi",
             "(W.3)",
             "w_i V1_i <= Vbar: |xi_i| <= sqrt(1 - exp(-Vbar/w_i)), or as the barrier says",
+            role=Role.WEIGHTED,
         ),
-        "e2": Statement("weighted e2", "(W.3)", "|e2| <= sqrt(2 Vbar/lambda_min(M0))", "rad/s"),
-        "f_tilde": Statement("weighted f_tilde", "(W.3)", "|f_tilde| <= sqrt(2 Vbar/w_f)", "N m"),
+        "e2": Statement(
+            "weighted e2",
+            "(W.3)",
+            "|e2| <= sqrt(2 Vbar/lambda_min(M0))",
+            "rad/s",
+            Role.WEIGHTED,
+        ),
+        "f_tilde": Statement(
+            "weighted f_tilde",
+            "(W.3)",
+            "|f_tilde| <= sqrt(2 Vbar/w_f)",
+            "N m",
+            Role.WEIGHTED,
+        ),
     }
     lyapunov: ClassVar[str] = "V_w, "
 
@@ -99,15 +119,13 @@ class Weighted(TwoCases):
 
     def constants(self, summary: Summary) -> dict[int, WeightedConstants]:
         """The numbers of the claim by case."""
-        extrema = summary.extrema
-        half_square = float(extrema.half_square_start)
-        V_rest = float(extrema.V_start) - half_square
-        gains, mu = gains_of(summary.run.scenario), float(extrema.mu)
+        reductions, F_d = summary.reductions, largest_f_rate(summary)
+        half_square = float(reductions.half_square_start)
+        V_rest = float(reductions.V_start) - half_square
+        gains, mu = gains_of(summary.run.scenario), float(reductions.mu)
         found = {}
         for case in CASES:
-            best = best_constants(
-                gains, mu, V_rest, half_square, summary.F_d, summary.duration, case
-            )
+            best = best_constants(gains, mu, V_rest, half_square, F_d, summary.duration, case)
             if best is not None:
                 found[case] = best
         return found
@@ -139,11 +157,12 @@ class Weighted(TwoCases):
 
     def _rate(self, summary: Summary, case: int) -> Line:
         """The rate of one case, with the chosen numbers."""
-        statement = Statement(f"weighted rho, case {case}", "(W.2)", RATE[case], "1/s")
+        name = f"weighted rho, case {case}"
+        statement = Statement(name, "(W.2)", RATE[case], "1/s", Role.WEIGHTED)
         reason = self.why_not_in_case(summary, case)
         if reason:
             return not_applicable(statement, reason)
-        gains, mu = gains_of(summary.run.scenario), float(summary.extrema.mu)
+        gains, mu = gains_of(summary.run.scenario), float(summary.reductions.mu)
         chosen = summary.constants[self.key][case]
         limits = (np.min(gains.decay_rate), 2.0 * mu, 2.0 * np.min(gains.kf))
         least = ("the decay rate of V1", "K2 over M0", "kf")[int(np.argmin(limits))]
@@ -155,8 +174,13 @@ class Weighted(TwoCases):
             f" {mu:.4g} 1/s; limited by {least}"
         )
         terms = rate_terms(gains, mu, chosen.a, chosen.b, chosen.w_f)
-        margin, counts = float(np.min(terms)), summary.counts(case)
-        return check_positive(statement, margin, value=chosen.rho, note=note, counts=counts)
+        return check_positive(
+            statement,
+            float(np.min(terms)),
+            value=chosen.rho,
+            note=note,
+            enters_verdict=enters_verdict(summary, case),
+        )
 
 
 WEIGHTED = Weighted()
@@ -222,7 +246,9 @@ def best_constants(
     # Axes: rates rho, then fractions of the largest b.
     rho = rho_limit * GRID[:, None]
     a = 1.0 - rho / (2.0 * mu)
-    fractions = {1: np.zeros((1, 1)), 2: GRID[None, :]}[case]
+    fractions = np.zeros((1, 1))
+    if case == 2:
+        fractions = GRID[None, :]
     b = 2.0 * (np.min(kf) - rho / 2.0) * fractions
     kf_margin = kf - (b + rho)[..., None] / 2.0
     w_f = np.max(0.25 / (a[..., None] * K2 * kf_margin), axis=-1)

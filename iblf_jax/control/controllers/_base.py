@@ -1,9 +1,9 @@
 """The contract of a tracking law.
 
-A law knows the model, the reference and the bounds (its `LawContext`), measures q and q', receives
-the observer's estimate and commands a torque.  It also returns signals for records and
-certificates: its virtual velocity alpha, its Lyapunov function V1, and whether a guard or a limit
-was active.
+A law is a `Law` of the state x or a `RobotLaw` of (q, q'); the loop calls both as a `Law`
+(`law_of_x`).  It knows the model, the reference and the bounds (its `LawContext`), receives the
+observer's estimate and commands an input.  It also returns signals for records and certificates:
+its virtual velocity alpha, its Lyapunov function V1, and whether a guard or a limit was active.
 """
 
 from __future__ import annotations
@@ -131,6 +131,8 @@ class Command(NamedTuple):
 class TrackingLaw(Timed):
     """What every tracking law states: a `Law` of the state x, or a `RobotLaw` of q and q'."""
 
+    receives_x: ClassVar[bool]
+    """Whether it receives the state x, as a `Law` does, and not q and q'."""
     gains: ClassVar[tuple[str, ...]] = ("k1", "K2")
     """The names of the leaves that `compare` scales together."""
     factors: ClassVar[tuple[str, ...]] = ()
@@ -212,6 +214,8 @@ class Law(TrackingLaw):
     dV/dx . d_tilde + dV/dd_tilde . d' by default.
     """
 
+    receives_x: ClassVar[bool] = True
+
     @abc.abstractmethod
     def init(self, x: jax.Array, context: LawContext) -> State:
         """State at the start of a run, given x, (r, n), there; `()` for most laws."""
@@ -282,6 +286,8 @@ class RobotLaw(TrackingLaw):
 
     A law with a proof of its own is a `LyapunovLaw`; then `certify` checks what it states.
     """
+
+    receives_x: ClassVar[bool] = False
 
     @abc.abstractmethod
     def init(self, q: jax.Array, dq: jax.Array, context: LawContext) -> State:
@@ -379,7 +385,7 @@ class RobotLaw(TrackingLaw):
 
 
 @component
-class LawOfRobot(Law):
+class RobotLawAdapter(Law):
     """command(t, x, ...) = law.command(t, x_1, x_2, ...): a law of q and q' in the closed loop.
 
     It is no part of a scenario.
@@ -471,7 +477,7 @@ def law_of_x(law: TrackingLaw) -> Law:
     if isinstance(law, Law):
         return law
     assert isinstance(law, RobotLaw)
-    return LawOfRobot(law)
+    return RobotLawAdapter(law)
 
 
 class Wrapping(Law):
@@ -543,6 +549,13 @@ def decay_of(law: TrackingLaw, i: int) -> Decay:
     if not law.decays:
         return Exponential()
     return law.decays[i]
+
+
+def position_barrier(law: Any) -> tuple[Barrier, jax.Array]:
+    """The barrier of the positions of a law that has one, and the weight of its V1, (n,)."""
+    if law.barriers:
+        return law.barriers[0], law.weights[0]
+    return law.barrier, law.weight
 
 
 class LyapunovLaw(RobotLaw):

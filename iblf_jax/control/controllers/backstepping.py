@@ -17,13 +17,13 @@ exact.
 
 **Decays.**  The gain k1 may depend on the time and on V1, k1(t, V1) >= k1 (`decays`), and then
 V1' <= -rate(k1(t, V1)) V1 + s . e2.  The second step has a decay of its own, of the energy
-W = 1/2 e2^T M0 e2 with a gain g(t, W) that all joints share:
+W = 1/2 e2^T M0 e2 with a gain k2(t, W) that all joints share:
 
-    tau = ... - g(t, W) M0 e2,   W' = -2 g(t, W) W - e2^T K2 e2 + e2 . f_tilde - w s . e2     (D.1)
+    tau = ... - k2(t, W) M0 e2,   W' = -2 k2(t, W) W - e2^T K2 e2 + e2 . f_tilde - w s . e2    (D.1)
 
-in the corrected variant, because e2^T (g M0 e2) = 2 g W.  V = sum w V1 + W then obeys
+in the corrected variant, because e2^T (k2 M0 e2) = 2 k2 W.  V = sum w V1 + W then obeys
 
-    V' <= -sum w rate(k1(t, V1)) V1 - 2 (mu + g(t, W)) W + e2 . f_tilde,  mu = lambda_min(M0^-1 K2)
+    V' <= -sum w rate(k1(t, V1)) V1 - 2 (mu + k2(t, W)) W + e2 . f_tilde,  mu = lambda_min(M0^-1 K2)
 
 With a decay of finite, fixed or prescribed time in both steps, so does V.
 """
@@ -244,7 +244,7 @@ def fit_decays(law, count: int) -> None:
 def with_energy_decay(
     law, t: jax.Array, q: jax.Array, e2: jax.Array, context: LawContext, tau: jax.Array
 ) -> jax.Array:
-    """A torque with the decay of the energy W of e2 added, tau - g(t, W) M0 e2, (n,) [N m]; (D.1).
+    """A torque with the decay of the energy W of e2 added, tau - k2(t, W) M0 e2, (n,) [N m]; (D.1).
 
     Args:
       law: with `decays`.

@@ -16,7 +16,7 @@ then remain true, and the decay adds its own: a time after which V is inside a b
 
 V is the value of the barrier without the weight of the law.  `controllers.Backstepping` and
 `DynamicSurface` have no barrier in their second step; there V is the energy W = 1/2 e2^T M0 e2, the
-gain k is 0, and the torque -M0 k(t, W) e2 adds -2 k(t, W) W to W'.
+gain k is 0, and the torque -M0 k2(t, W) e2 adds -2 k2(t, W) W to W'.
 """
 
 from __future__ import annotations

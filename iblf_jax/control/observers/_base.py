@@ -163,7 +163,7 @@ class RobotObserver(DisturbanceObserver):
 
 
 @component
-class ObserverOfRobot(Observer):
+class RobotObserverAdapter(Observer):
     """estimate(t, x, ...) = observer.estimate(t, x_1, x_2, ...): an observer of q and q' in the
     closed loop.
 
@@ -182,9 +182,9 @@ class ObserverOfRobot(Observer):
         """Whether the observer has `advance`."""
         return not is_default(self.observer.advance, RobotObserver.advance)
 
-    def at_period(self, period: jax.Array) -> ObserverOfRobot:
+    def at_period(self, period: jax.Array) -> RobotObserverAdapter:
         """The observer with gains for steps of Euler."""
-        return ObserverOfRobot(self.observer.at_period(period))
+        return RobotObserverAdapter(self.observer.at_period(period))
 
     def init(self, x: jax.Array, model: Plant) -> State:
         """State of the observer."""

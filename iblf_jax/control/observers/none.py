@@ -8,8 +8,8 @@ import jax.numpy as jnp
 from iblf_jax.control.observers._base import (
     DisturbanceObserver,
     Observer,
-    ObserverOfRobot,
     RobotObserver,
+    RobotObserverAdapter,
 )
 from iblf_jax.core.pytree import component
 from iblf_jax.world.plants import Plant
@@ -83,4 +83,4 @@ def observer_of_x(observer: DisturbanceObserver) -> Observer:
     if type(observer) is NoObserver:
         return _NoEstimate()
     assert isinstance(observer, RobotObserver)
-    return ObserverOfRobot(observer)
+    return RobotObserverAdapter(observer)

@@ -139,7 +139,7 @@ class RobotSensor(AnySensor):
 
 
 @component
-class SensorOfRobot(Sensor):
+class RobotSensorAdapter(Sensor):
     """measure(x, ...) = sensor.measure(x_1, x_2, ...): a sensor of q and q' in the closed loop.
 
     It is no part of a scenario.
@@ -176,7 +176,7 @@ def sensor_of_x(sensor: AnySensor) -> Sensor:
     if isinstance(sensor, Sensor):
         return sensor
     assert isinstance(sensor, RobotSensor)
-    return SensorOfRobot(sensor)
+    return RobotSensorAdapter(sensor)
 
 
 def contract_of(sensor: object) -> type[Sensor] | type[RobotSensor]:
