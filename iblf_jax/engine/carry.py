@@ -95,7 +95,7 @@ def start(inputs: Inputs, method: str, jacobian: jax.Array) -> Carry:
       jacobian: what a `LinearizationStep` has found at the start.
     """
     state, zero = initial_state(inputs.scenario), jnp.zeros_like(inputs.dt)
-    shapes = jax.eval_shape(evaluate, inputs.scenario, inputs.dt, state, inputs.dt)[1]
+    shapes = jax.eval_shape(evaluate, inputs.scenario, inputs.dt, state)[1]
     sample = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
     blank = begun(inputs.folds, sample)
     constant, jacobian = jax.lax.stop_gradient((state, jacobian))

@@ -79,7 +79,7 @@ def numbers_of(inputs: Inputs, record: Callable) -> int:
 
     def one(inputs):
         state = initial_state(inputs.scenario)
-        sample = evaluate(inputs.scenario, inputs.dt, state, inputs.dt)[1]
+        sample = evaluate(inputs.scenario, inputs.dt, state)[1]
         seen = MetricSample(tuple(fold.init(sample) for fold in inputs.folds), sample, True)
         samples = (seen,) * samples_of_step(inputs.scenario)
         found = Advanced(None, samples, state)  # type: ignore[arg-type]

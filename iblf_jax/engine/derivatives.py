@@ -214,7 +214,7 @@ def without_flags(sample: Sample) -> Any:
 
 
 def preaccumulated(scenario, directions: Directions, eps: jax.Array) -> Callable:
-    """`closed_loop.evaluate`, its Jacobian by directions and state (of a sampled loop torque and
+    """`closed_loop.evaluate`, its Jacobian by directions and state (of a sampled loop command and
     time too) worked out once and applied to every tangent.
 
     One tangent through the law costs as much as the law; applying the Jacobian costs a tenth of it.
@@ -223,24 +223,24 @@ def preaccumulated(scenario, directions: Directions, eps: jax.Array) -> Callable
     """
     jumps = scenario.jump_times().size > 0
 
-    def loop(moved, t, state, dt=0.0, torque=None):
-        # A stage's time moves where a torque arrives within a step, or a jump time does.
-        torques = tuple(x for x in (torque,) if x is not None)
-        times = tuple(x for x in (t,) if torque is not None or jumps)
-        leaves, structure = jax.tree.flatten((state, torques, times))
+    def evaluated(moved, t, state, command=None):
+        # A stage's time moves where a command arrives within a step, or a jump time does.
+        commands = tuple(x for x in (command,) if x is not None)
+        times = tuple(x for x in (t,) if command is not None or jumps)
+        leaves, structure = jax.tree.flatten((state, commands, times))
         real = [jnp.issubdtype(x.dtype, jnp.floating) for x in leaves]
         here, unravel = ravel_pytree([x for x, yes in zip(leaves, real, strict=True) if yes])
         flags = [x for x, yes in zip(leaves, real, strict=True) if not yes]
 
         # All that it reads is handed in: within a branch of JAX's it may close over nothing that is
         # traced.
-        def numbers(flat, eps, scenario, flags, t, dt):
+        def numbers(flat, eps, scenario, flags, t):
             parts, rest = iter(unravel(flat)), iter(flags)
-            state, torque, time = jax.tree.unflatten(
+            state, command, time = jax.tree.unflatten(
                 structure, [next(parts if yes else rest) for yes in real]
             )
             (t,) = time or (t,)
-            slope, sample = evaluate(directions.moved(scenario, eps), t, state, dt, *torque)
+            slope, sample = evaluate(directions.moved(scenario, eps), t, state, *command)
             return (slope, without_flags(sample)), attributes(sample, FLAG_FIELDS)
 
         @jax.custom_jvp
@@ -259,11 +259,11 @@ def preaccumulated(scenario, directions: Directions, eps: jax.Array) -> Callable
                 lambda column: jnp.tensordot(along, column, 1), columns
             )
 
-        at = here, eps, scenario, flags, t, jnp.asarray(dt, t.dtype)
+        at = here, eps, scenario, flags, t
         slope, values = floats(*at)
         return slope, Sample(**values, **numbers(*jax.lax.stop_gradient(at))[1])
 
-    return loop
+    return evaluated
 
 
 def count_curvatures(folds: Any) -> int:

@@ -83,9 +83,7 @@ class LinearizationStep(Step):
         direction = jnp.where(iteration < 0, unit, carry.growth.direction)
 
         def rate_at(y):
-            return ravel_pytree(
-                perturbed_rate(inputs.scenario, carry.time, as_state(y), inputs.dt)
-            )[0]
+            return ravel_pytree(perturbed_rate(inputs.scenario, carry.time, as_state(y)))[0]
 
         plant = as_state(x)
         if inputs.scenario.sampling is not None:

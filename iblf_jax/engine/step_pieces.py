@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from iblf_jax.core.pytree import is_absent
 from iblf_jax.engine.carry import Inputs, StepOptions
 from iblf_jax.engine.metric_folds import split_floats, updated, weighed
 from iblf_jax.engine.status_flags import sample_status
@@ -92,8 +93,8 @@ class LoopAlongStep(NamedTuple):
     inputs: Inputs
     state: LoopState
     """At the instant, after what is due there."""
-    torques: tuple
-    """For a sampled law, the torques at the actuator before and after a command arrives within the
+    commands: tuple
+    """For a sampled law, the commands at the actuator before and after one arrives within the
     step."""
     arriving: Any = ()
     """The `ArrivingCommands` of a continuous loop whose input has a delay; `()` without one."""
@@ -101,7 +102,7 @@ class LoopAlongStep(NamedTuple):
     @property
     def jumps_with_law(self) -> bool:
         """Whether the input jumps at once where the command of the law does."""
-        return self.inputs.scenario.sampling is None and not self.arriving
+        return self.inputs.scenario.sampling is None and is_absent(self.arriving)
 
     def at(
         self,
@@ -118,19 +119,27 @@ class LoopAlongStep(NamedTuple):
           moved: the `integrated_part` of the state.
           command: that arrives, (n,), where the input has a delay; that of the time t if not given.
         """
-        torque = self.torques
-        if self.arriving:
-            if command is None:
-                command = self.arriving.at(discontinuities.stage_time(piece, t))
-            torque = (command,)
-        elif torque and isinstance(piece.command_arrived, bool):
-            torque = (torque[int(piece.command_arrived)],)
-        elif torque:
-            torque = (jnp.where(piece.command_arrived, torque[1], torque[0]),)
         scenario, time = self.inputs.scenario, discontinuities.stage_time(piece, t)
         state = with_integrated_part(self.state, moved)
-        rate, sample = self.evaluate(scenario, time, state, self.inputs.dt, *torque)
+        if command is None:
+            command = self._command_at(piece, time)
+        # JAX keys what it traced by the arguments as they are given, a None included.
+        given = () if command is None else (command,)
+        rate, sample = self.evaluate(scenario, time, state, *given)
         return with_process_noise(scenario, time, state, rate, piece.noise_rate), sample
+
+    def _command_at(self, piece: discontinuities.Piece, time: jax.Array) -> jax.Array | None:
+        """The command at the actuator at a time within a piece, (n,); None where it is that of the
+        law at once.
+        """
+        if not is_absent(self.arriving):
+            return self.arriving.at(time)
+        if not self.commands:
+            return None
+        before, after = self.commands
+        if isinstance(piece.command_arrived, bool):
+            return after if piece.command_arrived else before
+        return jnp.where(piece.command_arrived, after, before)
 
 
 def integrated(
@@ -142,7 +151,7 @@ def integrated(
 ) -> integrators.StepResult:
     """One step of the integrator over a piece, with the commands that arrive at its stages."""
     commands = None
-    if along.arriving:
+    if not is_absent(along.arriving):
         times = [
             discontinuities.stage_time(piece, piece.begin + c * piece.length)
             for c in integrators.tableau(method).c
@@ -185,7 +194,7 @@ def across_jumps(
 
     def rate(t, state):
         time = discontinuities.stage_time(piece, t)
-        slope, sample = evaluate(inputs.scenario, time, state, dt)
+        slope, sample = evaluate(inputs.scenario, time, state)
         return with_process_noise(inputs.scenario, time, state, slope, piece.noise_rate), sample
 
     def gains_of(sample):
@@ -194,7 +203,7 @@ def across_jumps(
                 updated(inputs.folds, begun, dataclasses.replace(sample, dt=weight))
             )[0]
 
-        gains = jax.jvp(sums, (sample.dt,), (jnp.ones_like(sample.dt),))[1]
+        gains = jax.jvp(sums, (dt,), (jnp.ones_like(dt),))[1]
         return [jnp.where(counts, gain, jnp.zeros_like(gain)) for gain in gains]
 
     floats, replaced = split_floats(accumulators)

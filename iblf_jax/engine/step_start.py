@@ -53,13 +53,13 @@ def sampled_start(
     due = (now.phase == 0) & (index > 0)
     t = index.astype(dt.dtype) * dt
     state = run_sampled_law_if_due(scenario, t, carry.state, now, inputs.noise)
-    torques = sampling.step_torques(scenario.sampling, dt, now, state.sampled.commands)
+    commands = sampling.step_commands(scenario.sampling, dt, now, state.sampled.commands)
     before = sampling.arrival_before(scenario.sampling, dt, now)
     arrivals = None
     if before is not None:
-        arrivals = ((torques.arrival * dt, torques.arrives), before)
+        arrivals = ((commands.arrival * dt, commands.arrives), before)
     times = step_times(inputs, index, method, arrivals)
-    along = LoopAlongStep(evaluated, inputs, state, (torques.torque, torques.next))
+    along = LoopAlongStep(evaluated, inputs, state, (commands.first, commands.next))
     accumulators, metric_samples = _before_sample(along, carry, due, times)
     length = jnp.where(due, jnp.zeros_like(dt), times.previous_piece_length)
     times = times._replace(previous_piece_length=length)
@@ -71,7 +71,7 @@ def _before_sample(
 ) -> tuple[tuple, tuple[MetricSample, ...]]:
     """The accumulators after the sample just before the law runs, where it is due; and that sample.
 
-    The law's signals, and without a delay the torque, jump there.
+    The law's signals, and without a delay the command, jump there.
     """
     folds, scenario, dt = along.inputs.folds, along.inputs.scenario, along.inputs.dt
     if not folds:
@@ -79,7 +79,7 @@ def _before_sample(
     commands = carry.state.sampled.commands
     pending = along.state.sampled.commands
     schedule: Any = scenario.sampling
-    torque = sampling.torque_before(schedule, dt, commands, pending)
+    command = sampling.command_before(schedule, dt, commands, pending)
     t, previous_piece_length = times.span.start, times.previous_piece_length
     seen_at = (
         t
@@ -88,7 +88,7 @@ def _before_sample(
     )
 
     def seen(accumulators):
-        sample = along.evaluate(scenario, seen_at, carry.state, dt, torque)[1]
+        sample = along.evaluate(scenario, seen_at, carry.state, command)[1]
         sample = weighed(sample, t, 0.5 * previous_piece_length, jnp.zeros_like(dt))
         return updated(folds, accumulators, sample), sample
 

@@ -124,8 +124,8 @@ def advance(
     state = along.state
     first = times.division.pieces[0]
     stepped = integrated(along, first, integrated_part(state), method, options)
-    if along.arriving:
-        commands = [slope.delayed for slope in stepped.slopes]
+    if not is_absent(along.arriving):
+        commands = [slope.command for slope in stepped.slopes]
         along = along._replace(arriving=along.arriving.with_commands_of_step(commands))
     ahead = jnp.where(times.span.in_run, first.length, jnp.zeros_like(inputs.dt))
     step = jnp.where(index > 0, inputs.dt, jnp.zeros_like(inputs.dt))
@@ -145,7 +145,7 @@ def advance(
     later = later_pieces(along, times.division.pieces, stepped, accumulators, method, options)
     parts = [(first.length, stepped.slopes), *later.parts]
     state_after = with_integrated_part(state, later.moved)
-    if along.arriving:
+    if not is_absent(along.arriving):
         state_after, parts = _with_commands(
             along, method, times.division.pieces, state_after, parts
         )
@@ -183,12 +183,12 @@ def _with_commands(
     pieces of the step, whose slopes no longer contain the commands.
     """
     of_pieces = [
-        delays.PieceCommands(piece.begin, length, piece.exists, [slope.delayed for slope in slopes])
+        delays.PieceCommands(piece.begin, length, piece.exists, [slope.command for slope in slopes])
         for piece, (length, slopes) in zip(pieces, parts, strict=True)
     ]
     commands = delays.with_step(along.state.delayed, method, along.arriving, of_pieces)
     without_commands = [
-        (length, [slope._replace(delayed=()) for slope in slopes]) for length, slopes in parts
+        (length, [slope._replace(command=()) for slope in slopes]) for length, slopes in parts
     ]
     return after._replace(delayed=commands), without_commands
 
@@ -301,7 +301,7 @@ def recorded(folds: Any, found: Advanced) -> Record:
     """The signals of an instant, and the states of law, observer, actuator and sensor."""
     state, measured = found.state, ()
     if not is_absent(state.sampled):
-        measured = state.sampled.measured
+        measured = state.sampled.received
     signals = attributes(found.sample, FIELDS)
     return Record(signals, state.controller, state.observer, state.actuator, measured)
 

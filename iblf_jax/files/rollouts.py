@@ -215,7 +215,7 @@ def _rollout_of(
             "controller_state": start.controller,
             "observer_state": start.observer,
             "actuator_state": start.actuator,
-            "measured": start.sampled.measured if scenario.sampling is not None else (),
+            "measured": start.sampled.received if scenario.sampling is not None else (),
         }
         arrays = {str(name): variable.values for name, variable in data.data_vars.items()}
         levels = {name: jnp.asarray(earlier.levels(arrays, name)) for name in LEVEL_SIGNALS}

@@ -4,7 +4,7 @@ A Runge-Kutta step across a jump is of first order, whatever the method. A step 
 integrated in pieces that end where
 
     a jump time of the scenario lies in it,   t_k < t_j <= t_(k+1)   (`Scenario.jump_times`),
-    a command of a sampled law arrives in it  (`sampling.step_torques`).
+    a command of a sampled law arrives in it  (`sampling.step_commands`).
 
 A jump at the end of a step belongs to that step and is followed by a piece of length 0. The
 lengths of the pieces, this one included, depend on jump times and delays, so the derivative of the

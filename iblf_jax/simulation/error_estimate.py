@@ -328,7 +328,7 @@ def local_error_of_state(
     """
 
     def flat(slope: LoopState) -> jax.Array:
-        slope = slope._replace(delayed=())
+        slope = slope._replace(command=())
         return jax.lax.stop_gradient(ravel_pytree(slope)[0])
 
     table = tableau(method)
