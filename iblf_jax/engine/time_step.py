@@ -242,7 +242,7 @@ def _concluded(
             grown = _grown_error(method, inputs, carry, index, parts, before, width)
             estimate = estimate._replace(growth=grown)
     after, raised = later
-    status = carry.status | sample_status(sample)
+    status = carry.status | sample_status(inputs.scenario, sample)
     if raised is not None:
         status = status | raised
     plant = inputs.scenario.loop.plant
