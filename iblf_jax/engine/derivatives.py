@@ -49,12 +49,12 @@ from jax.flatten_util import ravel_pytree
 
 from iblf_jax.core.attributes import attributes
 from iblf_jax.engine import thresholds
-from iblf_jax.engine.batch import Batch, StepLoop, finalize, initialize
+from iblf_jax.engine.batch import Batch, Stepper, finalize, initialize
 from iblf_jax.engine.carry import Carry, Inputs, Step, StepOptions
 from iblf_jax.engine.metric_folds import finished, split_floats
 from iblf_jax.engine.outcome import Outcome
 from iblf_jax.engine.request import RunRequest
-from iblf_jax.engine.time_step import Advanced, advance
+from iblf_jax.engine.time_step import StepOutput, advance
 from iblf_jax.simulation import error_estimate
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
 from iblf_jax.simulation.paths import get, with_parameters
@@ -279,7 +279,7 @@ def outers_of(folds, accumulators, sample) -> tuple[Outer, ...]:
     return found
 
 
-def outers_of_step(folds, found: Advanced) -> list[Outer]:
+def outers_of_step(folds, found: StepOutput) -> list[Outer]:
     """What all samples of a step add to them."""
     samples = []
     for seen in found.metric_samples:
@@ -308,13 +308,11 @@ class DerivativeStep(Step):
 
         def one(scenario, before, eps):
             # On arrays a Jacobian for a few tangents would cost more than the tangents.
-            loop = (
-                preaccumulated(inputs.scenario, self.directions, eps)
-                if options.scalar
-                else evaluate
-            )
+            function: Callable = evaluate
+            if options.scalar:
+                function = preaccumulated(inputs.scenario, self.directions, eps)
             found = advance(
-                inputs._replace(scenario=scenario), before, index, self.method, options, loop
+                inputs._replace(scenario=scenario), before, index, self.method, options, function
             )
             outers = outers_of_step(inputs.folds, found)
             vectors = [outer.vector for outer in outers]
@@ -330,7 +328,7 @@ class DerivativeStep(Step):
 
 
 def run_with_tangents(
-    loop: StepLoop, batch: Batch, directions: Directions, request: RunRequest
+    run_steps: Stepper, batch: Batch, directions: Directions, request: RunRequest
 ) -> Tangents:
     """All runs with their tangents, from the start to the outcome; `request` records nothing."""
     rows, columns = np.triu_indices(directions.tangents)
@@ -361,10 +359,10 @@ def run_with_tangents(
             full.at[rows, columns].set(x).at[columns, rows].set(x) for x in before.products
         )
 
-    carry, instant = initialize(loop, batch, request.method)
+    carry, instant = initialize(run_steps, batch, request.method)
     before = batch.map_runs(at_start, carry)
-    after, _ = loop(
+    after, _ = run_steps(
         DerivativeStep(request.method, directions), batch, before, request.steps + 1, None
     )
     tangents, products = batch.map_runs(at_end, after)
-    return Tangents(finalize(loop, batch, request, after.carry, instant), tangents, products)
+    return Tangents(finalize(run_steps, batch, request, after.carry, instant), tangents, products)

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from iblf_jax.engine.carry import Inputs, Step, StepOptions, keep_if
+from iblf_jax.engine.carry import Inputs, Step, StepOptions, tree_where
 from iblf_jax.simulation import error_estimate, stability
 from iblf_jax.simulation.closed_loop import (
     LoopState,
@@ -36,8 +36,7 @@ class Linearization(NamedTuple):
     time: jax.Array
     state: jax.Array
     """(m,)."""
-    growth: stability.PowerIteration
-    """Of the power iteration."""
+    power_iteration: stability.PowerIteration
     lengths: Any
     """Lengths of the columns of `jacobian` that are found, (3, m') [1/s], where a power iteration
     reads them; `()` elsewhere."""
@@ -75,12 +74,12 @@ class LinearizationStep(Step):
         as_state = ravel_pytree(perturbed_state(start))[1]
         iteration = index - 3 * watched.size
         count = jnp.asarray(watched.size, index.dtype)
-        level = jax.lax.div(index, count)
-        number = index - level * count
+        size_index = jax.lax.div(index, count)
+        number = index - size_index * count
         rank = np.full(x.size, -1, index.dtype)
         rank[watched] = np.arange(watched.size)
         unit = (jnp.asarray(rank) == number).astype(x.dtype)
-        direction = jnp.where(iteration < 0, unit, carry.growth.direction)
+        direction = jnp.where(iteration < 0, unit, carry.power_iteration.direction)
 
         def rate_at(y):
             return ravel_pytree(perturbed_rate(inputs.scenario, carry.time, as_state(y)))[0]
@@ -93,7 +92,7 @@ class LinearizationStep(Step):
             iteration < 0, jnp.sum(rooms * unit), jnp.asarray(stability.THIRD_SIZE, x.dtype)
         )
         sizes = stability.difference_sizes(x, direction, room)
-        widest = level == 2
+        widest = size_index == 2
         if (
             len(watched) < x.size
         ):  # a power iteration follows, across infinite slopes by the widest differences
@@ -101,24 +100,26 @@ class LinearizationStep(Step):
                 stability.is_infinite(carry.lengths, inputs.scenario.sampling is not None)
             )
         size = jnp.where(
-            widest, sizes[2], jnp.where((level == 1) & (iteration < 0), sizes[1], sizes[0])
+            widest, sizes[2], jnp.where((size_index == 1) & (iteration < 0), sizes[1], sizes[0])
         )
         w = stability.directional_derivative(rate_at, x, direction, size)
         column = jnp.stack([w[i] for i in watched])
-        growth, lengths = carry.growth, carry.lengths
+        power_iteration, lengths = carry.power_iteration, carry.lengths
         if len(watched) < x.size:
-            growth = keep_if(
-                iteration < 0, growth, stability.power_iteration_step(growth, w, iteration)
+            power_iteration = tree_where(
+                iteration < 0,
+                power_iteration,
+                stability.power_iteration_step(power_iteration, w, iteration),
             )
             columns = jnp.arange(watched.size, dtype=index.dtype) == number
-            chosen = (jnp.arange(3, dtype=index.dtype) == level)[:, None] & columns
+            chosen = (jnp.arange(3, dtype=index.dtype) == size_index)[:, None] & columns
             lengths = jnp.where(chosen, jnp.sum(jnp.abs(column)), lengths)
-        unresolved = keep_if(
+        unresolved = tree_where(
             index == 0,
             error_estimate.with_acceleration(inputs.scenario, carry.unresolved),
             carry.unresolved,
         )
-        return Linearization(carry.time, x, growth, lengths, unresolved), column
+        return Linearization(carry.time, x, power_iteration, lengths, unresolved), column
 
 
 def linearization_steps(scenario: Scenario) -> int:
@@ -147,7 +148,7 @@ def fastest_mode(scenario: Scenario, found: Linearization) -> jax.Array:
     is_complete = len(jacobian) == found.state.size
     if is_complete:
         return stability.growth_rate_of_matrix(jacobian)
-    return stability.growth_rate(found.growth)
+    return stability.growth_rate(found.power_iteration)
 
 
 def linearization_at(

@@ -23,7 +23,7 @@ import numpy as np
 from iblf_jax.core import programs
 from iblf_jax.core.caches import CACHE
 from iblf_jax.engine import registry, thresholds
-from iblf_jax.engine.batch import Batch, StepLoop, finalize, initialize, run_all
+from iblf_jax.engine.batch import Batch, Stepper, finalize, initialize, run_all
 from iblf_jax.engine.carry import Carry
 from iblf_jax.engine.compile import (
     building,
@@ -35,7 +35,7 @@ from iblf_jax.engine.compile import (
     structural_part,
 )
 from iblf_jax.engine.linearization import Linearization
-from iblf_jax.engine.loops import kernel_loop, scan
+from iblf_jax.engine.loops import kernel_stepper, scan
 from iblf_jax.engine.outcome import Outcome
 from iblf_jax.engine.registry import Executor
 from iblf_jax.engine.request import RunRequest
@@ -60,7 +60,7 @@ def run_one(
     folds: tuple[Fold, ...],
     dt: jax.Array,
     request: RunRequest,
-    noise: jax.Array | None = None,
+    noise_key: jax.Array | None = None,
 ) -> Outcome:
     """Runs a scenario once; the caller must not batch or differentiate it.
 
@@ -69,9 +69,9 @@ def run_one(
     Args:
       scenario, folds, dt: as `run_batch`.
       request: the request.
-      noise: key of the noise of a sensor.
+      noise_key: key of the run's random numbers.
     """
-    leaves, structure = jax.tree.flatten(inputs_of(scenario, folds, dt, request, noise))
+    leaves, structure = jax.tree.flatten(inputs_of(scenario, folds, dt, request, noise_key))
     shapes = shapes_of(leaves)
     execution, nodes = plan_of_single_run(
         structural_part(request), registry.machine(), structure, shapes
@@ -120,9 +120,9 @@ class Parts(NamedTuple):
         return registry.EXECUTORS[self.backend]
 
     @property
-    def loop(self) -> StepLoop:
-        """The loop of the executor."""
-        return kernel_loop(self.executor)
+    def loop(self) -> Stepper:
+        """That of the executor."""
+        return kernel_stepper(self.executor)
 
 
 def _run_by_executor(parts: Parts, nodes: int, request: RunRequest, leaves: list) -> Outcome:
@@ -172,15 +172,15 @@ def _steps_from(
     parts: Parts, request: RunRequest, count: int, leaves: list, carry: Carry, first: jax.Array
 ) -> tuple[Carry, Any]:
     """`count` steps from step `first` on, by the kernel for many steps."""
-    loop = kernel_loop(parts.executor, first=first, short_vector=True)
-    return _steps(loop, parts.batch(leaves, request), request, carry, count)
+    run_steps = kernel_stepper(parts.executor, first=first, short_vector=True)
+    return _steps(run_steps, parts.batch(leaves, request), request, carry, count)
 
 
 def _steps(
-    loop: StepLoop, batch: Batch, request: RunRequest, carry: Carry, steps: int
+    run_steps: Stepper, batch: Batch, request: RunRequest, carry: Carry, steps: int
 ) -> tuple[Carry, Any]:
     """Steps of a batch of one run; the records have no run axis, and are None if not requested."""
-    carry, records = loop(TimeStep.of(request), batch, carry, steps, request.record_every)
+    carry, records = run_steps(TimeStep.of(request), batch, carry, steps, request.record_every)
     if request.record_every is None:
         return carry, None
     return carry, jax.tree.map(lambda x: x[0], records)

@@ -81,7 +81,7 @@ def step_times(inputs: Inputs, index: jax.Array, method: str, arrivals: tuple | 
         restarts = discontinuities.has_jump(times, (number - reach) * dt, span.end)
     division = discontinuities.divide_step(times, span, here)
     if inputs.scenario.process_noise is not None:
-        pieces = with_noise_rates(inputs.scenario, inputs.noise, index, dt, division.pieces)
+        pieces = with_noise_rates(inputs.scenario, inputs.noise_key, index, dt, division.pieces)
         division = division._replace(pieces=pieces)
     return StepTimes(span, division, previous_piece_length, restarts)
 
@@ -142,7 +142,7 @@ class LoopAlongStep(NamedTuple):
         return jnp.where(piece.command_arrived, after, before)
 
 
-def integrated(
+def integrate_piece(
     along: LoopAlongStep,
     piece: discontinuities.Piece,
     moved: LoopState,
@@ -174,7 +174,7 @@ def across_jumps(
     before: LoopState,
     method: str,
     stepped: integrators.StepResult,
-    begun: tuple,
+    before_sample: tuple,
     accumulators: tuple,
 ) -> tuple[integrators.StepResult, tuple]:
     """A piece of a step and the accumulators, with their derivatives across jumps of the command;
@@ -186,7 +186,7 @@ def across_jumps(
       before: state at its start.
       method: the integrator.
       stepped: the result of the integrator for this piece.
-      begun, accumulators: of the folds, before and after the sample at its start.
+      before_sample, accumulators: of the folds, before and after the sample at its start.
     """
     inputs, dt = along.inputs, along.inputs.dt
     # No metric counts what comes after the end of a run.
@@ -200,7 +200,7 @@ def across_jumps(
     def gains_of(sample):
         def sums(weight):
             return split_floats(
-                updated(inputs.folds, begun, dataclasses.replace(sample, dt=weight))
+                updated(inputs.folds, before_sample, dataclasses.replace(sample, dt=weight))
             )[0]
 
         gains = jax.jvp(sums, (dt,), (jnp.ones_like(dt),))[1]
@@ -220,7 +220,7 @@ class LaterPieces(NamedTuple):
     moved: LoopState
     """At the end of the step."""
     accumulators: tuple
-    parts: list[tuple[jax.Array, list]]
+    piece_slopes: list[tuple[jax.Array, list]]
     """Length [s] of each piece, and the slopes of its stages."""
     metric_samples: tuple[MetricSample, ...]
     status: jax.Array | None
@@ -241,7 +241,7 @@ def later_pieces(
     # These pieces are rare: their stages are a loop, which compiles in a fraction of the time.
     scenario, folds = along.inputs.scenario, along.inputs.folds
     none = jnp.zeros_like(along.inputs.dt)
-    moved, parts, metric_samples = stepped.state, [], []
+    moved, piece_slopes, metric_samples = stepped.state, [], []
     status = None
     if len(pieces) > 1:
         status = jnp.int32(0)
@@ -255,7 +255,7 @@ def later_pieces(
                 left = along.at(last, last.begin + last.length, moved)[1]
                 left = weighed(left, piece.begin, 0.5 * last.length, none)
                 between = accumulators = updated(folds, accumulators, left)
-            made = integrated(
+            made = integrate_piece(
                 along, piece, moved, method, options._replace(rolled=not options.scalar)
             )
             right = weighed(made.aux, piece.begin, 0.5 * piece.length, none)
@@ -274,19 +274,19 @@ def later_pieces(
             )
 
         before = accumulators
-        (moved, accumulators, status), (slopes, left, between, right) = run_if(
+        (moved, accumulators, status), (slopes, left, between, right) = cond_or_zeros(
             piece.exists, further, (moved, accumulators, status)
         )
-        parts.append((piece.length, slopes))
+        piece_slopes.append((piece.length, slopes))
         if folds:
             metric_samples += [
                 MetricSample(before, left, piece.exists),
                 MetricSample(between, right, piece.exists),
             ]
-    return LaterPieces(moved, accumulators, parts, tuple(metric_samples), status)
+    return LaterPieces(moved, accumulators, piece_slopes, tuple(metric_samples), status)
 
 
-def run_if(condition: jax.Array, made: Callable, kept: Any) -> tuple[Any, Any]:
+def cond_or_zeros(condition: jax.Array, made: Callable, kept: Any) -> tuple[Any, Any]:
     """`made(kept)`, new values and anything else, where a condition holds; else the values as they
     are, and zeros.
     """

@@ -64,7 +64,7 @@ class Pair(NamedTuple):
     step: jax.Array
     coarse: jax.Array
     fine: jax.Array
-    estimate: error_estimate.Accuracy
+    accuracy: error_estimate.Accuracy
     difference: jax.Array
     """Largest so far, relative to the tube."""
     nearest: tuple[jax.Array, jax.Array, jax.Array]
@@ -95,16 +95,16 @@ def _start(scenario: Scenario, dt: jax.Array, steps: jax.Array, *, method: str) 
     start, zero = initial_state(scenario), jnp.zeros_like(dt)
     x = ravel_pytree(start)[0]
     watched = error_estimate.watched_indices(start)
-    estimate = error_estimate.begin(
+    accuracy = error_estimate.initial_accuracy(
         method, jacobian(scenario, zero, start)[watched][:, watched], start
     )
-    estimate = error_estimate.with_unresolved(
-        estimate,
+    accuracy = error_estimate.with_unresolved(
+        accuracy,
         error_estimate.with_acceleration(
             scenario, error_estimate.unresolved_signals(scenario, method, dt, steps)
         ),
     )
-    return Pair(jnp.int32(0), x, x, estimate, zero, (zero - 1.0, zero, x), jnp.bool_(True))
+    return Pair(jnp.int32(0), x, x, accuracy, zero, (zero - 1.0, zero, x), jnp.bool_(True))
 
 
 @programs.jit(static_argnames="method")
@@ -129,37 +129,42 @@ def _one_step(scenario: Scenario, times: jax.Array, dt: jax.Array, pair: Pair, m
     number = pair.step.astype(dt.dtype)
     begin, end = number * dt, (number + 1.0) * dt
 
-    def part(both, cut):
+    def interval(both, cut):
         coarse, fine = both
         is_coarse, h = cut[1] - cut[0] == 1.0, (cut[1] - cut[0]) * dt
         x = jnp.where(is_coarse, coarse, fine)
-        end_of_part = jnp.where(cut[1] == 1.0, end, begin + cut[1] * dt)
+        end_of_interval = jnp.where(cut[1] == 1.0, end, begin + cut[1] * dt)
         division = discontinuities.divide_step(
-            times, discontinuities.Span(begin + cut[0] * dt, end_of_part, h)
+            times, discontinuities.Span(begin + cut[0] * dt, end_of_interval, h)
         )
         stepped = discontinuities.integrate_pieces(
             method, partial(evaluate, scenario), division, as_state(x), rolled=True
         )
         new, sample = ravel_pytree(stepped.state)[0], stepped.aux
-        seen = (stepped.parts, sample.upper - sample.lower, sample.xi, division.too_many_jumps)
+        seen = (
+            stepped.piece_slopes,
+            sample.upper - sample.lower,
+            sample.xi,
+            division.too_many_jumps,
+        )
         return (jnp.where(is_coarse, new, coarse), jnp.where(is_coarse, fine, new)), seen
 
     (coarse, fine), seen = jax.lax.scan(
-        part, (pair.coarse, pair.fine), jnp.asarray(INTERVALS, dt.dtype)
+        interval, (pair.coarse, pair.fine), jnp.asarray(INTERVALS, dt.dtype)
     )
-    parts, width, _, too_many_jumps = jax.tree.map(lambda x: x[0], seen)
+    piece_slopes, width, _, too_many_jumps = jax.tree.map(lambda x: x[0], seen)
     xi_of_fine = seen[2][1]
     restarts = None
     if times.size:
         restarts = discontinuities.has_jump(
             times, (number - error_estimate.steps_back(method)) * dt, end
         )
-    estimate = error_estimate.update(
-        pair.estimate,
+    accuracy = error_estimate.update(
+        pair.accuracy,
         method,
         dt,
         pair.step,
-        parts,
+        piece_slopes,
         width,
         restarts=restarts,
         too_many_jumps=too_many_jumps,
@@ -174,7 +179,7 @@ def _one_step(scenario: Scenario, times: jax.Array, dt: jax.Array, pair: Pair, m
     going = jnp.all(jnp.isfinite(fine)) & jnp.all(jnp.abs(fine[n : 2 * n]) < limit)
     larger = jnp.maximum(pair.difference, jnp.where(off <= 1.0, off, jnp.inf))
     difference = jnp.where(going, larger, pair.difference)
-    return Pair(pair.step + 1, coarse, fine, estimate, difference, nearest, going)
+    return Pair(pair.step + 1, coarse, fine, accuracy, difference, nearest, going)
 
 
 @programs.jit
@@ -277,7 +282,7 @@ def find_dt(scenario: Scenario, *, duration: float, method: str) -> float:
         pair = side_by_side(scenario, dt, math.ceil(duration / dt * (1 - 1e-9)), method=method)
         excess = max(
             float(pair.difference) / RECOMMENDED_ERROR,
-            float(pair.estimate.relative) / error_estimate.TOLERANCE,
+            float(pair.accuracy.relative) / error_estimate.TOLERANCE,
         )
         if not excess > 1.0:
             nearest = _mode(scenario, pair.nearest[1], as_state(pair.nearest[2]))

@@ -14,7 +14,13 @@ import jax.numpy as jnp
 
 from iblf_jax.engine.carry import Carry, Inputs
 from iblf_jax.engine.metric_folds import updated, weighed
-from iblf_jax.engine.step_pieces import LoopAlongStep, MetricSample, StepTimes, run_if, step_times
+from iblf_jax.engine.step_pieces import (
+    LoopAlongStep,
+    MetricSample,
+    StepTimes,
+    cond_or_zeros,
+    step_times,
+)
 from iblf_jax.simulation import delays, discontinuities, sampling
 from iblf_jax.simulation.closed_loop import (
     run_sampled_law_if_due,
@@ -33,18 +39,18 @@ class StepStart(NamedTuple):
 
 
 def continuous_start(
-    inputs: Inputs, carry: Carry, index: jax.Array, method: str, evaluated: Callable
+    inputs: Inputs, carry: Carry, index: jax.Array, method: str, evaluate: Callable
 ) -> StepStart:
     """The start of a step of a loop whose law acts continuously."""
     times = step_times(inputs, index, method, None)
     number, commands = index.astype(inputs.dt.dtype), carry.state.delayed
     arriving = delays.arriving(inputs.scenario, method, inputs.dt, number, commands)
-    along = LoopAlongStep(evaluated, inputs, carry.state, (), arriving)
+    along = LoopAlongStep(evaluate, inputs, carry.state, (), arriving)
     return StepStart(along, times, carry.accumulators, ())
 
 
 def sampled_start(
-    inputs: Inputs, carry: Carry, index: jax.Array, method: str, evaluated: Callable
+    inputs: Inputs, carry: Carry, index: jax.Array, method: str, evaluate: Callable
 ) -> StepStart:
     """The start of a step of a sampled loop: its law runs where it is due, and commands arrive."""
     scenario, dt = inputs.scenario, inputs.dt
@@ -52,14 +58,14 @@ def sampled_start(
     now = sampling.instant(scenario.sampling, dt, index)
     due = (now.phase == 0) & (index > 0)
     t = index.astype(dt.dtype) * dt
-    state = run_sampled_law_if_due(scenario, t, carry.state, now, inputs.noise)
+    state = run_sampled_law_if_due(scenario, t, carry.state, now, inputs.noise_key)
     commands = sampling.step_commands(scenario.sampling, dt, now, state.sampled.commands)
     before = sampling.arrival_before(scenario.sampling, dt, now)
     arrivals = None
     if before is not None:
         arrivals = ((commands.arrival * dt, commands.arrives), before)
     times = step_times(inputs, index, method, arrivals)
-    along = LoopAlongStep(evaluated, inputs, state, (commands.first, commands.next))
+    along = LoopAlongStep(evaluate, inputs, state, (commands.first, commands.next))
     accumulators, metric_samples = _before_sample(along, carry, due, times)
     length = jnp.where(due, jnp.zeros_like(dt), times.previous_piece_length)
     times = times._replace(previous_piece_length=length)
@@ -92,5 +98,5 @@ def _before_sample(
         sample = weighed(sample, t, 0.5 * previous_piece_length, jnp.zeros_like(dt))
         return updated(folds, accumulators, sample), sample
 
-    after, sample = run_if(due, seen, carry.accumulators)
+    after, sample = cond_or_zeros(due, seen, carry.accumulators)
     return after, (MetricSample(carry.accumulators, sample, due),)

@@ -9,7 +9,7 @@ to a bound, because the loop is stiffest there.  At the last instant the loop is
 integrated.
 
 A step is a function (inputs, carry, index) -> (carry, records) of ONE run.  It is hashable, and
-equal steps are compiled once.  `carry.start` creates the carry before the first step, and
+equal steps are compiled once.  `carry.initial_carry` creates the carry before the first step, and
 `outcome.outcome_of` computes the result after the last one.  Neither evaluates the closed loop:
 `linearization` computes the Jacobian that both need, also in steps.
 """
@@ -27,19 +27,20 @@ import jax.numpy as jnp
 from iblf_jax.core.attributes import attributes
 from iblf_jax.core.pytree import is_absent
 from iblf_jax.core.status import Status, flag
-from iblf_jax.engine.carry import Carry, Inputs, Nearest, Step, StepOptions, keep_if
-from iblf_jax.engine.metric_folds import begun_at, updated, weighed
+from iblf_jax.engine.carry import Carry, Inputs, Nearest, Step, StepOptions, tree_where
+from iblf_jax.engine.metric_folds import initialised_at, updated, weighed
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.status_flags import has_no_input, is_valid, sample_status
 from iblf_jax.engine.step_pieces import (
     LoopAlongStep,
     MetricSample,
     across_jumps,
-    integrated,
+    integrate_piece,
     later_pieces,
 )
 from iblf_jax.engine.step_start import continuous_start, sampled_start
 from iblf_jax.simulation import (
+    closed_loop,
     delays,
     discontinuities,
     error_estimate,
@@ -48,7 +49,6 @@ from iblf_jax.simulation import (
 )
 from iblf_jax.simulation.closed_loop import (
     LoopState,
-    evaluate,
     integrated_part,
     perturbed_state,
     with_integrated_part,
@@ -82,7 +82,7 @@ class TimeStep(Step):
         return found.carry, self.record(inputs.folds, found)
 
 
-class Advanced(NamedTuple):
+class StepOutput(NamedTuple):
     """What one step of a run gives."""
 
     carry: Carry
@@ -104,8 +104,8 @@ def advance(
     index: jax.Array,
     method: str,
     options: StepOptions,
-    loop: Callable = evaluate,
-) -> Advanced:
+    evaluate: Callable = closed_loop.evaluate,
+) -> StepOutput:
     """One step: evaluates the closed loop, updates the metrics, integrates piece by piece, and
     freezes a state that diverges.
 
@@ -114,16 +114,16 @@ def advance(
       index: number of the instant, () int.
       method: the integrator.
       options: how the code of the step is generated.
-      loop: replaces `closed_loop.evaluate`.
+      evaluate: replaces `closed_loop.evaluate`.
     """
     begin = continuous_start
     if inputs.scenario.sampling is not None:
         begin = sampled_start
-    start = begin(inputs, carry, index, method, loop)
+    start = begin(inputs, carry, index, method, evaluate)
     along, times = start.along, start.times
     state = along.state
     first = times.division.pieces[0]
-    stepped = integrated(along, first, integrated_part(state), method, options)
+    stepped = integrate_piece(along, first, integrated_part(state), method, options)
     if not is_absent(along.arriving):
         commands = [slope.command for slope in stepped.slopes]
         along = along._replace(arriving=along.arriving.with_commands_of_step(commands))
@@ -134,28 +134,28 @@ def advance(
     )
     walls = distances(inputs.scenario, sample)
     sample = with_extremes(
-        inputs.scenario, inputs.noise, index, inputs.dt, sample, state.x, carry.distances, walls
+        inputs.scenario, inputs.noise_key, index, inputs.dt, sample, state.x, carry.distances, walls
     )
-    begun = begun_at(index, inputs.folds, sample, start.accumulators)
-    accumulators = updated(inputs.folds, begun, sample)
+    before_sample = initialised_at(index, inputs.folds, sample, start.accumulators)
+    accumulators = updated(inputs.folds, before_sample, sample)
     if along.jumps_with_law:
         stepped, accumulators = across_jumps(
-            along, first, state, method, stepped, begun, accumulators
+            along, first, state, method, stepped, before_sample, accumulators
         )
     later = later_pieces(along, times.division.pieces, stepped, accumulators, method, options)
-    parts = [(first.length, stepped.slopes), *later.parts]
+    piece_slopes = [(first.length, stepped.slopes), *later.piece_slopes]
     state_after = with_integrated_part(state, later.moved)
     if not is_absent(along.arriving):
-        state_after, parts = _with_commands(
-            along, method, times.division.pieces, state_after, parts
+        state_after, piece_slopes = _with_commands(
+            along, method, times.division.pieces, state_after, piece_slopes
         )
-    after, status, nearest, estimate = _concluded(
+    after, status, nearest, accuracy = _concluded(
         method,
         inputs,
         carry,
         index,
         sample,
-        parts,
+        piece_slopes,
         (state_after, later.status),
         state,
         times.span.in_run,
@@ -163,12 +163,12 @@ def advance(
         times.division.too_many_jumps,
     )
     metric_samples = (
-        MetricSample(begun, sample, True),
+        MetricSample(before_sample, sample, True),
         *start.metric_samples,
         *later.metric_samples,
     )
-    return Advanced(
-        Carry(after, later.accumulators, status, nearest, estimate, walls), metric_samples, state
+    return StepOutput(
+        Carry(after, later.accumulators, status, nearest, accuracy, walls), metric_samples, state
     )
 
 
@@ -177,18 +177,19 @@ def _with_commands(
     method: str,
     pieces: tuple[discontinuities.Piece, ...],
     after: LoopState,
-    parts: list,
+    piece_slopes: list,
 ) -> tuple[LoopState, list]:
     """The state after a step, which keeps the commands of the step for a delayed input; and the
     pieces of the step, whose slopes no longer contain the commands.
     """
     of_pieces = [
         delays.PieceCommands(piece.begin, length, piece.exists, [slope.command for slope in slopes])
-        for piece, (length, slopes) in zip(pieces, parts, strict=True)
+        for piece, (length, slopes) in zip(pieces, piece_slopes, strict=True)
     ]
     commands = delays.with_step(along.state.delayed, method, along.arriving, of_pieces)
     without_commands = [
-        (length, [slope._replace(command=()) for slope in slopes]) for length, slopes in parts
+        (length, [slope._replace(command=()) for slope in slopes])
+        for length, slopes in piece_slopes
     ]
     return after._replace(delayed=commands), without_commands
 
@@ -199,7 +200,7 @@ def _concluded(
     carry: Carry,
     index: jax.Array,
     sample: Sample,
-    parts: list,
+    piece_slopes: list,
     later: tuple[LoopState, Any],
     before: LoopState,
     in_run: jax.Array,
@@ -213,7 +214,7 @@ def _concluded(
       inputs, carry: of the run.
       index: number of the instant, () int.
       sample: of the instant.
-      parts: lengths and slopes of the pieces of the step.
+      piece_slopes: lengths and slopes of the pieces of the step.
       later: the state at the end of the step, and the flags raised within it.
       before: the state at its start.
       in_run: whether the run goes on after the instant, () bool.
@@ -221,26 +222,26 @@ def _concluded(
     """
     near = jnp.max(jnp.abs(jax.lax.stop_gradient(sample.xi)))
     here = Nearest(near, sample.t, jax.lax.stop_gradient(perturbed_state(before)))
-    nearest = keep_if(near > carry.nearest.xi, here, carry.nearest)
+    nearest = tree_where(near > carry.nearest.xi, here, carry.nearest)
     is_sampled = inputs.scenario.sampling is not None
     width = sample.upper - sample.lower
-    estimate = carry.accuracy
+    accuracy = carry.accuracy
     if inputs.scenario.process_noise is None:
-        estimate = error_estimate.update(
-            estimate,
+        accuracy = error_estimate.update(
+            accuracy,
             method,
             inputs.dt,
             index,
-            parts,
+            piece_slopes,
             width,
             is_sampled,
             restarts,
             too_many_jumps,
             error_growth.rounds_continuously(inputs.scenario),
         )
-        if not is_absent(estimate.growth):
-            grown = _grown_error(method, inputs, carry, index, parts, before, width)
-            estimate = estimate._replace(growth=grown)
+        if not is_absent(accuracy.error_growth):
+            grown = _grown_error(method, inputs, carry, index, piece_slopes, before, width)
+            accuracy = accuracy._replace(error_growth=grown)
     after, raised = later
     status = carry.status | sample_status(inputs.scenario, sample)
     if raised is not None:
@@ -250,10 +251,10 @@ def _concluded(
     valid = is_valid(after, limit) & (status & int(Status.NOT_FINITE) == 0)
     status |= flag(~valid & in_run, Status.NOT_FINITE)
     if plant.loses_input:
-        stages = [slope for _, slopes in parts for slope in slopes]
+        stages = [slope for _, slopes in piece_slopes for slope in slopes]
         lost = jnp.any(jnp.stack([has_no_input(slope) for slope in stages]))
         status |= flag(lost & in_run, Status.SINGULAR_GAIN)
-    return keep_if(valid & in_run, after, before), status, nearest, estimate
+    return tree_where(valid & in_run, after, before), status, nearest, accuracy
 
 
 def _grown_error(
@@ -261,7 +262,7 @@ def _grown_error(
     inputs: Inputs,
     carry: Carry,
     index: jax.Array,
-    parts: list,
+    piece_slopes: list,
     state: LoopState,
     width: jax.Array,
 ) -> error_growth.ErrorGrowth:
@@ -271,15 +272,15 @@ def _grown_error(
     if scenario.sampling is not None:
         now = sampling.instant(scenario.sampling, dt, index)
     local_error = error_estimate.local_error_of_state(
-        method, parts, partial(error_growth.rate_at_end, scenario, dt, index, now, state)
+        method, piece_slopes, partial(error_growth.rate_at_end, scenario, dt, index, now, state)
     )
     return error_growth.update(
-        carry.accuracy.growth,
+        carry.accuracy.error_growth,
         scenario,
         dt,
         index,
         now,
-        inputs.noise,
+        inputs.noise_key,
         carry.state,
         state,
         local_error,
@@ -297,7 +298,7 @@ class Record(NamedTuple):
     measured: Any
 
 
-def recorded(folds: Any, found: Advanced) -> Record:
+def recorded(folds: Any, found: StepOutput) -> Record:
     """The signals of an instant, and the states of law, observer, actuator and sensor."""
     state, measured = found.state, ()
     if not is_absent(state.sampled):
@@ -310,13 +311,13 @@ POSITIONS = ("t", "q", "e1", "lower", "upper", "q_d")
 """Signals of `positions`."""
 
 
-def positions(folds: Any, found: Advanced) -> dict[str, jax.Array]:
+def positions(folds: Any, found: StepOutput) -> dict[str, jax.Array]:
     """The time, and the positions of an instant with their errors, bounds and reference."""
     return attributes(found.sample, POSITIONS)
 
 
 def samples_of_step(scenario: Scenario) -> int:
-    """How many samples the folds see of a step at most: `Advanced.metric_samples`."""
+    """How many samples the folds see of a step at most: `StepOutput.metric_samples`."""
     arrives = scenario.sampling is not None and scenario.sampling.queue > 0
     cuts = min(scenario.jump_times().size, discontinuities.MAX_CUTS) + arrives
     return 1 + (scenario.sampling is not None) + 2 * cuts

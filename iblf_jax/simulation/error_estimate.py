@@ -92,7 +92,7 @@ class Accuracy(NamedTuple):
     """Largest position error so far, (n,) [rad]."""
     relative: jax.Array
     """Largest position error so far, relative to the width of its tube, () [1]."""
-    growth: Any = ()
+    error_growth: Any = ()
     """The `error_growth.ErrorGrowth` of a loop whose feedback is interrupted; `()` of others."""
 
 
@@ -155,7 +155,7 @@ def steps_back(method: str) -> int:
     return (len(table.differences) - 1) // _rates_per_step(table)
 
 
-def begin(method: str, jacobian: jax.Array, state: LoopState) -> Accuracy:
+def initial_accuracy(method: str, jacobian: jax.Array, state: LoopState) -> Accuracy:
     """The estimate before the first step.
 
     Args:

@@ -175,7 +175,7 @@ def _variables(scenario: Scenario, state: LoopState) -> Any:
     return integrated_part(state), memory, sampled.commands, sampled.sent
 
 
-def begin(scenario: Scenario, state: LoopState, derivative: jax.Array) -> Any:
+def initial_growth(scenario: Scenario, state: LoopState, derivative: jax.Array) -> Any:
     """The error before the first step, 0; `()` for a loop that is not interrupted.
 
     Args:
@@ -228,7 +228,7 @@ def _rows_of_levels(state: LoopState) -> list[slice]:
 # --- a step --------------------------------------------------------------------------------------
 
 
-def _moved(x: T, by: Any, factor: jax.Array) -> T:
+def _shifted(x: T, by: Any, factor: jax.Array) -> T:
     """A pytree x + factor by; leaves that are no floats stay."""
 
     def one(a: jax.Array, b: jax.Array) -> jax.Array:
@@ -252,7 +252,7 @@ def update(
     dt: jax.Array,
     index: jax.Array,
     now: Instant | None,
-    noise: jax.Array,
+    noise_key: jax.Array,
     before: LoopState,
     state: LoopState,
     local_error: jax.Array,
@@ -266,7 +266,7 @@ def update(
       dt: time step, () [s].
       index: number of the step, () int.
       now: its position between samples; None for a continuous loop.
-      noise: the key of the random numbers.
+      noise_key: key of the run's random numbers.
       before, state: the state at the start of the step, before and after the law has run.
       local_error: of the step, of the flat `integrated_part`.
       width: of the tube, (n,) [rad].
@@ -280,7 +280,7 @@ def update(
     if now is not None:
         growth = jax.lax.cond(
             now.phase == 0,
-            lambda old: _at_sample(old, scenario, t, now, noise, before, state),
+            lambda old: _at_sample(old, scenario, t, now, noise_key, before, state),
             lambda old: old,
             growth,
         )
@@ -294,7 +294,7 @@ def update(
     rate = _rate(scenario, t, state, base, command)
     if command is not None and command_error is not None:
         command = command + small * command_error
-    shifted = _rate(scenario, t, state, _moved(base, part, small), command)
+    shifted = _rate(scenario, t, state, _shifted(base, part, small), command)
     flat, unflatten = ravel_pytree(part)
     grown = flat + dt * back * (ravel_pytree(shifted)[0] - ravel_pytree(rate)[0])
     rounding = jnp.finfo(dt.dtype).eps * jnp.abs(ravel_pytree(base)[0])
@@ -321,7 +321,7 @@ def rate_at_end(
         sampling = checks.given(scenario.sampling)
         command = step_commands(sampling, dt, now, state.sampled.commands).first
     part = integrated_part(state)
-    end = _moved(part, _rate(scenario, t, state, part, command), dt)
+    end = _shifted(part, _rate(scenario, t, state, part, command), dt)
     return _rate(scenario, t + dt, state, end, command)
 
 
@@ -358,12 +358,12 @@ def _at_sample(
     scenario: Scenario,
     t: jax.Array,
     now: Instant,
-    noise: jax.Array,
+    noise_key: jax.Array,
     before: LoopState,
     state: LoopState,
 ) -> ErrorGrowth:
     """The errors after the law has run, and whether a code may differ (A.3)."""
-    normal = normals(noise, now.sampling_index, scenario.sensor.draws, scenario.n).astype(
+    normal = normals(noise_key, now.sampling_index, scenario.sensor.draws, scenario.n).astype(
         state.x.dtype
     )
     if _rounds_readings(scenario):
@@ -405,8 +405,8 @@ def _after_law(
     small, back = _scales((part.x, memory))
 
     def law(scale: jax.Array) -> tuple[jax.Array, Any]:
-        x = _moved(before.x, part.x, scale)
-        controller, observer, sensor = _moved(states, memory, scale)
+        x = _shifted(before.x, part.x, scale)
+        controller, observer, sensor = _shifted(states, memory, scale)
         at = before._replace(x=x, controller=controller, observer=observer)
         at = at._replace(sampled=sampled._replace(sensor=sensor, sent=()))
         after = run_sampled_law(always, t, at, normal)
@@ -415,7 +415,7 @@ def _after_law(
 
     unshifted, shifted = law(jnp.zeros_like(small)), law(small)
     command = unshifted[0]
-    command_error, memory = _moved(
+    command_error, memory = _shifted(
         jax.tree.map(jnp.zeros_like, unshifted), _difference(unshifted, shifted), back
     )
     blur = ARITHMETIC * jnp.finfo(command.dtype).eps * jnp.abs(command)
@@ -613,7 +613,7 @@ def with_growth(
       bounds: of `bound`, (n,) [rad].
       width: smallest width of the tube, (n,) [rad].
     """
-    growth = accuracy.growth
+    growth = accuracy.error_growth
     of_codes = jnp.max(bounds / width)
     bounds = bounds + accuracy.error
     relative = of_codes + accuracy.relative
