@@ -226,7 +226,8 @@ def finalize(
 
     def at_nearest_and_end(inputs, carry):
         watched = at_start.jacobian.shape[-1]
-        no_estimate = error_estimate.UnresolvedSignals(*[jnp.zeros_like(carry.accuracy.error)] * 3)
+        error = carry.accuracy.error
+        no_estimate = error_estimate.UnresolvedSignals.zero(error.size, error.dtype)
         nearest = carry.nearest
         end = inputs.dt * inputs.steps
         pair = (

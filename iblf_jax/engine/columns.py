@@ -204,7 +204,7 @@ def _made(
     batch that has its directions.
     """
     before = wide.map_runs(lambda inputs: _initial_carry(inputs, request.method, step.places))
-    after, records = run_steps(step, wide, before, request.steps + 1, request.record_every)
+    after, records = run_steps(step, wide, before, request.instants, request.record_every)
     metrics = wide.map_runs(lambda inputs, carry: _metrics(inputs, carry, step.places), after)
     return list(records), metrics
 

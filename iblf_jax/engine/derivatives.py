@@ -362,7 +362,7 @@ def run_with_tangents(
     carry, instant = initialize(run_steps, batch, request.method)
     before = batch.map_runs(at_start, carry)
     after, _ = run_steps(
-        DerivativeStep(request.method, directions), batch, before, request.steps + 1, None
+        DerivativeStep(request.method, directions), batch, before, request.instants, None
     )
     tangents, products = batch.map_runs(at_end, after)
     return Tangents(finalize(run_steps, batch, request, after.carry, instant), tangents, products)

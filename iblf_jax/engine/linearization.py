@@ -134,8 +134,7 @@ def linearization_steps(scenario: Scenario) -> int:
 def jacobian_carry(scenario: Scenario, time: jax.Array, state: LoopState) -> Linearization:
     """The carry of a `LinearizationStep` of which only the Jacobian at a state is of interest."""
     watched = error_estimate.watched_indices(state).size
-    none = jnp.zeros(scenario.n, state.x.dtype)
-    no_estimate = error_estimate.UnresolvedSignals(none, none, none)
+    no_estimate = error_estimate.UnresolvedSignals.zero(scenario.n, state.x.dtype)
     return linearization_at(time, perturbed_state(state), watched, no_estimate)
 
 

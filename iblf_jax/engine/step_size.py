@@ -124,7 +124,6 @@ def _advanced(
 
 def _one_step(scenario: Scenario, times: jax.Array, dt: jax.Array, pair: Pair, method: str) -> Pair:
     """Both runs one step later; `times` are the jump times."""
-    n = scenario.n
     as_state = ravel_pytree(initial_state(scenario))[1]
     number = pair.step.astype(dt.dtype)
     begin, end = number * dt, (number + 1.0) * dt
@@ -174,9 +173,9 @@ def _one_step(scenario: Scenario, times: jax.Array, dt: jax.Array, pair: Pair, m
     nearest = jax.tree.map(
         partial(jnp.where, near > pair.nearest[0]), (near, begin, pair.fine), pair.nearest
     )
-    off = jnp.max(jnp.abs(coarse[:n] - fine[:n]) / width)
+    off = jnp.max(jnp.abs(as_state(coarse).q - as_state(fine).q) / width)
     limit = plants.speed_limit(scenario.plant)
-    going = jnp.all(jnp.isfinite(fine)) & jnp.all(jnp.abs(fine[n : 2 * n]) < limit)
+    going = jnp.all(jnp.isfinite(fine)) & jnp.all(jnp.abs(as_state(fine).dq) < limit)
     larger = jnp.maximum(pair.difference, jnp.where(off <= 1.0, off, jnp.inf))
     difference = jnp.where(going, larger, pair.difference)
     return Pair(pair.step + 1, coarse, fine, accuracy, difference, nearest, going)

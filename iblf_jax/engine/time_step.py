@@ -34,6 +34,7 @@ from iblf_jax.engine.status_flags import has_no_input, is_valid, sample_status
 from iblf_jax.engine.step_pieces import (
     LoopAlongStep,
     MetricSample,
+    StepTimes,
     across_jumps,
     integrate_piece,
     later_pieces,
@@ -116,10 +117,10 @@ def advance(
       options: how the code of the step is generated.
       evaluate: replaces `closed_loop.evaluate`.
     """
-    begin = continuous_start
-    if inputs.scenario.sampling is not None:
-        begin = sampled_start
-    start = begin(inputs, carry, index, method, evaluate)
+    if inputs.scenario.sampling is None:
+        start = continuous_start(inputs, carry, index, method, evaluate)
+    else:
+        start = sampled_start(inputs, carry, index, method, evaluate)
     along, times = start.along, start.times
     state = along.state
     first = times.division.pieces[0]
@@ -149,19 +150,19 @@ def advance(
         state_after, piece_slopes = _with_commands(
             along, method, times.division.pieces, state_after, piece_slopes
         )
-    after, status, nearest, accuracy = _concluded(
-        method,
-        inputs,
-        carry,
-        index,
-        sample,
-        piece_slopes,
-        (state_after, later.status),
-        state,
-        times.span.in_run,
-        times.restarts,
-        times.division.too_many_jumps,
+    in_run = times.span.in_run
+    status = carry.status | sample_status(inputs.scenario, sample)
+    if later.status is not None:
+        status = status | later.status
+    after, status = _frozen_if_invalid(
+        inputs.scenario, state, state_after, piece_slopes, status, in_run
     )
+    nearest = _nearest_to_bound(carry.nearest, sample, state)
+    accuracy = carry.accuracy
+    if inputs.scenario.process_noise is None:
+        accuracy = _updated_accuracy(
+            method, inputs, carry, index, piece_slopes, state, sample.upper - sample.lower, times
+        )
     metric_samples = (
         MetricSample(before_sample, sample, True),
         *start.metric_samples,
@@ -194,67 +195,78 @@ def _with_commands(
     return after._replace(delayed=commands), without_commands
 
 
-def _concluded(
+def _nearest_to_bound(before: Nearest, sample: Sample, state: LoopState) -> Nearest:
+    """The instant nearest to a bound so far, with that of a sample and its state."""
+    near = jnp.max(jnp.abs(jax.lax.stop_gradient(sample.xi)))
+    here = Nearest(near, sample.t, jax.lax.stop_gradient(perturbed_state(state)))
+    return tree_where(near > before.xi, here, before)
+
+
+def _updated_accuracy(
     method: str,
     inputs: Inputs,
     carry: Carry,
     index: jax.Array,
-    sample: Sample,
     piece_slopes: list,
-    later: tuple[LoopState, Any],
-    before: LoopState,
-    in_run: jax.Array,
-    restarts: Any,
-    too_many_jumps: Any,
-) -> tuple[LoopState, jax.Array, Nearest, error_estimate.Accuracy]:
-    """State, status, nearest instant and accuracy after a step; a state that diverges is frozen.
+    state: LoopState,
+    width: jax.Array,
+    times: StepTimes,
+) -> error_estimate.Accuracy:
+    """The estimate of the accuracy after a step.
 
     Args:
       method: the integrator.
       inputs, carry: of the run.
       index: number of the instant, () int.
-      sample: of the instant.
       piece_slopes: lengths and slopes of the pieces of the step.
-      later: the state at the end of the step, and the flags raised within it.
-      before: the state at its start.
-      in_run: whether the run goes on after the instant, () bool.
-      restarts, too_many_jumps: of `StepTimes` and its division.
+      state: at the start of the step.
+      width: of the tube, (n,) [rad].
+      times: of the step.
     """
-    near = jnp.max(jnp.abs(jax.lax.stop_gradient(sample.xi)))
-    here = Nearest(near, sample.t, jax.lax.stop_gradient(perturbed_state(before)))
-    nearest = tree_where(near > carry.nearest.xi, here, carry.nearest)
-    is_sampled = inputs.scenario.sampling is not None
-    width = sample.upper - sample.lower
-    accuracy = carry.accuracy
-    if inputs.scenario.process_noise is None:
-        accuracy = error_estimate.update(
-            accuracy,
-            method,
-            inputs.dt,
-            index,
-            piece_slopes,
-            width,
-            is_sampled,
-            restarts,
-            too_many_jumps,
-            error_growth.rounds_continuously(inputs.scenario),
-        )
-        if not is_absent(accuracy.error_growth):
-            grown = _grown_error(method, inputs, carry, index, piece_slopes, before, width)
-            accuracy = accuracy._replace(error_growth=grown)
-    after, raised = later
-    status = carry.status | sample_status(inputs.scenario, sample)
-    if raised is not None:
-        status = status | raised
-    plant = inputs.scenario.loop.plant
-    limit = plants.speed_limit(plant)
-    valid = is_valid(after, limit) & (status & int(Status.NOT_FINITE) == 0)
+    accuracy = error_estimate.update(
+        carry.accuracy,
+        method,
+        inputs.dt,
+        index,
+        piece_slopes,
+        width,
+        inputs.scenario.sampling is not None,
+        times.restarts,
+        times.division.too_many_jumps,
+        error_growth.rounds_continuously(inputs.scenario),
+    )
+    if is_absent(accuracy.error_growth):
+        return accuracy
+    grown = _grown_error(method, inputs, carry, index, piece_slopes, state, width)
+    return accuracy._replace(error_growth=grown)
+
+
+def _frozen_if_invalid(
+    scenario: Scenario,
+    before: LoopState,
+    after: LoopState,
+    piece_slopes: list,
+    status: jax.Array,
+    in_run: jax.Array,
+) -> tuple[LoopState, jax.Array]:
+    """State and status after a step; a state that diverges is frozen, as is one at the end of a
+    run.
+
+    Args:
+      scenario: the scenario.
+      before, after: the state at the start and at the end of the step.
+      piece_slopes: lengths and slopes of the pieces of the step.
+      status: with the flags of its samples, () int32.
+      in_run: whether the run goes on after the instant, () bool.
+    """
+    plant = scenario.loop.plant
+    valid = is_valid(after, plants.speed_limit(plant)) & (status & int(Status.NOT_FINITE) == 0)
     status |= flag(~valid & in_run, Status.NOT_FINITE)
     if plant.loses_input:
         stages = [slope for _, slopes in piece_slopes for slope in slopes]
         lost = jnp.any(jnp.stack([has_no_input(slope) for slope in stages]))
         status |= flag(lost & in_run, Status.SINGULAR_GAIN)
-    return tree_where(valid & in_run, after, before), status, nearest, accuracy
+    return tree_where(valid & in_run, after, before), status
 
 
 def _grown_error(
@@ -266,7 +278,9 @@ def _grown_error(
     state: LoopState,
     width: jax.Array,
 ) -> error_growth.ErrorGrowth:
-    """The error after a step of a loop whose feedback is interrupted; arguments as `_concluded`."""
+    """The error after a step of a loop whose feedback is interrupted; arguments as
+    `_updated_accuracy`.
+    """
     scenario, dt = inputs.scenario, inputs.dt
     now = None
     if scenario.sampling is not None:

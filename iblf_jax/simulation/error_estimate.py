@@ -396,6 +396,12 @@ class UnresolvedSignals(NamedTuple):
     width: jax.Array
     """Smallest width of the tube, (n,) [rad]."""
 
+    @staticmethod
+    def zero(n: int, dtype: Any) -> UnresolvedSignals:
+        """Zeros, where no estimate is of interest."""
+        none = jnp.zeros(n, dtype)
+        return UnresolvedSignals(none, none, none)
+
 
 def unresolved_signals(
     scenario: Scenario, method: str, dt: jax.Array, steps: int | jax.Array
