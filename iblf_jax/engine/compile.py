@@ -97,7 +97,10 @@ def first_that_works(
     names = (*execution.backends, "vmap")
     for name, following in itertools.pairwise(names):
         try:
-            return _attempted(attempt, registry.EXECUTORS[name])
+            try:
+                return attempt(registry.EXECUTORS[name])
+            except StoppedError:
+                return attempt(registry.EXECUTORS[name])
         except StoppedError:
             raise
         except ToolchainError as error:
@@ -107,14 +110,6 @@ def first_that_works(
                 _warn_once(plan.scan_warning(reason))
             break
     return by_scan()
-
-
-def _attempted(attempt: Callable[[Executor], T], executor: Executor) -> T:
-    """The value of an attempt, of a second one if the compiler was stopped in the first."""
-    try:
-        return attempt(executor)
-    except StoppedError:
-        return attempt(executor)
 
 
 def inputs_of(

@@ -44,10 +44,10 @@ class Linearization(NamedTuple):
     """Of the run; its torque is turned into what it accelerates, as that takes the robot's mass
     matrix."""
     jacobian: Any = ()
-    """By the numbers that `error_estimate` watches, by differences of three sizes, (3, m', m')
-    [1/s]; `stability.resolved_jacobian` makes one of them.  `()` until all steps are made, because
-    each records its column: carried from step to step, the m'^2 numbers would be most of the
-    program."""
+    """Of the rate by the m' numbers that `error_estimate` watches, by differences of three sizes,
+    (3, m', m') [1/s]; `stability.resolved_jacobian` makes one matrix of the three.  It is `()`
+    until all steps are made: each step records its column, because m'^2 numbers in the carry would
+    make most of the program."""
 
     def with_columns(self, columns: jax.Array) -> Linearization:
         """The linearization after its steps, which recorded these columns, (..., steps, m')."""
@@ -93,15 +93,13 @@ class LinearizationStep(Step):
         )
         sizes = stability.difference_sizes(x, direction, room)
         widest = size_index == 2
-        if (
-            len(watched) < x.size
-        ):  # a power iteration follows, across infinite slopes by the widest differences
-            widest |= (iteration >= 0) & jnp.any(
-                stability.is_infinite(carry.lengths, inputs.scenario.sampling is not None)
-            )
-        size = jnp.where(
-            widest, sizes[2], jnp.where((size_index == 1) & (iteration < 0), sizes[1], sizes[0])
-        )
+        if len(watched) < x.size:
+            # A power iteration follows, across infinite slopes by the widest differences.
+            is_sampled = inputs.scenario.sampling is not None
+            is_steep = jnp.any(stability.is_infinite(carry.lengths, is_sampled))
+            widest |= (iteration >= 0) & is_steep
+        is_second = (size_index == 1) & (iteration < 0)
+        size = jnp.where(widest, sizes[2], jnp.where(is_second, sizes[1], sizes[0]))
         w = stability.directional_derivative(rate_at, x, direction, size)
         column = jnp.stack([w[i] for i in watched])
         power_iteration, lengths = carry.power_iteration, carry.lengths

@@ -40,8 +40,9 @@ def outcome_of(
       inputs: of the run.
       method: the integrator.
       carry: after the last step.
-      unresolved: what a `LinearizationStep` has found for the run.
-      instants: what it has found at some of them.
+      unresolved: the unresolved signals of the run, as accelerations.
+      instants: linearizations at the start, at the instant nearest to a bound and at the end of the
+        run, (3, ...).
     """
     scenario = inputs.scenario
     accuracy = error_estimate.with_unresolved(carry.accuracy, unresolved)

@@ -7,11 +7,12 @@ actuator after the delay, within this step or a later one.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
+from iblf_jax.core import checks
 from iblf_jax.engine.carry import Carry, Inputs
 from iblf_jax.engine.metric_folds import updated, weighed
 from iblf_jax.engine.step_pieces import (
@@ -22,9 +23,7 @@ from iblf_jax.engine.step_pieces import (
     step_times,
 )
 from iblf_jax.simulation import delays, discontinuities, sampling
-from iblf_jax.simulation.closed_loop import (
-    run_sampled_law_if_due,
-)
+from iblf_jax.simulation.closed_loop import run_sampled_law_if_due
 
 
 class StepStart(NamedTuple):
@@ -54,13 +53,13 @@ def sampled_start(
 ) -> StepStart:
     """The start of a step of a sampled loop: its law runs where it is due, and commands arrive."""
     scenario, dt = inputs.scenario, inputs.dt
-    assert scenario.sampling is not None
-    now = sampling.instant(scenario.sampling, dt, index)
+    schedule = checks.given(scenario.sampling)
+    now = sampling.instant(schedule, dt, index)
     due = (now.phase == 0) & (index > 0)
     t = index.astype(dt.dtype) * dt
     state = run_sampled_law_if_due(scenario, t, carry.state, now, inputs.noise_key)
-    commands = sampling.step_commands(scenario.sampling, dt, now, state.sampled.commands)
-    before = sampling.arrival_before(scenario.sampling, dt, now)
+    commands = sampling.step_commands(schedule, dt, now, state.sampled.commands)
+    before = sampling.arrival_before(schedule, dt, now)
     arrivals = None
     if before is not None:
         arrivals = ((commands.arrival * dt, commands.arrives), before)
@@ -84,7 +83,7 @@ def _before_sample(
         return carry.accumulators, ()
     commands = carry.state.sampled.commands
     pending = along.state.sampled.commands
-    schedule: Any = scenario.sampling
+    schedule = checks.given(scenario.sampling)
     command = sampling.command_before(schedule, dt, commands, pending)
     t, previous_piece_length = times.span.start, times.previous_piece_length
     seen_at = (

@@ -313,7 +313,9 @@ class Record(NamedTuple):
 
 
 def recorded(folds: Any, found: StepOutput) -> Record:
-    """The signals of an instant, and the states of law, observer, actuator and sensor."""
+    """The signals of an instant, the states of law, observer and actuator, and what a sampled law
+    received.
+    """
     state, measured = found.state, ()
     if not is_absent(state.sampled):
         measured = state.sampled.received

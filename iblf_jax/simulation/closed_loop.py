@@ -550,8 +550,7 @@ def run_sampled_law(
       normal: standard normal numbers for the sensor, (draws, n).
       applied: as in `law_update`.
     """
-    before, sampling = state.sampled, scenario.sampling
-    assert sampling is not None
+    before, sampling = state.sampled, checks.given(scenario.sampling)
     measurement, sensor = scenario.loop.sensor.measure(
         state.x, normal, sampling.period, before.sensor
     )
