@@ -50,6 +50,8 @@ MODE_INSTANTS = 33
 """Instants along the reference at which modes are computed."""
 MAX_TRIED = 5_000_000
 """Steps of a run that is tried, at most."""
+DIVISORS = tuple(f * 10**k for k in range(7) for f in (1, 2, 5))
+"""Numbers of steps in a sampling period or a delay that are tried."""
 MAX_STEPS_IN_DELAY = 20
 """Steps in the delay of an input that are tried, at most: each number of them is a program of its
 own, which contains all commands on their way."""
@@ -300,20 +302,21 @@ def find_dt(scenario: Scenario, *, duration: float, method: str) -> float:
 
 
 def _find_part(
-    scenario: Scenario, period: float, duration: float, method: str, most_parts: int = MAX_TRIED
+    scenario: Scenario, period: float, duration: float, method: str, most_divisor: int = MAX_TRIED
 ) -> float:
     """`find_dt` for a sampled law or a delayed input: the largest accurate fraction of the sampling
-    period or of the delay [s].  The divisor is 1, 2 or 5 times a power of ten, at most
-    `most_parts`.
+    period or of the delay [s], by one of DIVISORS up to `most_divisor`.
     """
-    noise = jnp.zeros((4,)) if scenario.sampling is not None else None
+    noise_key = jnp.zeros((4,)) if scenario.sampling is not None else None
     _can_be_tried(duration, period)
     periods = max(math.ceil(duration / period - 1e-9), 1)
-    parts, before, poor_before, coarser = 1, None, 0, period
-    while periods * parts <= MAX_TRIED and parts <= most_parts:
-        dt = jnp.asarray(period / parts, scenario.initial.q.dtype)
-        fitted = with_history(scenario, period / parts)
-        found = run_one(fitted, (), dt, RunRequest(periods * parts, method, parts), noise)
+    before, poor_before, coarser = None, 0, period
+    for divisor in DIVISORS:
+        if periods * divisor > MAX_TRIED or divisor > most_divisor:
+            break
+        dt = jnp.asarray(period / divisor, scenario.initial.q.dtype)
+        fitted = with_history(scenario, period / divisor)
+        found = run_one(fitted, (), dt, RunRequest(periods * divisor, method, divisor), noise_key)
         signals = found.records.signals
         q = signals["x"][:, 0]
         width = signals["level_upper"][:, 0] - signals["level_lower"][:, 0]
@@ -330,8 +333,6 @@ def _find_part(
         ):
             return coarser
         before, poor_before, coarser = q, poor, float(dt)
-        lead = int(str(parts)[0])
-        parts = parts // lead * {1: 2, 2: 5, 5: 10}[lead]
     problem = "makes this run accurate: the loop may magnify every error."
     notices.warn(f"No step down to {coarser:g} s {problem}")
     return coarser
