@@ -95,7 +95,7 @@ from iblf_jax.simulation.error_estimate import RELATIVE, TOLERANCE, Accuracy
 from iblf_jax.simulation.noise import normals
 from iblf_jax.simulation.sampling import Instant, step_commands
 from iblf_jax.simulation.scenario import Scenario
-from iblf_jax.simulation.stability import flow, period_map
+from iblf_jax.simulation.stability import linear_flow, period_map
 
 T = TypeVar("T")
 
@@ -579,7 +579,7 @@ def _inputs(
     plant = ravel_pytree(integrated_part(state))[0].size
     memory = len(derivative) - plant - n
     A, B = derivative[:plant, :plant], derivative[:plant, plant : plant + n]
-    by_torque = flow(A, B, sampling.period)[:, plant:]
+    by_torque = linear_flow(A, B, sampling.period)[:, plant:]
 
     def columns(plant_rows: jax.Array, memory_rows: jax.Array) -> jax.Array:
         rest = jnp.zeros((size - plant - memory, n), derivative.dtype)

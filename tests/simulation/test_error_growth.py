@@ -234,7 +234,7 @@ def test_the_bounds_are_those_of_the_worst_and_of_random_rounding_errors():
     plant = ravel_pytree(integrated_part(state))[0].size
     Phi = np.asarray(stability.period_map(scenario, state, derivative))
     A, B = derivative[:plant, :plant], derivative[:plant, plant : plant + 2]
-    by_torque = np.asarray(stability.flow(A, B, scenario.sampling.period))[:, plant:]
+    by_torque = np.asarray(stability.linear_flow(A, B, scenario.sampling.period))[:, plant:]
     law = np.asarray(derivative[plant:, :2])
     by_reading = np.concatenate([by_torque @ law[:2], law[2:]]) * 2 * np.pi / 1024
     by_level = np.concatenate([by_torque, np.zeros_like(law[2:])]) * 1.5
