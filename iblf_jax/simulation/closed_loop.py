@@ -438,8 +438,8 @@ def _bounds_of_levels(
     last = max(i for i, bounds in enumerate(scenario.bounds) if bounds is not None)
     centres = [*signals.alphas, *jnp.zeros_like(x[1 + len(signals.alphas) :])]
     infinite = jnp.full_like(x[0], jnp.inf)
-    higher = zip(scenario.bounds[1 : last + 1], centres, strict=False)
-    for level, (bounds, centre) in enumerate(higher, start=2):
+    others = zip(scenario.bounds[1 : last + 1], centres, strict=False)
+    for level, (bounds, centre) in enumerate(others, start=2):
         if bounds is None:
             bounds_of_levels.append((-infinite, infinite))
         elif level == 2 and has_speed_limits(scenario):
