@@ -402,7 +402,7 @@ def _observed(scenario: Scenario, folds, dt, motion: RecordedMotion, is_gap):
     x, moved = (jnp.stack(levels, axis=1) for levels in ((rows.q, rows.dq), (rows.dq, rows.ddq)))
     samples = jax.vmap(partial(sample_at, scenario))(t, x, moved, rows.tau, rows.limited, signals)
     samples = dataclasses.replace(samples, dt=weight, step=step)
-    raised = jax.vmap(partial(sample_status, scenario))(samples)
+    raised = jax.vmap(sample_status)(samples)
     return samples, folded(folds, samples), raised
 
 

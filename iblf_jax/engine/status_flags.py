@@ -7,7 +7,6 @@ import jax.numpy as jnp
 
 from iblf_jax.core.status import Status, flag
 from iblf_jax.simulation.closed_loop import LoopState, integrated_part
-from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import (
     Sample,
     has,
@@ -20,8 +19,8 @@ from iblf_jax.simulation.signals import (
 from iblf_jax.world.bounds import NARROWEST
 
 
-def sample_status(scenario: Scenario, sample: Sample) -> jax.Array:
-    """The flags that one sample of a scenario raises, () int32."""
+def sample_status(sample: Sample) -> jax.Array:
+    """The flags that one sample raises, () int32."""
     found = (
         flag(jnp.any(~(least_margin(sample, 1) > 0)), Status.BOUND_VIOLATED)
         | flag(jnp.any(sample.guard_active), Status.GUARD_ACTIVE)
@@ -35,8 +34,6 @@ def sample_status(scenario: Scenario, sample: Sample) -> jax.Array:
     for signal in ("slack", "region_slack"):
         if has(sample, signal):
             found |= flag(jnp.any(getattr(sample, signal) > 0), Status.FILTER_INFEASIBLE)
-    if scenario.loop.plant.loses_input:
-        found |= flag(jnp.any(~jnp.isfinite(sample.tau)), Status.SINGULAR_GAIN)
     if has(sample, "region_margin"):
         found |= flag(jnp.any(~(sample.region_margin > 0)), Status.REGION_VIOLATED)
     if has_velocity_level_bounds(sample):

@@ -239,8 +239,7 @@ def later_pieces(
     begins.
     """
     # These pieces are rare: their stages are a loop, which compiles in a fraction of the time.
-    scenario, folds = along.inputs.scenario, along.inputs.folds
-    none = jnp.zeros_like(along.inputs.dt)
+    folds, none = along.inputs.folds, jnp.zeros_like(along.inputs.dt)
     moved, piece_slopes, metric_samples = stepped.state, [], []
     status = None
     if len(pieces) > 1:
@@ -266,7 +265,7 @@ def later_pieces(
                 made, accumulators = across_jumps(
                     along, piece, moved, method, made, between, accumulators
                 )
-            return (made.state, accumulators, status | sample_status(scenario, right)), (
+            return (made.state, accumulators, status | sample_status(right)), (
                 made.slopes,
                 left,
                 between,

@@ -151,7 +151,7 @@ def advance(
             along, method, times.division.pieces, state_after, piece_slopes
         )
     in_run = times.span.in_run
-    status = carry.status | sample_status(inputs.scenario, sample)
+    status = carry.status | sample_status(sample)
     if later.status is not None:
         status = status | later.status
     after, status = _frozen_if_invalid(
@@ -263,9 +263,11 @@ def _frozen_if_invalid(
     valid = is_valid(after, plants.speed_limit(plant)) & (status & int(Status.NOT_FINITE) == 0)
     status |= flag(~valid & in_run, Status.NOT_FINITE)
     if plant.loses_input:
-        stages = [slope for _, slopes in piece_slopes for slope in slopes]
-        lost = jnp.any(jnp.stack([has_no_input(slope) for slope in stages]))
-        status |= flag(lost & in_run, Status.SINGULAR_GAIN)
+        lost, *later = [has_no_input(slope) for _, slopes in piece_slopes for slope in slopes]
+        if later:
+            # The later stages of the last instant lie beyond the end of the run.
+            lost |= jnp.any(jnp.stack(later)) & in_run
+        status |= flag(lost, Status.SINGULAR_GAIN)
     return tree_where(valid & in_run, after, before), status
 
 
