@@ -164,18 +164,18 @@ def sample(scenario: Scenario, inputs: SampleInputs, state: LawState) -> tuple[L
         filtered.append(after)
     measured = measurement_of(jnp.stack(levels))
     update = law_update(scenario, inputs.t, measured, state.controller, state.observer, state.sent)
-    command = update.command
+    output = update.output
     tube = scenario.context.tube(inputs.t)
     infeasible = jnp.zeros((), bool)
-    for slack in jax.tree.leaves((command.slack, command.region_slack)):
+    for slack in jax.tree.leaves((output.slack, output.region_slack)):
         infeasible |= jnp.any(slack > 0)
     outputs = Outputs(
-        plant_input(command),
-        command.alpha,
-        update.f_hat,
+        plant_input(output),
+        output.alpha,
+        update.estimate,
         ~jnp.all((inputs.q > tube.lower) & (inputs.q < tube.upper)),
-        jnp.any(command.guard_active),
-        jnp.any(command.saturated),
+        jnp.any(output.guard_active),
+        jnp.any(output.saturated),
         infeasible,
     )
     return LawState(update.controller, update.observer, tuple(filtered), update.sent), outputs

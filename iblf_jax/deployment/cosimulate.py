@@ -400,10 +400,8 @@ def _observed(scenario: Scenario, folds, dt, motion: RecordedMotion, is_gap):
     step = jnp.where(rows.instant & (t > 0), dt, 0.0)
     signals = jax.tree.map(lambda x: x[rows.sample], motion.states.sampled.signals)
     x, moved = (jnp.stack(levels, axis=1) for levels in ((rows.q, rows.dq), (rows.dq, rows.ddq)))
-    samples = jax.vmap(partial(sample_at, scenario))(
-        t, weight, x, moved, rows.tau, rows.limited, signals
-    )
-    samples = dataclasses.replace(samples, step=step)
+    samples = jax.vmap(partial(sample_at, scenario))(t, x, moved, rows.tau, rows.limited, signals)
+    samples = dataclasses.replace(samples, dt=weight, step=step)
     raised = jax.vmap(sample_status)(samples)
     return samples, folded(folds, samples), raised
 
@@ -449,7 +447,7 @@ def rollout_of(
         fastest_mode=jnp.full_like(step_size, jnp.nan),
         dt=step_size,
         actuator_state=jax.tree.map(lambda x: jnp.asarray(x[at]), rows.actuator),
-        measured=states.sampled.measured,
+        measured=states.sampled.received,
         method=method,
         steps=int(np.sum(rows.instant)) - 1,
         **attributes(recorded, FIELDS),

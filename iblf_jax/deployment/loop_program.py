@@ -12,8 +12,7 @@ import jax.numpy as jnp
 from iblf_jax.core.attributes import attributes
 from iblf_jax.deployment.control_law import as_floats, of_floats, program_of
 from iblf_jax.deployment.signal_units import one_unit, rate_units
-from iblf_jax.engine.carry import Inputs, StepOptions, start
-from iblf_jax.engine.time_step import advance
+from iblf_jax.engine import Inputs, StepOptions, advance, initial_carry
 from iblf_jax.kernels import Program
 from iblf_jax.simulation import error_estimate
 from iblf_jax.simulation.closed_loop import initial_state
@@ -111,7 +110,7 @@ def loop_program(scenario: Scenario, method: str) -> Loop:
             noise = key
         inputs = Inputs(scenario, (), run_settings.dt, jnp.asarray(UNLIMITED_STEPS, dtype), noise)
         size = error_estimate.watched_indices(state).size
-        before = start(inputs, method, jnp.zeros((size, size), dtype))
+        before = initial_carry(inputs, method, jnp.zeros((size, size), dtype))
         before = before._replace(state=state, status=status)
         done = advance(inputs, before, index, method, StepOptions(scalar=True))
         values = []

@@ -4,7 +4,7 @@
     request    `RunRequest.of`                       `RunRequest.of`
     plan       `plan.choose_plan`                    `plan.choose_plan`
     program    `compile.plan_of_single_run`          `compile_batch`
-    output     `single_run.run_one`: an `Outcome`    `CompiledBatch` or `run_batch`: an `Outcome`
+    outcome    `single_run.run_one`: an `Outcome`    `CompiledBatch` or `run_batch`: an `Outcome`
     result     `run_rollout`: a `Rollout`            of the caller, such as a `Study`
 
 The later functions call the earlier ones: `run_rollout` and `run_batch` need only a request.
@@ -14,7 +14,10 @@ import from here; `simulate`, `explain`, `recommended_period` and the step sizes
 their own.
 """
 
+from iblf_jax.engine.carry import Inputs as Inputs
 from iblf_jax.engine.carry import Step as Step
+from iblf_jax.engine.carry import StepOptions as StepOptions
+from iblf_jax.engine.carry import initial_carry as initial_carry
 from iblf_jax.engine.compile import BackendWarning as BackendWarning
 from iblf_jax.engine.derivatives import Outer as Outer
 from iblf_jax.engine.derivatives import Tangents as Tangents
@@ -44,4 +47,5 @@ from iblf_jax.engine.status_flags import sample_status as sample_status
 from iblf_jax.engine.thresholds import LOWERING_LIMITS as LOWERING_LIMITS
 from iblf_jax.engine.thresholds import MAX_FORWARD_NUMBERS as MAX_FORWARD_NUMBERS
 from iblf_jax.engine.thresholds import differentiates_forward as differentiates_forward
+from iblf_jax.engine.time_step import advance as advance
 from iblf_jax.engine.waiting import wait_until_ready as wait_until_ready

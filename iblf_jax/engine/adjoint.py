@@ -35,14 +35,14 @@ from iblf_jax.engine.carry import (
     Inputs,
     Step,
     StepOptions,
-    keep_if,
-    start_without_accuracy,
+    carry_without_accuracy,
+    tree_where,
 )
 from iblf_jax.engine.columns import float_metrics, floats_of
 from iblf_jax.engine.compile import operations
 from iblf_jax.engine.derivatives import floats_of_carry
 from iblf_jax.engine.linearization import Linearization
-from iblf_jax.engine.loops import kernel_loop, program_of, rows_of_leaves
+from iblf_jax.engine.loops import kernel_stepper, program_of, rows_of_leaves
 from iblf_jax.engine.outcome import Outcome
 from iblf_jax.engine.registry import Executor
 from iblf_jax.engine.request import RunRequest
@@ -157,9 +157,9 @@ class AdjointStep(Step):
         is_made = status & int(Status.NOT_FINITE) == 0
         total = sum(map(jnp.sum, [*cotangent, *by_leaves]), jnp.zeros_like(inputs.dt))
         counts = is_made | jnp.isfinite(total)
-        by_leaves = keep_if(counts, by_leaves, jax.tree.map(jnp.zeros_like, by_leaves))
+        by_leaves = tree_where(counts, by_leaves, jax.tree.map(jnp.zeros_like, by_leaves))
         gradient = jax.tree.map(jnp.add, carry.gradient, by_leaves)
-        return Adjoint(keep_if(counts, cotangent, carry.cotangent), gradient), ()
+        return Adjoint(tree_where(counts, cotangent, carry.cotangent), gradient), ()
 
 
 def with_leaves(inputs: Inputs, places: Sequence[int], values: Sequence[jax.Array]) -> Inputs:
@@ -211,13 +211,13 @@ class ReverseRun(NamedTuple):
     def forward(self) -> tuple[Outcome, Stored]:
         """The outcome, without records, and what the way back needs."""
         stored, at_start = self.stored()
-        loop = kernel_loop(self.executor)
-        return finalize(loop, self.batch, self.request, stored.carry, at_start), stored
+        run_steps = kernel_stepper(self.executor)
+        return finalize(run_steps, self.batch, self.request, stored.carry, at_start), stored
 
     def stored(self) -> tuple[Stored, Linearization]:
         """What the way back needs, and the linearization at the start."""
-        loop = kernel_loop(self.executor)
-        before, at_start = initialize(loop, self.batch, self.request.method)
+        run_steps = kernel_stepper(self.executor)
+        before, at_start = initialize(run_steps, self.batch, self.request.method)
         form = Form.of(before)
         segment = self.segment(form)
         packed = self.executor.pack(
@@ -315,7 +315,7 @@ class ReverseRun(NamedTuple):
 
         def floats_at_start(parameters):
             moved = with_leaves(inputs, self.places, parameters)
-            return floats_of_carry(start_without_accuracy(moved, self.request.method))[0]
+            return floats_of_carry(carry_without_accuracy(moved, self.request.method))[0]
 
         _, pullback = jax.vjp(floats_at_start, self._parameters(inputs))
         (by_start,) = pullback(adjoint.cotangent)

@@ -1,6 +1,6 @@
 """A batch of runs, or a single run: its leaves, and the sequence from the start to the outcome.
 
-`run_all` calls `initialize`, a loop over the steps (`StepLoop`) and `finalize`.
+`run_all` calls `initialize`, a `Stepper` and `finalize`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.engine.carry import Carry, Inputs, start, start_without_accuracy
+from iblf_jax.engine.carry import Carry, Inputs, carry_without_accuracy, initial_carry
 from iblf_jax.engine.linearization import (
     Linearization,
     LinearizationStep,
@@ -76,13 +76,13 @@ def split(inputs: Inputs, varied: Mapping[str, jax.Array]) -> Leaves:
 
     def replaced(values):
         leaves = {path: x for path, x in values.items() if path != NOISE_NAME}
-        noise = inputs.noise
+        noise_key = inputs.noise_key
         if NOISE_NAME in values:
-            noise = values[NOISE_NAME].astype(inputs.dt.dtype)
+            noise_key = values[NOISE_NAME].astype(inputs.dt.dtype)
         scenario = with_parameters(inputs.scenario, leaves)
         if NOISE_NAME in values:
-            scenario = realised(scenario, noise)
-        return jax.tree.leaves(inputs._replace(scenario=scenario, noise=noise))
+            scenario = realised(scenario, noise_key)
+        return jax.tree.leaves(inputs._replace(scenario=scenario, noise_key=noise_key))
 
     # A leaf that no path replaces stays the same object, also under `vmap`.
     is_per_run: list[bool] = []
@@ -146,19 +146,19 @@ class Batch(NamedTuple):
         return jax.vmap(one, axis_size=self.runs)(self.leaves.per_run, *args)
 
 
-StepLoop = Callable[[Any, Batch, Any, int, int | None], tuple[Any, Any]]
-"""The loop over all steps of a batch: a function (step, batch, carry, steps, every) -> (carry after
-the last step, records).
+Stepper = Callable[[Any, Batch, Any, int, int | None], tuple[Any, Any]]
+"""Makes all steps of a batch: a function (step, batch, carry, steps, every) -> (carry after the
+last step, records).
 
 The first step and every `every`-th one after it are recorded; None records nothing.  All arrays
 have a leading run axis, which the time axis of the records follows."""
 
 
-def _linearized(loop: StepLoop, batch: Batch, carry: Linearization) -> Linearization:
+def _linearized(run_steps: Stepper, batch: Batch, carry: Linearization) -> Linearization:
     """The linearization of every run, after all `LinearizationStep`s."""
     batch = _linearized_batch(batch)
     steps = linearization_steps(batch.leaves.first.scenario)
-    carry, columns = loop(LinearizationStep(), batch, carry, steps, 1)
+    carry, columns = run_steps(LinearizationStep(), batch, carry, steps, 1)
     return carry.with_columns(columns)
 
 
@@ -168,7 +168,7 @@ def _linearized_batch(batch: Batch) -> Batch:
     """
     leaves = batch.leaves
     indices: Inputs = jax.tree.unflatten(leaves.treedef, range(len(leaves.is_per_run)))
-    kept, treedef = jax.tree.flatten(indices._replace(folds=(), noise=(), direction=()))
+    kept, treedef = jax.tree.flatten(indices._replace(folds=(), noise_key=(), direction=()))
     values = leaves.merge(leaves.shared, leaves.per_run)
     is_per_run = [leaves.is_per_run[i] for i in kept]
     constants = jax.lax.stop_gradient([values[i] for i in kept])
@@ -196,20 +196,20 @@ def linearization_batch(batch: Batch, method: str) -> tuple[Batch, Linearization
     return _linearized_batch(batch), jax.eval_shape(lambda: _initial_linearization(batch, method))
 
 
-def initialize(loop: StepLoop, batch: Batch, method: str) -> tuple[Carry, Linearization]:
+def initialize(run_steps: Stepper, batch: Batch, method: str) -> tuple[Carry, Linearization]:
     """The carry before the first step, and the linearization at the start."""
-    at_start = _linearized(loop, batch, _initial_linearization(batch, method))
+    at_start = _linearized(run_steps, batch, _initial_linearization(batch, method))
 
     def of_run(inputs, at_start):
         is_sampled = inputs.scenario.sampling is not None
-        return start(inputs, method, resolved_jacobian(at_start.jacobian, is_sampled))
+        return initial_carry(inputs, method, resolved_jacobian(at_start.jacobian, is_sampled))
 
     return batch.map_runs(of_run, at_start), at_start
 
 
 def carry_without_linearization(batch: Batch, method: str) -> Carry:
     """The carry before the first step, with an error estimate that has no meaning."""
-    return batch.map_runs(lambda inputs: start_without_accuracy(inputs, method))
+    return batch.map_runs(lambda inputs: carry_without_accuracy(inputs, method))
 
 
 def carry_shapes(batch: Batch, method: str) -> Carry:
@@ -218,7 +218,7 @@ def carry_shapes(batch: Batch, method: str) -> Carry:
 
 
 def finalize(
-    loop: StepLoop, batch: Batch, request: RunRequest, carry: Carry, at_start: Linearization
+    run_steps: Stepper, batch: Batch, request: RunRequest, carry: Carry, at_start: Linearization
 ) -> Outcome:
     """The outcome after the last step, without records; `at_start` is the linearization at the
     start of the run.
@@ -226,7 +226,8 @@ def finalize(
 
     def at_nearest_and_end(inputs, carry):
         watched = at_start.jacobian.shape[-1]
-        no_estimate = error_estimate.UnresolvedSignals(*[jnp.zeros_like(carry.accuracy.error)] * 3)
+        error = carry.accuracy.error
+        no_estimate = error_estimate.UnresolvedSignals.zero(error.size, error.dtype)
         nearest = carry.nearest
         end = inputs.dt * inputs.steps
         pair = (
@@ -245,34 +246,34 @@ def finalize(
     doubled = batch._replace(leaves=leaves, runs=2 * (batch.runs or 1))
     pairs = batch.map_runs(at_nearest_and_end, carry)
     if batch.runs is None:
-        pairs = _linearized(loop, doubled, pairs)
+        pairs = _linearized(run_steps, doubled, pairs)
     else:
         flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), pairs)
-        flat = _linearized(loop, doubled, flat)
+        flat = _linearized(run_steps, doubled, flat)
         pairs = jax.tree.map(lambda x: x.reshape(-1, 2, *x.shape[1:]), flat)
     return batch.map_runs(outcome, carry, at_start, pairs)
 
 
-def run_all(loop: StepLoop, batch: Batch, request: RunRequest) -> Outcome:
-    """The outcome of all runs, made by a loop."""
-    outcome, records = run_step(loop, batch, TimeStep.of(request), request)
+def run_all(run_steps: Stepper, batch: Batch, request: RunRequest) -> Outcome:
+    """The outcome of all runs, whose steps a `Stepper` makes."""
+    outcome, records = run_step(run_steps, batch, TimeStep.of(request), request)
     if request.record_every is None:
         return outcome
     return outcome._replace(records=records)
 
 
 def run_step(
-    loop: StepLoop, batch: Batch, step: TimeStep, request: RunRequest
+    run_steps: Stepper, batch: Batch, step: TimeStep, request: RunRequest
 ) -> tuple[Outcome, Any]:
     """The outcome without records, and the records, of all runs by a given step."""
-    carry, at_start = initialize(loop, batch, request.method)
-    carry, records = loop(step, batch, carry, request.instants, request.record_every)
-    return finalize(loop, batch, request, carry, at_start), records
+    carry, at_start = initialize(run_steps, batch, request.method)
+    carry, records = run_steps(step, batch, carry, request.instants, request.record_every)
+    return finalize(run_steps, batch, request, carry, at_start), records
 
 
-def jacobians(loop: StepLoop, batch: Batch, carry: Linearization) -> jax.Array:
+def jacobians(run_steps: Stepper, batch: Batch, carry: Linearization) -> jax.Array:
     """The Jacobian of every run at the state of its carry (`linearization.jacobian_carry`),
     (B, m', m') [1/s].
     """
     is_sampled = batch.leaves.first.scenario.sampling is not None
-    return resolved_jacobian(_linearized(loop, batch, carry).jacobian, is_sampled)
+    return resolved_jacobian(_linearized(run_steps, batch, carry).jacobian, is_sampled)

@@ -1,6 +1,6 @@
 """Inputs and carry of a step: what a run is made from, and what goes from one step to the next.
 
-`start` creates the carry before the first step.
+`initial_carry` creates the carry before the first step.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.engine.metric_folds import begun
+from iblf_jax.engine.metric_folds import initial_accumulators
 from iblf_jax.simulation import error_estimate, error_growth, stability
 from iblf_jax.simulation.closed_loop import (
     LoopState,
@@ -36,8 +36,8 @@ class Inputs(NamedTuple):
     dt: jax.Array
     steps: jax.Array
     """(), a float: integers are not leaves of a scalar program."""
-    noise: Any = ()
-    """The key of the run's random numbers (`noise.noise_key`), where it has any."""
+    noise_key: Any = ()
+    """Key of the run's random numbers (`noise.noise_key`), where it has any."""
     direction: Any = ()
     """Tangents of leaves, where a step takes them as data."""
 
@@ -80,12 +80,12 @@ class Step:
     __call__: Callable[..., tuple[Any, Any]]
 
 
-def keep_if(condition, new, old):
+def tree_where(condition, new, old):
     """`new` where the condition holds, leaf by leaf, else `old`."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
 
 
-def start(inputs: Inputs, method: str, jacobian: jax.Array) -> Carry:
+def initial_carry(inputs: Inputs, method: str, jacobian: jax.Array) -> Carry:
     """The carry before the first step; accumulators that begin with something of the first sample
     are blank until then.
 
@@ -95,27 +95,29 @@ def start(inputs: Inputs, method: str, jacobian: jax.Array) -> Carry:
       jacobian: what a `LinearizationStep` has found at the start.
     """
     state, zero = initial_state(inputs.scenario), jnp.zeros_like(inputs.dt)
-    shapes = jax.eval_shape(evaluate, inputs.scenario, inputs.dt, state, inputs.dt)[1]
+    shapes = jax.eval_shape(evaluate, inputs.scenario, inputs.dt, state)[1]
     sample = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-    blank = begun(inputs.folds, sample)
+    blank = initial_accumulators(inputs.folds, sample)
     constant, jacobian = jax.lax.stop_gradient((state, jacobian))
-    growth = error_growth.begin(inputs.scenario, constant, jacobian)
+    growth = error_growth.initial_growth(inputs.scenario, constant, jacobian)
     if inputs.scenario.sampling is not None:
         jacobian = stability.period_map_as_rate(
             jax.lax.stop_gradient(inputs.scenario), constant, jacobian
         )
-    estimate = error_estimate.begin(method, jacobian, constant)._replace(growth=growth)
+    accuracy = error_estimate.initial_accuracy(method, jacobian, constant)._replace(
+        error_growth=growth
+    )
     return Carry(
         state,
         blank,
         jnp.int32(0),
         Nearest(-jnp.ones_like(zero), zero, perturbed_state(constant)),
-        estimate,
+        accuracy,
         distances(inputs.scenario, sample),
     )
 
 
-def start_without_accuracy(inputs: Inputs, method: str) -> Carry:
-    """As `start`, without a linearization: its estimate of the accuracy has no meaning."""
+def carry_without_accuracy(inputs: Inputs, method: str) -> Carry:
+    """As `initial_carry`, without a linearization: its estimate of the accuracy has no meaning."""
     size = error_estimate.watched_indices(initial_state(inputs.scenario)).size
-    return start(inputs, method, jnp.zeros((size, size), inputs.dt.dtype))
+    return initial_carry(inputs, method, jnp.zeros((size, size), inputs.dt.dtype))

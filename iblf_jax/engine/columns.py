@@ -17,8 +17,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.engine.batch import Batch, Leaves, StepLoop, run_step
-from iblf_jax.engine.carry import Carry, Inputs, Step, StepOptions, start_without_accuracy
+from iblf_jax.engine.batch import Batch, Leaves, Stepper, run_step
+from iblf_jax.engine.carry import Carry, Inputs, Step, StepOptions, carry_without_accuracy
 from iblf_jax.engine.derivatives import (
     Directions,
     Tangents,
@@ -29,7 +29,7 @@ from iblf_jax.engine.derivatives import (
 from iblf_jax.engine.metric_folds import finished
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.step_pieces import MetricSample
-from iblf_jax.engine.time_step import Advanced, TimeStep, samples_of_step
+from iblf_jax.engine.time_step import StepOutput, TimeStep, samples_of_step
 from iblf_jax.simulation import error_estimate
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
 
@@ -61,7 +61,7 @@ def _floats(carry: Carry | WithTangent) -> tuple[list[jax.Array], Callable]:
     return inner + carry.tangent, lambda x: WithTangent(replaced(x[: len(inner)]), x[len(inner) :])
 
 
-def _moved(inputs: Inputs, places: Places, eps: jax.Array) -> Inputs:
+def _with_moved_leaves(inputs: Inputs, places: Places, eps: jax.Array) -> Inputs:
     """The inputs, with leaves moved by eps along the last direction."""
     leaves, treedef = jax.tree.flatten(inputs.scenario)
     for place, change in zip(places[-1], inputs.direction[len(places) - 1], strict=True):
@@ -79,10 +79,10 @@ def numbers_of(inputs: Inputs, record: Callable) -> int:
 
     def one(inputs):
         state = initial_state(inputs.scenario)
-        sample = evaluate(inputs.scenario, inputs.dt, state, inputs.dt)[1]
+        sample = evaluate(inputs.scenario, inputs.dt, state)[1]
         seen = MetricSample(tuple(fold.init(sample) for fold in inputs.folds), sample, True)
         samples = (seen,) * samples_of_step(inputs.scenario)
-        found = Advanced(None, samples, state)  # type: ignore[arg-type]
+        found = StepOutput(None, samples, state)  # type: ignore[arg-type]
         return floats_of(record(inputs.folds, found))
 
     return sum(math.prod(x.shape) for x in jax.eval_shape(one, inputs))
@@ -104,7 +104,9 @@ class TangentStep(Step):
         floats, replaced = _floats(carry.carry)
 
         def of(eps, floats):
-            after, record = step(_moved(inputs, self.places, eps), replaced(floats), index, options)
+            after, record = step(
+                _with_moved_leaves(inputs, self.places, eps), replaced(floats), index, options
+            )
             return (_floats(after)[0], floats_of(record)), after
 
         zero = jnp.zeros_like(inputs.dt)
@@ -114,14 +116,14 @@ class TangentStep(Step):
         return WithTangent(after, tangent), record
 
 
-def _begun(inputs: Inputs, method: str, places: Places) -> Carry | WithTangent:
+def _initial_carry(inputs: Inputs, method: str, places: Places) -> Carry | WithTangent:
     """The carry before the first step, with its tangents."""
     if not places:
         # The accuracy is estimated by the run without tangents; this estimate is not read.
-        return start_without_accuracy(inputs, method)
+        return carry_without_accuracy(inputs, method)
 
     def of(eps):
-        carry = _begun(_moved(inputs, places, eps), method, places[:-1])
+        carry = _initial_carry(_with_moved_leaves(inputs, places, eps), method, places[:-1])
         return _floats(carry)[0], carry
 
     zero = jnp.zeros_like(inputs.dt)
@@ -143,7 +145,7 @@ def _metrics(inputs: Inputs, carry: Carry | WithTangent, places: Places) -> dict
     zero = jnp.zeros_like(inputs.dt)
 
     def of(eps, floats):
-        return _metrics(_moved(inputs, places, eps), replaced(floats), places[:-1])
+        return _metrics(_with_moved_leaves(inputs, places, eps), replaced(floats), places[:-1])
 
     return jax.jvp(of, (zero, floats), (jnp.ones_like(zero), carry.tangent))[1]
 
@@ -167,7 +169,7 @@ def _units(shapes: list[tuple[int, ...]], dtype) -> list[jax.Array]:
 
 
 def _stepped(
-    loop: StepLoop,
+    run_steps: Stepper,
     batch: Batch,
     step: TangentStep,
     directions: list[list[Any]],
@@ -179,7 +181,7 @@ def _stepped(
     """
     # A run is made for every column of every run of the batch.
     leaves, runs = batch.leaves, batch.runs or 1
-    sizes = [len(level[0]) for level in directions]
+    sizes = [len(of_order[0]) for of_order in directions]
     per_run = [jnp.repeat(x, math.prod(sizes), axis=0) for x in leaves.per_run]
 
     def beside_others(k: int, column: jax.Array) -> jax.Array:
@@ -187,34 +189,34 @@ def _stepped(
         repeated = jnp.repeat(column, math.prod(sizes[k + 1 :]), axis=0)
         return jnp.tile(repeated, (runs * math.prod(sizes[:k]), *[1] * (column.ndim - 1)))
 
-    added = [[beside_others(k, x) for x in level] for k, level in enumerate(directions)]
+    added = [[beside_others(k, x) for x in of_order] for k, of_order in enumerate(directions)]
     repeated = batch._replace(leaves=leaves._replace(per_run=per_run))
     wide = _with_directions(repeated, added)._replace(runs=runs * math.prod(sizes))
     return jax.tree.map(
-        lambda x: x.reshape(runs, *sizes, *x.shape[1:]), _made(loop, wide, step, request)
+        lambda x: x.reshape(runs, *sizes, *x.shape[1:]), _made(run_steps, wide, step, request)
     )
 
 
 def _made(
-    loop: StepLoop, wide: Batch, step: TangentStep, request: RunRequest
+    run_steps: Stepper, wide: Batch, step: TangentStep, request: RunRequest
 ) -> tuple[list[jax.Array], dict[str, jax.Array]]:
     """The derivatives of what a step records and of the metrics, for each run and direction of a
     batch that has its directions.
     """
-    before = wide.map_runs(lambda inputs: _begun(inputs, request.method, step.places))
-    after, records = loop(step, wide, before, request.steps + 1, request.record_every)
+    before = wide.map_runs(lambda inputs: _initial_carry(inputs, request.method, step.places))
+    after, records = run_steps(step, wide, before, request.instants, request.record_every)
     metrics = wide.map_runs(lambda inputs, carry: _metrics(inputs, carry, step.places), after)
     return list(records), metrics
 
 
 def columns(
-    loop: StepLoop, batch: Batch, places: Places, request: RunRequest
+    run_steps: Stepper, batch: Batch, places: Places, request: RunRequest
 ) -> tuple[list[jax.Array], dict[str, jax.Array]]:
     """The derivative of records and metrics of every run by the numbers of some leaves, or a second
     derivative.
 
     Args:
-      loop: makes the steps.
+      run_steps: makes the steps.
       batch: of R runs.
       places: of the leaves by whose numbers, P of them, it is; for a second derivative two such
         tuples, P and Q.
@@ -225,21 +227,23 @@ def columns(
       metric that is a float (R, P, ...).
     """
     shapes = [jnp.shape(x) for x in jax.tree.leaves(batch.leaves.first.scenario)]
-    directions = [_units([shapes[place] for place in level], batch.dtype) for level in places]
-    return _stepped(loop, batch, TangentStep(TimeStep.of(request), places), directions, request)
+    directions = [_units([shapes[place] for place in of_order], batch.dtype) for of_order in places]
+    return _stepped(
+        run_steps, batch, TangentStep(TimeStep.of(request), places), directions, request
+    )
 
 
 def along_direction(
-    loop: StepLoop,
+    run_steps: Stepper,
     batch: Batch,
     places: tuple[int, ...],
-    moves: list[jax.Array],
+    tangents: list[jax.Array],
     request: RunRequest,
 ) -> tuple[list[jax.Array], dict[str, jax.Array]]:
     """The derivative of records and metrics of every run along a direction of its own.
 
     Args:
-      loop, batch, request: as `columns`.
+      run_steps, batch, request: as `columns`.
       places: of the leaves that move.
       moves: how far each of them moves in every run, (R, *shape of the leaf).
 
@@ -247,21 +251,21 @@ def along_direction(
       As `columns`, without the axis of the columns.
     """
     step = TangentStep(TimeStep.of(request), (places,))
-    return _made(loop, _with_directions(batch, [moves]), step, request)
+    return _made(run_steps, _with_directions(batch, [tangents]), step, request)
 
 
-def outer_vectors(folds: tuple[Fold, ...], found: Advanced) -> list[jax.Array]:
+def outer_vectors(folds: tuple[Fold, ...], found: StepOutput) -> list[jax.Array]:
     """Of the curvature matrices, what has tangents."""
     return [outer.vector for outer in outers_of_step(folds, found)]
 
 
-def _weights(folds: tuple[Fold, ...], found: Advanced) -> list[jax.Array]:
+def _weights(folds: tuple[Fold, ...], found: StepOutput) -> list[jax.Array]:
     """And their weights."""
     return [outer.weight for outer in outers_of_step(folds, found)]
 
 
 def run_by_columns(
-    loop: StepLoop, batch: Batch, directions: Directions, request: RunRequest
+    run_steps: Stepper, batch: Batch, directions: Directions, request: RunRequest
 ) -> Tangents:
     """The same result as `run_with_tangents`, from one run per tangent."""
     inputs = batch.leaves.first
@@ -280,9 +284,9 @@ def run_by_columns(
     if count_curvatures(inputs.folds):
         weight_of, vector_of, every = _weights, outer_vectors, 1
     request = request._replace(record_every=every)
-    outcome, weights = run_step(loop, batch, TimeStep(request.method, weight_of), request)
+    outcome, weights = run_step(run_steps, batch, TimeStep(request.method, weight_of), request)
     step = TangentStep(TimeStep(request.method, vector_of), (places,))
-    found, tangents = _stepped(loop, batch, step, [along], request)
+    found, tangents = _stepped(run_steps, batch, step, [along], request)
     constant = {name: x for name, x in outcome.metrics.items() if name in ACCURACY}
     no_tangents = {
         name: jnp.zeros((len(x), directions.tangents, *x.shape[1:]), batch.dtype)

@@ -27,10 +27,10 @@ import numpy as np
 from iblf_jax.core import checks, notices
 from iblf_jax.core.caches import CACHE
 from iblf_jax.engine import plan, registry, thresholds
-from iblf_jax.engine.batch import Batch, StepLoop, carry_shapes, linearization_batch
+from iblf_jax.engine.batch import Batch, Stepper, carry_shapes, linearization_batch
 from iblf_jax.engine.carry import Inputs
 from iblf_jax.engine.linearization import LinearizationStep, linearization_steps
-from iblf_jax.engine.loops import kernel_loop, program_of
+from iblf_jax.engine.loops import kernel_stepper, program_of
 from iblf_jax.engine.plan import ExecutionPlan, Sizes, choose_plan
 from iblf_jax.engine.registry import Executor, Machine
 from iblf_jax.engine.request import RunRequest
@@ -97,7 +97,10 @@ def first_that_works(
     names = (*execution.backends, "vmap")
     for name, following in itertools.pairwise(names):
         try:
-            return _attempted(attempt, registry.EXECUTORS[name])
+            try:
+                return attempt(registry.EXECUTORS[name])
+            except StoppedError:
+                return attempt(registry.EXECUTORS[name])
         except StoppedError:
             raise
         except ToolchainError as error:
@@ -109,30 +112,22 @@ def first_that_works(
     return by_scan()
 
 
-def _attempted(attempt: Callable[[Executor], T], executor: Executor) -> T:
-    """The value of an attempt, of a second one if the compiler was stopped in the first."""
-    try:
-        return attempt(executor)
-    except StoppedError:
-        return attempt(executor)
-
-
 def inputs_of(
     scenario: Scenario,
     folds: tuple[Fold, ...],
     dt: jax.Array,
     request: RunRequest,
-    noise: jax.Array | None = None,
+    noise_key: jax.Array | None = None,
 ) -> Inputs:
-    """The inputs of a run; `noise` is the key of its random numbers."""
+    """The inputs of a run; `noise_key` is the key of its random numbers."""
     key: Any = ()
     if needs_key(scenario):
         key = jnp.zeros((4,), dt.dtype)
-        if noise is not None:
-            key = noise.astype(dt.dtype)
+        if noise_key is not None:
+            key = noise_key.astype(dt.dtype)
         scenario = realised(scenario, key)
     steps: Any = np.asarray(request.steps, dt.dtype)
-    return Inputs(scenario, folds, dt, steps, noise=key)
+    return Inputs(scenario, folds, dt, steps, noise_key=key)
 
 
 def operations(inputs: Inputs) -> int:
@@ -206,16 +201,16 @@ def start_build(executor: Executor, program: StepProgram) -> None:
 
 
 def run_by_executor(
-    executor: Executor, batch: Batch, request: RunRequest, run: Callable[[StepLoop, Batch], T]
+    executor: Executor, batch: Batch, request: RunRequest, run: Callable[[Stepper, Batch], T]
 ) -> T:
-    """`run(loop, batch)` with the loop of an executor.
+    """`run(run_steps, batch)` with the `Stepper` of an executor.
 
     The longest kernel is built in the background at the same time, on another core.
     """
     if executor.start_build:
         start_build(executor, time_step_program(batch, request))
     with building():
-        return run(kernel_loop(executor), batch)
+        return run(kernel_stepper(executor), batch)
 
 
 @jax.tree_util.register_static

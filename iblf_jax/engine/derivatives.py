@@ -49,12 +49,12 @@ from jax.flatten_util import ravel_pytree
 
 from iblf_jax.core.attributes import attributes
 from iblf_jax.engine import thresholds
-from iblf_jax.engine.batch import Batch, StepLoop, finalize, initialize
+from iblf_jax.engine.batch import Batch, Stepper, finalize, initialize
 from iblf_jax.engine.carry import Carry, Inputs, Step, StepOptions
 from iblf_jax.engine.metric_folds import finished, split_floats
 from iblf_jax.engine.outcome import Outcome
 from iblf_jax.engine.request import RunRequest
-from iblf_jax.engine.time_step import Advanced, advance
+from iblf_jax.engine.time_step import StepOutput, advance
 from iblf_jax.simulation import error_estimate
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
 from iblf_jax.simulation.paths import get, with_parameters
@@ -214,7 +214,7 @@ def without_flags(sample: Sample) -> Any:
 
 
 def preaccumulated(scenario, directions: Directions, eps: jax.Array) -> Callable:
-    """`closed_loop.evaluate`, its Jacobian by directions and state (of a sampled loop torque and
+    """`closed_loop.evaluate`, its Jacobian by directions and state (of a sampled loop command and
     time too) worked out once and applied to every tangent.
 
     One tangent through the law costs as much as the law; applying the Jacobian costs a tenth of it.
@@ -223,24 +223,24 @@ def preaccumulated(scenario, directions: Directions, eps: jax.Array) -> Callable
     """
     jumps = scenario.jump_times().size > 0
 
-    def loop(moved, t, state, dt=0.0, torque=None):
-        # A stage's time moves where a torque arrives within a step, or a jump time does.
-        torques = tuple(x for x in (torque,) if x is not None)
-        times = tuple(x for x in (t,) if torque is not None or jumps)
-        leaves, structure = jax.tree.flatten((state, torques, times))
+    def evaluated(moved, t, state, command=None):
+        # A stage's time moves where a command arrives within a step, or a jump time does.
+        commands = tuple(x for x in (command,) if x is not None)
+        times = tuple(x for x in (t,) if command is not None or jumps)
+        leaves, structure = jax.tree.flatten((state, commands, times))
         real = [jnp.issubdtype(x.dtype, jnp.floating) for x in leaves]
         here, unravel = ravel_pytree([x for x, yes in zip(leaves, real, strict=True) if yes])
         flags = [x for x, yes in zip(leaves, real, strict=True) if not yes]
 
         # All that it reads is handed in: within a branch of JAX's it may close over nothing that is
         # traced.
-        def numbers(flat, eps, scenario, flags, t, dt):
+        def numbers(flat, eps, scenario, flags, t):
             parts, rest = iter(unravel(flat)), iter(flags)
-            state, torque, time = jax.tree.unflatten(
+            state, command, time = jax.tree.unflatten(
                 structure, [next(parts if yes else rest) for yes in real]
             )
             (t,) = time or (t,)
-            slope, sample = evaluate(directions.moved(scenario, eps), t, state, dt, *torque)
+            slope, sample = evaluate(directions.moved(scenario, eps), t, state, *command)
             return (slope, without_flags(sample)), attributes(sample, FLAG_FIELDS)
 
         @jax.custom_jvp
@@ -259,11 +259,11 @@ def preaccumulated(scenario, directions: Directions, eps: jax.Array) -> Callable
                 lambda column: jnp.tensordot(along, column, 1), columns
             )
 
-        at = here, eps, scenario, flags, t, jnp.asarray(dt, t.dtype)
+        at = here, eps, scenario, flags, t
         slope, values = floats(*at)
         return slope, Sample(**values, **numbers(*jax.lax.stop_gradient(at))[1])
 
-    return loop
+    return evaluated
 
 
 def count_curvatures(folds: Any) -> int:
@@ -279,7 +279,7 @@ def outers_of(folds, accumulators, sample) -> tuple[Outer, ...]:
     return found
 
 
-def outers_of_step(folds, found: Advanced) -> list[Outer]:
+def outers_of_step(folds, found: StepOutput) -> list[Outer]:
     """What all samples of a step add to them."""
     samples = []
     for seen in found.metric_samples:
@@ -308,13 +308,11 @@ class DerivativeStep(Step):
 
         def one(scenario, before, eps):
             # On arrays a Jacobian for a few tangents would cost more than the tangents.
-            loop = (
-                preaccumulated(inputs.scenario, self.directions, eps)
-                if options.scalar
-                else evaluate
-            )
+            function: Callable = evaluate
+            if options.scalar:
+                function = preaccumulated(inputs.scenario, self.directions, eps)
             found = advance(
-                inputs._replace(scenario=scenario), before, index, self.method, options, loop
+                inputs._replace(scenario=scenario), before, index, self.method, options, function
             )
             outers = outers_of_step(inputs.folds, found)
             vectors = [outer.vector for outer in outers]
@@ -330,7 +328,7 @@ class DerivativeStep(Step):
 
 
 def run_with_tangents(
-    loop: StepLoop, batch: Batch, directions: Directions, request: RunRequest
+    run_steps: Stepper, batch: Batch, directions: Directions, request: RunRequest
 ) -> Tangents:
     """All runs with their tangents, from the start to the outcome; `request` records nothing."""
     rows, columns = np.triu_indices(directions.tangents)
@@ -361,10 +359,10 @@ def run_with_tangents(
             full.at[rows, columns].set(x).at[columns, rows].set(x) for x in before.products
         )
 
-    carry, instant = initialize(loop, batch, request.method)
+    carry, instant = initialize(run_steps, batch, request.method)
     before = batch.map_runs(at_start, carry)
-    after, _ = loop(
-        DerivativeStep(request.method, directions), batch, before, request.steps + 1, None
+    after, _ = run_steps(
+        DerivativeStep(request.method, directions), batch, before, request.instants, None
     )
     tangents, products = batch.map_runs(at_end, after)
-    return Tangents(finalize(loop, batch, request, after.carry, instant), tangents, products)
+    return Tangents(finalize(run_steps, batch, request, after.carry, instant), tangents, products)

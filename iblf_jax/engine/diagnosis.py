@@ -127,14 +127,14 @@ def _violation(level: int, prefix: str, margin: str, result: Rollout) -> str:
     )
 
 
-def _violation_above_second(result: Rollout) -> str:
+def _higher_violation(result: Rollout) -> str:
     """Which level from the third on violated its bounds first."""
     metrics = result.metrics
     if "first_level_violation_time" not in metrics:
         return ""
     level = int(metrics["first_level_violation_level"])
     joint = int(metrics["first_level_violation_component"])
-    margin = metrics["level_margin"][level - 3, joint]
+    margin = metrics["level_margin"][level - 3, joint]  # its first row is that of level 3
     return _first_violation_of(result, level, joint, metrics["first_level_violation_time"], margin)
 
 
@@ -416,7 +416,7 @@ def _guard_stayed(result: Rollout) -> str:
 BOUND_EXPLANATIONS: dict[Status, Callable[[Rollout], str]] = {
     Status.BOUND_VIOLATED: partial(_violation, 1, "first_violation", "margin"),
     Status.VELOCITY_VIOLATED: partial(_violation, 2, "first_velocity_violation", "velocity_margin"),
-    Status.STATE_BOUND_VIOLATED: _violation_above_second,
+    Status.STATE_BOUND_VIOLATED: _higher_violation,
     Status.REGION_VIOLATED: _region_violation,
 }
 """The explanation of each flag of a violated bound."""

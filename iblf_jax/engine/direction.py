@@ -23,7 +23,7 @@ from iblf_jax.engine.adjoint import Cotangents, ReverseRun
 from iblf_jax.engine.batch import Batch, Leaves, run_all
 from iblf_jax.engine.columns import ACCURACY, along_direction, floats_of
 from iblf_jax.engine.compile import building, first_that_works, shapes_of
-from iblf_jax.engine.loops import kernel_loop, scan
+from iblf_jax.engine.loops import kernel_stepper, scan
 from iblf_jax.engine.plan import ExecutionPlan
 from iblf_jax.engine.registry import Executor
 from iblf_jax.engine.request import RunRequest
@@ -99,7 +99,7 @@ def derivative(
     runs: TracedRuns,
     places: tuple[int, ...],
     leaves: Sequence[jax.Array],
-    moves: Sequence[jax.Array],
+    tangents: Sequence[jax.Array],
 ) -> tuple[list[jax.Array], dict[str, jax.Array]]:
     """The derivative of a single run's records and metrics along a direction.
 
@@ -116,7 +116,7 @@ def derivative(
     is_per_run = tuple(i in places for i in range(len(leaves)))
     own = [x[None] if differs else x for x, differs in zip(leaves, is_per_run, strict=True)]
     runs = runs._replace(is_per_run=is_per_run)
-    directions = [x[None] for x in moves]
+    directions = [x[None] for x in tangents]
     flat = [x[0] for x in _primitive.bind(*own, *directions, runs=runs, places=places)]
     names = _names(runs, shapes_of(own))
     count = len(flat) - len(names)
@@ -168,12 +168,12 @@ def _function_of(
 
 def _along(*operands: jax.Array, runs: TracedRuns, places: tuple[int, ...]) -> list[jax.Array]:
     """The outputs of the primitive."""
-    leaves, moves = _divided(runs, operands)
+    leaves, tangents = _divided(runs, operands)
 
     def by_kernel(executor: Executor) -> list[jax.Array]:
         batch = runs.batch(leaves)
-        loop = kernel_loop(executor)
-        return jax.tree.leaves(along_direction(loop, batch, places, moves, runs.request))
+        run_steps = kernel_stepper(executor)
+        return jax.tree.leaves(along_direction(run_steps, batch, places, tangents, runs.request))
 
     return first_that_works(
         runs.plan, by_kernel, lambda: _along_by_scan(*operands, runs=runs, places=places)
@@ -184,9 +184,9 @@ def _along_by_scan(
     *operands: jax.Array, runs: TracedRuns, places: tuple[int, ...]
 ) -> list[jax.Array]:
     """As `_along`."""
-    leaves, moves = _divided(runs, operands)
+    leaves, tangents = _divided(runs, operands)
     function, at = _function_of(runs, places, leaves)
-    return jax.jvp(function, at, moves)[1]
+    return jax.jvp(function, at, tangents)[1]
 
 
 def _gradient(
@@ -274,9 +274,9 @@ def _abstract(*operands: Any, runs: TracedRuns, places: tuple[int, ...]) -> list
 
 def _jvp(primals, tangents, *, runs, places):
     leaves, _ = _divided(runs, primals)
-    of_leaves, of_moves = _divided(runs, tangents)
+    of_leaves, of_tangents = _divided(runs, tangents)
     value = _primitive.bind(*primals, runs=runs, places=places)
-    instantiated = [without_symbol(x) for x in of_moves]
+    instantiated = [without_symbol(x) for x in of_tangents]
     if all(map(is_zero, of_leaves)):
         return value, _primitive.bind(*leaves, *instantiated, runs=runs, places=places)
     by_scan = partial(_along_by_scan, runs=runs, places=places)

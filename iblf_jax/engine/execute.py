@@ -21,7 +21,7 @@ from iblf_jax.engine import registry
 from iblf_jax.engine.adjoint import Cotangents, ReverseRun
 from iblf_jax.engine.batch import (
     Batch,
-    StepLoop,
+    Stepper,
     carry_shapes,
     carry_without_linearization,
     jacobians,
@@ -49,7 +49,7 @@ from iblf_jax.engine.derivatives import (
     run_with_tangents,
 )
 from iblf_jax.engine.linearization import jacobian_carry
-from iblf_jax.engine.loops import checkpointed, kernel_loop, program_of, scan
+from iblf_jax.engine.loops import checkpointed, kernel_stepper, program_of, scan
 from iblf_jax.engine.outcome import Outcome
 from iblf_jax.engine.plan import ExecutionPlan, plan_of_jacobians, plan_of_states
 from iblf_jax.engine.registry import Executor
@@ -96,8 +96,8 @@ def _run_planned(
 ) -> Outcome:
     """Runs a batch as planned."""
 
-    def run(loop: StepLoop, batch: Batch) -> Outcome:
-        return run_all(loop, batch, request)
+    def run(run_steps: Stepper, batch: Batch) -> Outcome:
+        return run_all(run_steps, batch, request)
 
     def attempt(executor: Executor) -> Outcome:
         batch = Batch.of(inputs, varied, request.constants)
@@ -155,14 +155,14 @@ class CompiledBatch(NamedTuple):
         inputs = inputs_of(scenario, (), dt, request)
         step = TimeStep(request.method, positions)
 
-        def run(loop: StepLoop, batch: Batch) -> dict[str, jax.Array]:
+        def run(run_steps: Stepper, batch: Batch) -> dict[str, jax.Array]:
             carry = carry_without_linearization(batch, request.method)
-            return loop(step, batch, carry, request.instants, record_every)[1]
+            return run_steps(step, batch, carry, request.instants, record_every)[1]
 
         def attempt(executor: Executor) -> dict[str, jax.Array]:
             batch = Batch.of(inputs, varied, request.constants)
             with building():
-                return run(kernel_loop(executor), batch)
+                return run(kernel_stepper(executor), batch)
 
         def by_scan() -> dict[str, jax.Array]:
             return run(partial(scan, rolled=self.execution.rolled), Batch.of(inputs, varied))
@@ -231,12 +231,12 @@ def run_batch_jvp(
         if method == "scan":
             return by_scan()
         if method == "one per run":
-            return run_by_columns(kernel_loop(executor), batch, along, request)
-        return run_with_tangents(kernel_loop(executor), batch, along, request)
+            return run_by_columns(kernel_stepper(executor), batch, along, request)
+        return run_with_tangents(kernel_stepper(executor), batch, along, request)
 
     def by_scan() -> Tangents:
-        loop = partial(scan, rolled=execution.rolled)
-        return run_with_tangents(loop, Batch.of(inputs, varied), along, request)
+        run_steps = partial(scan, rolled=execution.rolled)
+        return run_with_tangents(run_steps, Batch.of(inputs, varied), along, request)
 
     return first_that_works(execution, attempt, by_scan)
 
@@ -318,10 +318,10 @@ def run_batch_vjp(
         # The derivative contains the step six times: with the stages of the integrator as a loop,
         # the gradient of 8 runs of 500 steps of the paper's loop by 226 weights of a network
         # compiles in 12 s instead of 22 s of processor time, and takes the same time afterwards.
-        loop = partial(checkpointed, rolled=True)
+        run_steps = partial(checkpointed, rolled=True)
 
         def run(numbers: dict[str, jax.Array]) -> tuple[dict[str, jax.Array], Outcome]:
-            outcome = run_all(loop, Batch.of(inputs, {**varied, **numbers}), request)
+            outcome = run_all(run_steps, Batch.of(inputs, {**varied, **numbers}), request)
             return {name: outcome.metrics[name] for name in metrics}, outcome
 
         _, pullback, outcome = jax.vjp(run, numbers, has_aux=True)
@@ -360,11 +360,11 @@ def _step_states(
     batch = Batch.of(inputs, None, request.constants)._replace(runs=runs)
     execution = plan_of_states(operations(inputs), registry.default_backend())
 
-    def by(loop: StepLoop) -> tuple[Any, Any]:
-        return loop(step, batch, carry, request.steps, 1)
+    def by(run_steps: Stepper) -> tuple[Any, Any]:
+        return run_steps(step, batch, carry, request.steps, 1)
 
     by_scan = partial(by, partial(scan, rolled=execution.rolled))
-    return first_that_works(execution, lambda executor: by(kernel_loop(executor)), by_scan)
+    return first_that_works(execution, lambda executor: by(kernel_stepper(executor)), by_scan)
 
 
 def sampled_jacobians(scenario: Scenario, times: jax.Array, states: LoopState) -> jax.Array:
@@ -399,8 +399,8 @@ def _sampled_jacobians(
     carry = jax.vmap(partial(jacobian_carry, scenario))(times, states)
     execution = plan_of_jacobians(operations(inputs), registry.default_backend())
 
-    def by(loop: StepLoop) -> jax.Array:
-        return jacobians(loop, batch, carry)
+    def by(run_steps: Stepper) -> jax.Array:
+        return jacobians(run_steps, batch, carry)
 
     by_scan = partial(by, partial(scan, rolled=execution.rolled))
-    return first_that_works(execution, lambda executor: by(kernel_loop(executor)), by_scan)
+    return first_that_works(execution, lambda executor: by(kernel_stepper(executor)), by_scan)

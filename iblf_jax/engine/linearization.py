@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from iblf_jax.engine.carry import Inputs, Step, StepOptions, keep_if
+from iblf_jax.engine.carry import Inputs, Step, StepOptions, tree_where
 from iblf_jax.simulation import error_estimate, stability
 from iblf_jax.simulation.closed_loop import (
     LoopState,
@@ -36,8 +36,7 @@ class Linearization(NamedTuple):
     time: jax.Array
     state: jax.Array
     """(m,)."""
-    growth: stability.PowerIteration
-    """Of the power iteration."""
+    power_iteration: stability.PowerIteration
     lengths: Any
     """Lengths of the columns of `jacobian` that are found, (3, m') [1/s], where a power iteration
     reads them; `()` elsewhere."""
@@ -45,10 +44,10 @@ class Linearization(NamedTuple):
     """Of the run; its torque is turned into what it accelerates, as that takes the robot's mass
     matrix."""
     jacobian: Any = ()
-    """By the numbers that `error_estimate` watches, by differences of three sizes, (3, m', m')
-    [1/s]; `stability.resolved_jacobian` makes one of them.  `()` until all steps are made, because
-    each records its column: carried from step to step, the m'^2 numbers would be most of the
-    program."""
+    """Of the rate by the m' numbers that `error_estimate` watches, by differences of three sizes,
+    (3, m', m') [1/s]; `stability.resolved_jacobian` makes one matrix of the three.  It is `()`
+    until all steps are made: each step records its column, because m'^2 numbers in the carry would
+    make most of the program."""
 
     def with_columns(self, columns: jax.Array) -> Linearization:
         """The linearization after its steps, which recorded these columns, (..., steps, m')."""
@@ -75,17 +74,15 @@ class LinearizationStep(Step):
         as_state = ravel_pytree(perturbed_state(start))[1]
         iteration = index - 3 * watched.size
         count = jnp.asarray(watched.size, index.dtype)
-        level = jax.lax.div(index, count)
-        number = index - level * count
+        size_index = jax.lax.div(index, count)
+        number = index - size_index * count
         rank = np.full(x.size, -1, index.dtype)
         rank[watched] = np.arange(watched.size)
         unit = (jnp.asarray(rank) == number).astype(x.dtype)
-        direction = jnp.where(iteration < 0, unit, carry.growth.direction)
+        direction = jnp.where(iteration < 0, unit, carry.power_iteration.direction)
 
         def rate_at(y):
-            return ravel_pytree(
-                perturbed_rate(inputs.scenario, carry.time, as_state(y), inputs.dt)
-            )[0]
+            return ravel_pytree(perturbed_rate(inputs.scenario, carry.time, as_state(y)))[0]
 
         plant = as_state(x)
         if inputs.scenario.sampling is not None:
@@ -95,32 +92,32 @@ class LinearizationStep(Step):
             iteration < 0, jnp.sum(rooms * unit), jnp.asarray(stability.THIRD_SIZE, x.dtype)
         )
         sizes = stability.difference_sizes(x, direction, room)
-        widest = level == 2
-        if (
-            len(watched) < x.size
-        ):  # a power iteration follows, across infinite slopes by the widest differences
-            widest |= (iteration >= 0) & jnp.any(
-                stability.is_infinite(carry.lengths, inputs.scenario.sampling is not None)
-            )
-        size = jnp.where(
-            widest, sizes[2], jnp.where((level == 1) & (iteration < 0), sizes[1], sizes[0])
-        )
+        widest = size_index == 2
+        if len(watched) < x.size:
+            # A power iteration follows, across infinite slopes by the widest differences.
+            is_sampled = inputs.scenario.sampling is not None
+            is_steep = jnp.any(stability.is_infinite(carry.lengths, is_sampled))
+            widest |= (iteration >= 0) & is_steep
+        is_second = (size_index == 1) & (iteration < 0)
+        size = jnp.where(widest, sizes[2], jnp.where(is_second, sizes[1], sizes[0]))
         w = stability.directional_derivative(rate_at, x, direction, size)
         column = jnp.stack([w[i] for i in watched])
-        growth, lengths = carry.growth, carry.lengths
+        power_iteration, lengths = carry.power_iteration, carry.lengths
         if len(watched) < x.size:
-            growth = keep_if(
-                iteration < 0, growth, stability.power_iteration_step(growth, w, iteration)
+            power_iteration = tree_where(
+                iteration < 0,
+                power_iteration,
+                stability.power_iteration_step(power_iteration, w, iteration),
             )
             columns = jnp.arange(watched.size, dtype=index.dtype) == number
-            chosen = (jnp.arange(3, dtype=index.dtype) == level)[:, None] & columns
+            chosen = (jnp.arange(3, dtype=index.dtype) == size_index)[:, None] & columns
             lengths = jnp.where(chosen, jnp.sum(jnp.abs(column)), lengths)
-        unresolved = keep_if(
+        unresolved = tree_where(
             index == 0,
             error_estimate.with_acceleration(inputs.scenario, carry.unresolved),
             carry.unresolved,
         )
-        return Linearization(carry.time, x, growth, lengths, unresolved), column
+        return Linearization(carry.time, x, power_iteration, lengths, unresolved), column
 
 
 def linearization_steps(scenario: Scenario) -> int:
@@ -135,8 +132,7 @@ def linearization_steps(scenario: Scenario) -> int:
 def jacobian_carry(scenario: Scenario, time: jax.Array, state: LoopState) -> Linearization:
     """The carry of a `LinearizationStep` of which only the Jacobian at a state is of interest."""
     watched = error_estimate.watched_indices(state).size
-    none = jnp.zeros(scenario.n, state.x.dtype)
-    no_estimate = error_estimate.UnresolvedSignals(none, none, none)
+    no_estimate = error_estimate.UnresolvedSignals.zero(scenario.n, state.x.dtype)
     return linearization_at(time, perturbed_state(state), watched, no_estimate)
 
 
@@ -149,7 +145,7 @@ def fastest_mode(scenario: Scenario, found: Linearization) -> jax.Array:
     is_complete = len(jacobian) == found.state.size
     if is_complete:
         return stability.growth_rate_of_matrix(jacobian)
-    return stability.growth_rate(found.growth)
+    return stability.growth_rate(found.power_iteration)
 
 
 def linearization_at(

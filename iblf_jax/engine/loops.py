@@ -1,7 +1,7 @@
-"""The loops over all steps of a batch, each a `StepLoop`.
+"""The functions that make all steps of a batch, each a `Stepper`.
 
-`scan` and `checkpointed` are loops of JAX over the step.  `kernel_loop` returns the loop of an
-executor over the scalar program of the step.
+`scan` and `checkpointed` are loops of JAX over the step.  `kernel_stepper` returns that of an
+executor, which runs the scalar program of the step.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ import numpy as np
 from iblf_jax.core import checks
 from iblf_jax.core.caches import CACHE
 from iblf_jax.engine import thresholds
-from iblf_jax.engine.batch import Batch, Leaves, StepLoop
-from iblf_jax.engine.carry import Step, StepOptions, keep_if
+from iblf_jax.engine.batch import Batch, Leaves, Stepper
+from iblf_jax.engine.carry import Step, StepOptions, tree_where
 from iblf_jax.engine.linearization import LinearizationStep
 from iblf_jax.engine.registry import Executor
 from iblf_jax.kernels import (
@@ -65,8 +65,8 @@ def _scan_run(step: Callable, carry: Any, steps: int, every: int | None) -> tupl
     def one_step(carry_and_record, index):
         before, record = carry_and_record
         after, new_record = step(before, index)
-        after = keep_if(index < steps, after, before)
-        return (after, keep_if(index % every == 0, new_record, record)), None
+        after = tree_where(index < steps, after, before)
+        return (after, tree_where(index % every == 0, new_record, record)), None
 
     def one_interval(carry_and_record, first):
         indices = first + jnp.arange(every)
@@ -94,7 +94,7 @@ def checkpointed(
         @jax.checkpoint
         def one_step(carry, index):
             after, _ = step(inputs, carry, index, options)
-            return keep_if(index < steps, after, carry), None
+            return tree_where(index < steps, after, carry), None
 
         @jax.checkpoint
         def inner_loop(carry, first):
@@ -158,15 +158,15 @@ def rows_of_leaves(executor: Executor, batch: Batch) -> tuple[jax.Array, jax.Arr
     return shared_rows[:, 0], per_run_rows
 
 
-def kernel_loop(executor: Executor, **options: Any) -> StepLoop:
-    """The loop of an executor over the scalar program of a step.
+def kernel_stepper(executor: Executor, **options: Any) -> Stepper:
+    """The `Stepper` of an executor, by the scalar program of a step.
 
     Args:
       executor: the executor.
       options: further arguments of `executor.run`.
     """
 
-    def loop(
+    def run_steps(
         step: Step, batch: Batch, carry: Any, steps: int, every: int | None
     ) -> tuple[Any, Any]:
         compiled = program_of(step, batch, carry)
@@ -182,4 +182,4 @@ def kernel_loop(executor: Executor, **options: Any) -> StepLoop:
             records = unpacked_records(compiled.records, arrays)
         return jax.tree.unflatten(treedef, executor.unpack(after, shapes, runs)), records
 
-    return loop
+    return run_steps

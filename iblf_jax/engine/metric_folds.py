@@ -20,19 +20,18 @@ if TYPE_CHECKING:
     from iblf_jax.simulation.metrics import Fold
 
 
-def begun(folds: tuple[Fold, ...], sample: Sample) -> tuple:
+def initial_accumulators(folds: tuple[Fold, ...], sample: Sample) -> tuple:
     """The accumulators before a first sample."""
     return tuple(fold.init(sample) for fold in folds)
 
 
-def begun_at(
+def initialised_at(
     index: jax.Array, folds: tuple[Fold, ...], sample: Sample, accumulators: tuple
 ) -> tuple:
-    """The accumulators before an instant: begun with its sample if it is the first.
-
-    What does not depend on the sample was begun by `start`, and costs no choice in every step.
+    """At index 0, the accumulators that depend on the first sample are initialised from it; all
+    others pass through unchanged.
     """
-    traced, shapes = jax.make_jaxpr(begun, return_shape=True)(folds, sample)
+    traced, shapes = jax.make_jaxpr(initial_accumulators, return_shape=True)(folds, sample)
     depends = jaxprs.depend_on_last(traced, len(jax.tree.leaves(sample)))
     chosen = jax.tree.unflatten(jax.tree.structure(shapes), depends)
 
@@ -44,7 +43,7 @@ def begun_at(
     return jax.tree.map(
         of_first,
         chosen,
-        begun(folds, sample),
+        initial_accumulators(folds, sample),
         accumulators,
     )
 
@@ -87,6 +86,8 @@ def folded(folds: tuple[Fold, ...], samples: Sample) -> dict[str, jax.Array]:
     return finished(
         folds,
         jax.lax.scan(
-            lambda acc, sample: (updated(folds, acc, sample), None), begun(folds, first), samples
+            lambda acc, sample: (updated(folds, acc, sample), None),
+            initial_accumulators(folds, first),
+            samples,
         )[0],
     )

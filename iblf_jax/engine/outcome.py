@@ -40,15 +40,16 @@ def outcome_of(
       inputs: of the run.
       method: the integrator.
       carry: after the last step.
-      unresolved: what a `LinearizationStep` has found for the run.
-      instants: what it has found at some of them.
+      unresolved: the unresolved signals of the run, as accelerations.
+      instants: linearizations at the start, at the instant nearest to a bound and at the end of the
+        run, (3, ...).
     """
     scenario = inputs.scenario
-    estimate = error_estimate.with_unresolved(carry.accuracy, unresolved)
+    accuracy = error_estimate.with_unresolved(carry.accuracy, unresolved)
     rounding: dict[str, jax.Array] = {}
-    if not is_absent(estimate.growth):
+    if not is_absent(accuracy.error_growth):
         bounds = _bounds_of_growth(inputs, carry, instants)
-        estimate, rounding = error_growth.with_growth(estimate, bounds, unresolved.width)
+        accuracy, rounding = error_growth.with_growth(accuracy, bounds, unresolved.width)
     modes = jax.vmap(partial(fastest_mode, inputs.scenario))(instants)
     mode = jnp.max(jnp.where(jnp.isfinite(modes), modes, 0.0))
     limit = integrators.tableau(method).stability
@@ -59,10 +60,10 @@ def outcome_of(
         instants.jacobian, inputs.scenario.sampling is not None
     ) & (inputs.dt * steepest > limit)
     if scenario.process_noise is None:
-        status |= flag(~(estimate.relative <= error_estimate.TOLERANCE), Status.INACCURATE)
+        status |= flag(~(accuracy.relative <= error_estimate.TOLERANCE), Status.INACCURATE)
     suffers = has_flag(status, Status.STEP_TOO_LARGE | Status.INACCURATE)
     status |= flag(jnp.any(steep) & suffers, Status.INFINITE_SLOPE)
-    metrics = error_estimate.results(estimate)
+    metrics = error_estimate.results(accuracy)
     if scenario.process_noise is not None:
         metrics = error_estimate.unknown(metrics)
     plant: Any = scenario.plant
@@ -71,10 +72,10 @@ def outcome_of(
         metrics |= plant.switching(end)
         status |= flag(~plant.has_complete_path(end), Status.MODES_EXHAUSTED)
     if inputs.scenario.sampling is not None:
-        radii, growth = jax.lax.stop_gradient(_sampling_radii(inputs, carry, instants))
+        radii, growth_by_sampling = jax.lax.stop_gradient(_sampling_radii(inputs, carry, instants))
         metrics[stability.RADIUS] = jnp.max(jnp.where(jnp.isfinite(radii), radii, 0.0))
         metrics |= rounding
-        status |= flag(jnp.any(growth > 1.0), Status.SAMPLING_TOO_SLOW)
+        status |= flag(jnp.any(growth_by_sampling > 1.0), Status.SAMPLING_TOO_SLOW)
     metrics |= finished(inputs.folds, carry.accumulators)
     return Outcome(None, metrics, status, mode)
 
@@ -88,7 +89,7 @@ def _bounds_of_growth(inputs: Inputs, carry: Carry, instants: Linearization) -> 
         return jnp.full_like(carry.accuracy.error, jnp.inf)
     derivatives = stability.resolved_jacobian(instants.jacobian, sampled=True)
     periods = inputs.dt * inputs.steps / sampling.period
-    bound = partial(error_growth.bound, inputs.scenario, carry.accuracy.growth, carry.state)
+    bound = partial(error_growth.bound, inputs.scenario, carry.accuracy.error_growth, carry.state)
     found = jax.vmap(bound, in_axes=(0, None))(derivatives, periods)
     return jnp.max(found, axis=0)
 

@@ -81,9 +81,8 @@ def scan_only(execution: ExecutionPlan, reason: object) -> ExecutionPlan:
 
 
 def plan_of_states(operations: int, backend: Availability) -> ExecutionPlan:
-    """The plan of a few steps from each of many states, by the default backend of the machine; a
-    kernel is built only if the closed loop has few operations.  Compilation takes most of the time,
-    so that the stages are a loop in any case.
+    """Plan for few steps from many states, by the default backend of the machine.  Compilation
+    dominates, so the stages are rolled, and a kernel is built only for a short closed loop.
     """
     backends: tuple[str, ...] = ()
     if backend.reason is None and operations <= thresholds.LONG_EVALUATION:

@@ -1,7 +1,7 @@
 """`simulate` runs one scenario and returns a `Rollout`.
 
 request = runs.request(...)      checks what is requested
-output  = run_one(...)           plans, compiles and executes it (`single_run`); under a
+outcome = run_one(...)           plans, compiles and executes it (`single_run`); under a
                                  transformation of JAX `run_transformable` (`transformable`)
 result  = Rollout(...)           arrays with names and units
 """
@@ -52,10 +52,11 @@ def simulate(
         x' = rate(t, x),   x = (q, q', states of law, observer and actuator)        (closed_loop)
 
     `jax.jit`, `vmap`, `grad`, `jacfwd` and their compositions apply to it; every array of the
-    result is differentiable with respect to leaves of the scenario.  New values of leaves
-    reuse the compiled program, unless they change which numbers of an arm's geometry are 0, 1, -1
-    or equal.  A new structure or method does not.  A new number of steps or `record_every`
-    recompiles only the steps; on "vmap", the complete run.
+    result is differentiable with respect to leaves of the scenario.  New parameter values reuse the
+    compiled program, except where they change which structural constants (0, 1, -1 or equal entries
+    of a robot's geometry, 0 or 1 in a factor of the law) hold.  A new structure or method compiles
+    again.  A new number of steps or `record_every` recompiles only the time loop, or on "vmap" the
+    complete run.
 
     Args:
       scenario: what to run, of n joints.
@@ -68,10 +69,10 @@ def simulate(
       throw: whether to raise instead of warn if the run failed; inside a transformation of JAX it
         does neither.
       backend: "native", C code that is built once for a structure and kept on disk; "gpu", the same
-        on an NVIDIA GPU; "vmap", JAX without kernels; or "auto", the first of these that JAX's
-        default device supports.  Under `jit` or `vmap` of the caller, a run uses JAX without
-        kernels.  Kernels compute its derivatives with respect to the scenario, except on "vmap",
-        and differentiate everything that is recorded: increase `record_every` if metrics suffice.
+        on an NVIDIA GPU; "vmap", JAX without kernels; or "auto", the first one available on the
+        default device.  A run inside `jit` or `vmap` uses "vmap".  Its derivatives by the scenario
+        use kernels unless backend="vmap".  They include every recorded signal: raise `record_every`
+        if you need metrics only.
       seed: seed of the noise of a sensor, of process noise and of random switching times; the run
         is run 0 of a study with this seed.
       runs_as: an `ij.Runs`, in place of its fields.
@@ -97,8 +98,8 @@ def simulate(
     request = runs.request(scenario, record_every=every)
     step = jnp.asarray(dt, scenario.initial.q.dtype)
     folds = as_folds(metrics, step.dtype, scenario)
-    noise = noise_key(jax.random.PRNGKey(runs.seed)) if has_noise(scenario) else None
-    result = run_rollout(scenario, folds, step, request, noise)
+    key = noise_key(jax.random.PRNGKey(runs.seed)) if has_noise(scenario) else None
+    result = run_rollout(scenario, folds, step, request, key)
     # Inside a transformation the status may be a number, while the metrics are traced.
     if checks.is_concrete(result) and result.status.ndim == 0:
         report(result, request.steps, throw)
@@ -110,7 +111,7 @@ def run_rollout(
     folds: tuple[Fold, ...],
     dt: jax.Array,
     request: RunRequest,
-    noise: jax.Array | None = None,
+    key: jax.Array | None = None,
 ) -> Rollout:
     """One run as a `Rollout`, without checks and warnings.
 
@@ -119,14 +120,14 @@ def run_rollout(
       folds: the metrics, as `as_folds` returns them.
       dt: time step, () [s].
       request: the request; its `record_every` is not None.
-      noise: key of the run's random numbers (`noise.noise_key`).
+      key: of the run's random numbers (`noise.noise_key`).
     """
-    if noise is not None:
-        scenario = realised(scenario, noise.astype(dt.dtype))
+    if key is not None:
+        scenario = realised(scenario, key.astype(dt.dtype))
     if checks.is_concrete((scenario, folds, dt)):
-        outcome = run_one(scenario, folds, dt, request, noise)
+        outcome = run_one(scenario, folds, dt, request, key)
     else:
-        outcome = run_transformable(scenario, folds, dt, request, noise)
+        outcome = run_transformable(scenario, folds, dt, request, key)
     states = outcome.records._asdict()
     return Rollout(
         **states.pop("signals"),

@@ -23,7 +23,7 @@ import numpy as np
 from iblf_jax.core import programs
 from iblf_jax.core.caches import CACHE
 from iblf_jax.engine import registry, thresholds
-from iblf_jax.engine.batch import Batch, StepLoop, finalize, initialize, run_all
+from iblf_jax.engine.batch import Batch, Stepper, finalize, initialize, run_all
 from iblf_jax.engine.carry import Carry
 from iblf_jax.engine.compile import (
     building,
@@ -35,7 +35,7 @@ from iblf_jax.engine.compile import (
     structural_part,
 )
 from iblf_jax.engine.linearization import Linearization
-from iblf_jax.engine.loops import kernel_loop, scan
+from iblf_jax.engine.loops import kernel_stepper, scan
 from iblf_jax.engine.outcome import Outcome
 from iblf_jax.engine.registry import Executor
 from iblf_jax.engine.request import RunRequest
@@ -60,7 +60,7 @@ def run_one(
     folds: tuple[Fold, ...],
     dt: jax.Array,
     request: RunRequest,
-    noise: jax.Array | None = None,
+    noise_key: jax.Array | None = None,
 ) -> Outcome:
     """Runs a scenario once; the caller must not batch or differentiate it.
 
@@ -69,9 +69,9 @@ def run_one(
     Args:
       scenario, folds, dt: as `run_batch`.
       request: the request.
-      noise: key of the noise of a sensor.
+      noise_key: key of the run's random numbers.
     """
-    leaves, structure = jax.tree.flatten(inputs_of(scenario, folds, dt, request, noise))
+    leaves, structure = jax.tree.flatten(inputs_of(scenario, folds, dt, request, noise_key))
     shapes = shapes_of(leaves)
     execution, nodes = plan_of_single_run(
         structural_part(request), registry.machine(), structure, shapes
@@ -80,10 +80,10 @@ def run_one(
     request = request._replace(backend="auto")
 
     def attempt(executor: Executor) -> Outcome:
-        parts = Parts(executor.name, structure)
+        compiled = Compiled(executor.name, structure)
         try:
             with building():
-                return _run_by_executor(parts, nodes, request, leaves)
+                return _run_by_executor(compiled, nodes, request, leaves)
         except ToolchainError as error:
             if not isinstance(error, StoppedError):
                 CACHE.mark(FAILED_BUILDS, (executor.name, structure, shapes))
@@ -102,7 +102,7 @@ def run_one(
     return outcome
 
 
-class Parts(NamedTuple):
+class Compiled(NamedTuple):
     """What the three parts of a run are compiled for; static."""
 
     backend: str
@@ -119,47 +119,48 @@ class Parts(NamedTuple):
         """The executor."""
         return registry.EXECUTORS[self.backend]
 
-    @property
-    def loop(self) -> StepLoop:
-        """The loop of the executor."""
-        return kernel_loop(self.executor)
 
-
-def _run_by_executor(parts: Parts, nodes: int, request: RunRequest, leaves: list) -> Outcome:
+def _run_by_executor(compiled: Compiled, nodes: int, request: RunRequest, leaves: list) -> Outcome:
     """One run by an executor; `nodes` are those of the scalar program of its step."""
     without_steps = request._replace(steps=0, record_every=None)
-    carry, at_start = _initialize(parts, without_steps, leaves)
-    max_nodes = parts.executor.limits.single_run_nodes or nodes
-    is_short = request.instants * max_nodes <= thresholds.OPERATIONS_PER_CALL
+    carry, at_start = _initialize(compiled, without_steps, leaves)
+    executor = compiled.executor
+    most_operations = request.instants * (executor.limits.single_run_nodes or nodes)
     length = request.instants
-    if parts.executor.accepts_first_step and not is_short:
+    if executor.accepts_first_step and most_operations > thresholds.OPERATIONS_PER_CALL:
         length = thresholds.steps_per_call(nodes, request.instants, request.record_every)
     if length >= request.instants:
-        carry, records = _all_steps(parts, request, leaves, carry)
+        carry, records = _all_steps(compiled, request, leaves, carry)
     else:
-        carry, records = _steps_in_calls(parts, request, leaves, carry, length)
-    return _finalize(parts, without_steps, leaves, carry, at_start)._replace(records=records)
+        carry, records = _steps_in_calls(compiled, request, leaves, carry, length)
+    return _finalize(compiled, without_steps, leaves, carry, at_start)._replace(records=records)
 
 
 @programs.jit(static_argnums=(0, 1), optimised=False)
-def _initialize(parts: Parts, request: RunRequest, leaves: list) -> tuple[Carry, Linearization]:
-    return initialize(parts.loop, parts.batch(leaves, request), request.method)
+def _initialize(
+    compiled: Compiled, request: RunRequest, leaves: list
+) -> tuple[Carry, Linearization]:
+    run_steps = kernel_stepper(compiled.executor)
+    return initialize(run_steps, compiled.batch(leaves, request), request.method)
 
 
 @programs.jit(static_argnums=(0, 1))
-def _all_steps(parts: Parts, request: RunRequest, leaves: list, carry: Carry) -> tuple[Carry, Any]:
-    return _steps(parts.loop, parts.batch(leaves, request), request, carry, request.instants)
+def _all_steps(
+    compiled: Compiled, request: RunRequest, leaves: list, carry: Carry
+) -> tuple[Carry, Any]:
+    run_steps = kernel_stepper(compiled.executor)
+    return _steps(run_steps, compiled.batch(leaves, request), request, carry, request.instants)
 
 
 def _steps_in_calls(
-    parts: Parts, request: RunRequest, leaves: list, carry: Carry, length: int
+    compiled: Compiled, request: RunRequest, leaves: list, carry: Carry, length: int
 ) -> tuple[Carry, Any]:
     """All steps, `length` of them in each call."""
     without_steps = request._replace(steps=0)
     recorded = []
     for first in range(0, request.instants, length):
         count = min(length, request.instants - first)
-        carry, records = _steps_from(parts, without_steps, count, leaves, carry, np.int32(first))
+        carry, records = _steps_from(compiled, without_steps, count, leaves, carry, np.int32(first))
         jax.block_until_ready(carry)
         recorded.append(records)
     if request.record_every is None:
@@ -169,18 +170,23 @@ def _steps_in_calls(
 
 @programs.jit(static_argnums=(0, 1, 2))
 def _steps_from(
-    parts: Parts, request: RunRequest, count: int, leaves: list, carry: Carry, first: jax.Array
+    compiled: Compiled,
+    request: RunRequest,
+    count: int,
+    leaves: list,
+    carry: Carry,
+    first: jax.Array,
 ) -> tuple[Carry, Any]:
     """`count` steps from step `first` on, by the kernel for many steps."""
-    loop = kernel_loop(parts.executor, first=first, short_vector=True)
-    return _steps(loop, parts.batch(leaves, request), request, carry, count)
+    run_steps = kernel_stepper(compiled.executor, first=first, short_vector=True)
+    return _steps(run_steps, compiled.batch(leaves, request), request, carry, count)
 
 
 def _steps(
-    loop: StepLoop, batch: Batch, request: RunRequest, carry: Carry, steps: int
+    run_steps: Stepper, batch: Batch, request: RunRequest, carry: Carry, steps: int
 ) -> tuple[Carry, Any]:
     """Steps of a batch of one run; the records have no run axis, and are None if not requested."""
-    carry, records = loop(TimeStep.of(request), batch, carry, steps, request.record_every)
+    carry, records = run_steps(TimeStep.of(request), batch, carry, steps, request.record_every)
     if request.record_every is None:
         return carry, None
     return carry, jax.tree.map(lambda x: x[0], records)
@@ -188,9 +194,10 @@ def _steps(
 
 @programs.jit(static_argnums=(0, 1), optimised=False)
 def _finalize(
-    parts: Parts, request: RunRequest, leaves: list, carry: Carry, at_start: Linearization
+    compiled: Compiled, request: RunRequest, leaves: list, carry: Carry, at_start: Linearization
 ) -> Outcome:
-    outcome = finalize(parts.loop, parts.batch(leaves, request), request, carry, at_start)
+    run_steps = kernel_stepper(compiled.executor)
+    outcome = finalize(run_steps, compiled.batch(leaves, request), request, carry, at_start)
     return jax.tree.map(lambda x: x[0], outcome)
 
 

@@ -6,16 +6,14 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.core.status import Status, flag
-from iblf_jax.simulation.closed_loop import (
-    LoopState,
-    integrated_part,
-)
+from iblf_jax.simulation.closed_loop import LoopState, integrated_part
 from iblf_jax.simulation.signals import (
     Sample,
-    alpha_margins_above,
     has,
+    has_velocity_level_bounds,
+    higher_alpha_margins,
+    least_higher_margins,
     least_margin,
-    least_margins_above,
     margin_of,
 )
 from iblf_jax.world.bounds import NARROWEST
@@ -36,18 +34,16 @@ def sample_status(sample: Sample) -> jax.Array:
     for signal in ("slack", "region_slack"):
         if has(sample, signal):
             found |= flag(jnp.any(getattr(sample, signal) > 0), Status.FILTER_INFEASIBLE)
-    if len(sample.x) > 2:
-        found |= flag(jnp.any(~jnp.isfinite(sample.tau)), Status.SINGULAR_GAIN)
     if has(sample, "region_margin"):
         found |= flag(jnp.any(~(sample.region_margin > 0)), Status.REGION_VIOLATED)
-    if len(sample.level_lower) > 1:
+    if has_velocity_level_bounds(sample):
         alpha_margin = margin_of(sample, 2, sample.alpha)
         found |= flag(jnp.any(~(least_margin(sample, 2) > 0)), Status.VELOCITY_VIOLATED)
         found |= flag(jnp.any(~(alpha_margin > NARROWEST)), Status.ALPHA_INFEASIBLE)
-    if len(sample.level_lower) > 2:
-        violated = jnp.any(~(least_margins_above(sample) > 0))
+    if has(sample, "higher_lower"):
+        violated = jnp.any(~(least_higher_margins(sample) > 0))
         found |= flag(violated, Status.STATE_BOUND_VIOLATED)
-        margins = alpha_margins_above(sample)
+        margins = higher_alpha_margins(sample)
         if margins is not None:
             found |= flag(jnp.any(~(margins > NARROWEST)), Status.ALPHA_INFEASIBLE)
     return found

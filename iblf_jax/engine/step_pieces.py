@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from iblf_jax.core.pytree import is_absent
 from iblf_jax.engine.carry import Inputs, StepOptions
 from iblf_jax.engine.metric_folds import split_floats, updated, weighed
 from iblf_jax.engine.status_flags import sample_status
@@ -80,7 +81,7 @@ def step_times(inputs: Inputs, index: jax.Array, method: str, arrivals: tuple | 
         restarts = discontinuities.has_jump(times, (number - reach) * dt, span.end)
     division = discontinuities.divide_step(times, span, here)
     if inputs.scenario.process_noise is not None:
-        pieces = with_noise_rates(inputs.scenario, inputs.noise, index, dt, division.pieces)
+        pieces = with_noise_rates(inputs.scenario, inputs.noise_key, index, dt, division.pieces)
         division = division._replace(pieces=pieces)
     return StepTimes(span, division, previous_piece_length, restarts)
 
@@ -92,8 +93,8 @@ class LoopAlongStep(NamedTuple):
     inputs: Inputs
     state: LoopState
     """At the instant, after what is due there."""
-    torques: tuple
-    """For a sampled law, the torques at the actuator before and after a command arrives within the
+    commands: tuple
+    """For a sampled law, the commands at the actuator before and after one arrives within the
     step."""
     arriving: Any = ()
     """The `ArrivingCommands` of a continuous loop whose input has a delay; `()` without one."""
@@ -101,7 +102,7 @@ class LoopAlongStep(NamedTuple):
     @property
     def jumps_with_law(self) -> bool:
         """Whether the input jumps at once where the command of the law does."""
-        return self.inputs.scenario.sampling is None and not self.arriving
+        return self.inputs.scenario.sampling is None and is_absent(self.arriving)
 
     def at(
         self,
@@ -118,22 +119,30 @@ class LoopAlongStep(NamedTuple):
           moved: the `integrated_part` of the state.
           command: that arrives, (n,), where the input has a delay; that of the time t if not given.
         """
-        torque = self.torques
-        if self.arriving:
-            if command is None:
-                command = self.arriving.at(discontinuities.stage_time(piece, t))
-            torque = (command,)
-        elif torque and isinstance(piece.command_arrived, bool):
-            torque = (torque[int(piece.command_arrived)],)
-        elif torque:
-            torque = (jnp.where(piece.command_arrived, torque[1], torque[0]),)
         scenario, time = self.inputs.scenario, discontinuities.stage_time(piece, t)
         state = with_integrated_part(self.state, moved)
-        rate, sample = self.evaluate(scenario, time, state, self.inputs.dt, *torque)
+        if command is None:
+            command = self._command_at(piece, time)
+        # JAX keys what it traced by the arguments as they are given, a None included.
+        given = () if command is None else (command,)
+        rate, sample = self.evaluate(scenario, time, state, *given)
         return with_process_noise(scenario, time, state, rate, piece.noise_rate), sample
 
+    def _command_at(self, piece: discontinuities.Piece, time: jax.Array) -> jax.Array | None:
+        """The command at the actuator at a time within a piece, (n,); None where it is that of the
+        law at once.
+        """
+        if not is_absent(self.arriving):
+            return self.arriving.at(time)
+        if not self.commands:
+            return None
+        before, after = self.commands
+        if isinstance(piece.command_arrived, bool):
+            return after if piece.command_arrived else before
+        return jnp.where(piece.command_arrived, after, before)
 
-def integrated(
+
+def integrate_piece(
     along: LoopAlongStep,
     piece: discontinuities.Piece,
     moved: LoopState,
@@ -142,7 +151,7 @@ def integrated(
 ) -> integrators.StepResult:
     """One step of the integrator over a piece, with the commands that arrive at its stages."""
     commands = None
-    if along.arriving:
+    if not is_absent(along.arriving):
         times = [
             discontinuities.stage_time(piece, piece.begin + c * piece.length)
             for c in integrators.tableau(method).c
@@ -165,7 +174,7 @@ def across_jumps(
     before: LoopState,
     method: str,
     stepped: integrators.StepResult,
-    begun: tuple,
+    before_sample: tuple,
     accumulators: tuple,
 ) -> tuple[integrators.StepResult, tuple]:
     """A piece of a step and the accumulators, with their derivatives across jumps of the command;
@@ -177,7 +186,7 @@ def across_jumps(
       before: state at its start.
       method: the integrator.
       stepped: the result of the integrator for this piece.
-      begun, accumulators: of the folds, before and after the sample at its start.
+      before_sample, accumulators: of the folds, before and after the sample at its start.
     """
     inputs, dt = along.inputs, along.inputs.dt
     # No metric counts what comes after the end of a run.
@@ -185,16 +194,16 @@ def across_jumps(
 
     def rate(t, state):
         time = discontinuities.stage_time(piece, t)
-        slope, sample = evaluate(inputs.scenario, time, state, dt)
+        slope, sample = evaluate(inputs.scenario, time, state)
         return with_process_noise(inputs.scenario, time, state, slope, piece.noise_rate), sample
 
     def gains_of(sample):
         def sums(weight):
             return split_floats(
-                updated(inputs.folds, begun, dataclasses.replace(sample, dt=weight))
+                updated(inputs.folds, before_sample, dataclasses.replace(sample, dt=weight))
             )[0]
 
-        gains = jax.jvp(sums, (sample.dt,), (jnp.ones_like(sample.dt),))[1]
+        gains = jax.jvp(sums, (dt,), (jnp.ones_like(dt),))[1]
         return [jnp.where(counts, gain, jnp.zeros_like(gain)) for gain in gains]
 
     floats, replaced = split_floats(accumulators)
@@ -211,7 +220,7 @@ class LaterPieces(NamedTuple):
     moved: LoopState
     """At the end of the step."""
     accumulators: tuple
-    parts: list[tuple[jax.Array, list]]
+    piece_slopes: list[tuple[jax.Array, list]]
     """Length [s] of each piece, and the slopes of its stages."""
     metric_samples: tuple[MetricSample, ...]
     status: jax.Array | None
@@ -231,7 +240,7 @@ def later_pieces(
     """
     # These pieces are rare: their stages are a loop, which compiles in a fraction of the time.
     folds, none = along.inputs.folds, jnp.zeros_like(along.inputs.dt)
-    moved, parts, metric_samples = stepped.state, [], []
+    moved, piece_slopes, metric_samples = stepped.state, [], []
     status = None
     if len(pieces) > 1:
         status = jnp.int32(0)
@@ -245,7 +254,7 @@ def later_pieces(
                 left = along.at(last, last.begin + last.length, moved)[1]
                 left = weighed(left, piece.begin, 0.5 * last.length, none)
                 between = accumulators = updated(folds, accumulators, left)
-            made = integrated(
+            made = integrate_piece(
                 along, piece, moved, method, options._replace(rolled=not options.scalar)
             )
             right = weighed(made.aux, piece.begin, 0.5 * piece.length, none)
@@ -264,19 +273,19 @@ def later_pieces(
             )
 
         before = accumulators
-        (moved, accumulators, status), (slopes, left, between, right) = run_if(
+        (moved, accumulators, status), (slopes, left, between, right) = cond_or_zeros(
             piece.exists, further, (moved, accumulators, status)
         )
-        parts.append((piece.length, slopes))
+        piece_slopes.append((piece.length, slopes))
         if folds:
             metric_samples += [
                 MetricSample(before, left, piece.exists),
                 MetricSample(between, right, piece.exists),
             ]
-    return LaterPieces(moved, accumulators, parts, tuple(metric_samples), status)
+    return LaterPieces(moved, accumulators, piece_slopes, tuple(metric_samples), status)
 
 
-def run_if(condition: jax.Array, made: Callable, kept: Any) -> tuple[Any, Any]:
+def cond_or_zeros(condition: jax.Array, made: Callable, kept: Any) -> tuple[Any, Any]:
     """`made(kept)`, new values and anything else, where a condition holds; else the values as they
     are, and zeros.
     """

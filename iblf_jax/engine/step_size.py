@@ -50,6 +50,8 @@ MODE_INSTANTS = 33
 """Instants along the reference at which modes are computed."""
 MAX_TRIED = 5_000_000
 """Steps of a run that is tried, at most."""
+DIVISORS = tuple(f * 10**k for k in range(7) for f in (1, 2, 5))
+"""Numbers of steps in a sampling period or a delay that are tried."""
 MAX_STEPS_IN_DELAY = 20
 """Steps in the delay of an input that are tried, at most: each number of them is a program of its
 own, which contains all commands on their way."""
@@ -64,7 +66,7 @@ class Pair(NamedTuple):
     step: jax.Array
     coarse: jax.Array
     fine: jax.Array
-    estimate: error_estimate.Accuracy
+    accuracy: error_estimate.Accuracy
     difference: jax.Array
     """Largest so far, relative to the tube."""
     nearest: tuple[jax.Array, jax.Array, jax.Array]
@@ -95,16 +97,16 @@ def _start(scenario: Scenario, dt: jax.Array, steps: jax.Array, *, method: str) 
     start, zero = initial_state(scenario), jnp.zeros_like(dt)
     x = ravel_pytree(start)[0]
     watched = error_estimate.watched_indices(start)
-    estimate = error_estimate.begin(
+    accuracy = error_estimate.initial_accuracy(
         method, jacobian(scenario, zero, start)[watched][:, watched], start
     )
-    estimate = error_estimate.with_unresolved(
-        estimate,
+    accuracy = error_estimate.with_unresolved(
+        accuracy,
         error_estimate.with_acceleration(
             scenario, error_estimate.unresolved_signals(scenario, method, dt, steps)
         ),
     )
-    return Pair(jnp.int32(0), x, x, estimate, zero, (zero - 1.0, zero, x), jnp.bool_(True))
+    return Pair(jnp.int32(0), x, x, accuracy, zero, (zero - 1.0, zero, x), jnp.bool_(True))
 
 
 @programs.jit(static_argnames="method")
@@ -124,42 +126,46 @@ def _advanced(
 
 def _one_step(scenario: Scenario, times: jax.Array, dt: jax.Array, pair: Pair, method: str) -> Pair:
     """Both runs one step later; `times` are the jump times."""
-    n = scenario.n
     as_state = ravel_pytree(initial_state(scenario))[1]
     number = pair.step.astype(dt.dtype)
     begin, end = number * dt, (number + 1.0) * dt
 
-    def part(both, cut):
+    def interval(both, cut):
         coarse, fine = both
         is_coarse, h = cut[1] - cut[0] == 1.0, (cut[1] - cut[0]) * dt
         x = jnp.where(is_coarse, coarse, fine)
-        end_of_part = jnp.where(cut[1] == 1.0, end, begin + cut[1] * dt)
+        end_of_interval = jnp.where(cut[1] == 1.0, end, begin + cut[1] * dt)
         division = discontinuities.divide_step(
-            times, discontinuities.Span(begin + cut[0] * dt, end_of_part, h)
+            times, discontinuities.Span(begin + cut[0] * dt, end_of_interval, h)
         )
         stepped = discontinuities.integrate_pieces(
             method, partial(evaluate, scenario), division, as_state(x), rolled=True
         )
         new, sample = ravel_pytree(stepped.state)[0], stepped.aux
-        seen = (stepped.parts, sample.upper - sample.lower, sample.xi, division.too_many_jumps)
+        seen = (
+            stepped.piece_slopes,
+            sample.upper - sample.lower,
+            sample.xi,
+            division.too_many_jumps,
+        )
         return (jnp.where(is_coarse, new, coarse), jnp.where(is_coarse, fine, new)), seen
 
     (coarse, fine), seen = jax.lax.scan(
-        part, (pair.coarse, pair.fine), jnp.asarray(INTERVALS, dt.dtype)
+        interval, (pair.coarse, pair.fine), jnp.asarray(INTERVALS, dt.dtype)
     )
-    parts, width, _, too_many_jumps = jax.tree.map(lambda x: x[0], seen)
+    piece_slopes, width, _, too_many_jumps = jax.tree.map(lambda x: x[0], seen)
     xi_of_fine = seen[2][1]
     restarts = None
     if times.size:
         restarts = discontinuities.has_jump(
             times, (number - error_estimate.steps_back(method)) * dt, end
         )
-    estimate = error_estimate.update(
-        pair.estimate,
+    accuracy = error_estimate.update(
+        pair.accuracy,
         method,
         dt,
         pair.step,
-        parts,
+        piece_slopes,
         width,
         restarts=restarts,
         too_many_jumps=too_many_jumps,
@@ -169,12 +175,12 @@ def _one_step(scenario: Scenario, times: jax.Array, dt: jax.Array, pair: Pair, m
     nearest = jax.tree.map(
         partial(jnp.where, near > pair.nearest[0]), (near, begin, pair.fine), pair.nearest
     )
-    off = jnp.max(jnp.abs(coarse[:n] - fine[:n]) / width)
+    off = jnp.max(jnp.abs(as_state(coarse).q - as_state(fine).q) / width)
     limit = plants.speed_limit(scenario.plant)
-    going = jnp.all(jnp.isfinite(fine)) & jnp.all(jnp.abs(fine[n : 2 * n]) < limit)
+    going = jnp.all(jnp.isfinite(fine)) & jnp.all(jnp.abs(as_state(fine).dq) < limit)
     larger = jnp.maximum(pair.difference, jnp.where(off <= 1.0, off, jnp.inf))
     difference = jnp.where(going, larger, pair.difference)
-    return Pair(pair.step + 1, coarse, fine, estimate, difference, nearest, going)
+    return Pair(pair.step + 1, coarse, fine, accuracy, difference, nearest, going)
 
 
 @programs.jit
@@ -277,7 +283,7 @@ def find_dt(scenario: Scenario, *, duration: float, method: str) -> float:
         pair = side_by_side(scenario, dt, math.ceil(duration / dt * (1 - 1e-9)), method=method)
         excess = max(
             float(pair.difference) / RECOMMENDED_ERROR,
-            float(pair.estimate.relative) / error_estimate.TOLERANCE,
+            float(pair.accuracy.relative) / error_estimate.TOLERANCE,
         )
         if not excess > 1.0:
             nearest = _mode(scenario, pair.nearest[1], as_state(pair.nearest[2]))
@@ -296,20 +302,21 @@ def find_dt(scenario: Scenario, *, duration: float, method: str) -> float:
 
 
 def _find_part(
-    scenario: Scenario, period: float, duration: float, method: str, most_parts: int = MAX_TRIED
+    scenario: Scenario, period: float, duration: float, method: str, most_divisor: int = MAX_TRIED
 ) -> float:
     """`find_dt` for a sampled law or a delayed input: the largest accurate fraction of the sampling
-    period or of the delay [s].  The divisor is 1, 2 or 5 times a power of ten, at most
-    `most_parts`.
+    period or of the delay [s], by one of DIVISORS up to `most_divisor`.
     """
-    noise = jnp.zeros((4,)) if scenario.sampling is not None else None
+    noise_key = jnp.zeros((4,)) if scenario.sampling is not None else None
     _can_be_tried(duration, period)
     periods = max(math.ceil(duration / period - 1e-9), 1)
-    parts, before, poor_before, coarser = 1, None, 0, period
-    while periods * parts <= MAX_TRIED and parts <= most_parts:
-        dt = jnp.asarray(period / parts, scenario.initial.q.dtype)
-        fitted = with_history(scenario, period / parts)
-        found = run_one(fitted, (), dt, RunRequest(periods * parts, method, parts), noise)
+    before, poor_before, coarser = None, 0, period
+    for divisor in DIVISORS:
+        if periods * divisor > MAX_TRIED or divisor > most_divisor:
+            break
+        dt = jnp.asarray(period / divisor, scenario.initial.q.dtype)
+        fitted = with_history(scenario, period / divisor)
+        found = run_one(fitted, (), dt, RunRequest(periods * divisor, method, divisor), noise_key)
         signals = found.records.signals
         q = signals["x"][:, 0]
         width = signals["level_upper"][:, 0] - signals["level_lower"][:, 0]
@@ -326,8 +333,6 @@ def _find_part(
         ):
             return coarser
         before, poor_before, coarser = q, poor, float(dt)
-        lead = int(str(parts)[0])
-        parts = parts // lead * {1: 2, 2: 5, 5: 10}[lead]
     problem = "makes this run accurate: the loop may magnify every error."
     notices.warn(f"No step down to {coarser:g} s {problem}")
     return coarser

@@ -7,18 +7,23 @@ actuator after the delay, within this step or a later one.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
+from iblf_jax.core import checks
 from iblf_jax.engine.carry import Carry, Inputs
 from iblf_jax.engine.metric_folds import updated, weighed
-from iblf_jax.engine.step_pieces import LoopAlongStep, MetricSample, StepTimes, run_if, step_times
-from iblf_jax.simulation import delays, discontinuities, sampling
-from iblf_jax.simulation.closed_loop import (
-    run_sampled_law_if_due,
+from iblf_jax.engine.step_pieces import (
+    LoopAlongStep,
+    MetricSample,
+    StepTimes,
+    cond_or_zeros,
+    step_times,
 )
+from iblf_jax.simulation import delays, discontinuities, sampling
+from iblf_jax.simulation.closed_loop import run_sampled_law_if_due
 
 
 class StepStart(NamedTuple):
@@ -33,33 +38,33 @@ class StepStart(NamedTuple):
 
 
 def continuous_start(
-    inputs: Inputs, carry: Carry, index: jax.Array, method: str, evaluated: Callable
+    inputs: Inputs, carry: Carry, index: jax.Array, method: str, evaluate: Callable
 ) -> StepStart:
     """The start of a step of a loop whose law acts continuously."""
     times = step_times(inputs, index, method, None)
     number, commands = index.astype(inputs.dt.dtype), carry.state.delayed
     arriving = delays.arriving(inputs.scenario, method, inputs.dt, number, commands)
-    along = LoopAlongStep(evaluated, inputs, carry.state, (), arriving)
+    along = LoopAlongStep(evaluate, inputs, carry.state, (), arriving)
     return StepStart(along, times, carry.accumulators, ())
 
 
 def sampled_start(
-    inputs: Inputs, carry: Carry, index: jax.Array, method: str, evaluated: Callable
+    inputs: Inputs, carry: Carry, index: jax.Array, method: str, evaluate: Callable
 ) -> StepStart:
     """The start of a step of a sampled loop: its law runs where it is due, and commands arrive."""
     scenario, dt = inputs.scenario, inputs.dt
-    assert scenario.sampling is not None
-    now = sampling.instant(scenario.sampling, dt, index)
+    schedule = checks.given(scenario.sampling)
+    now = sampling.instant(schedule, dt, index)
     due = (now.phase == 0) & (index > 0)
     t = index.astype(dt.dtype) * dt
-    state = run_sampled_law_if_due(scenario, t, carry.state, now, inputs.noise)
-    torques = sampling.step_torques(scenario.sampling, dt, now, state.sampled.commands)
-    before = sampling.arrival_before(scenario.sampling, dt, now)
+    state = run_sampled_law_if_due(scenario, t, carry.state, now, inputs.noise_key)
+    commands = sampling.step_commands(schedule, dt, now, state.sampled.commands)
+    before = sampling.arrival_before(schedule, dt, now)
     arrivals = None
     if before is not None:
-        arrivals = ((torques.arrival * dt, torques.arrives), before)
+        arrivals = ((commands.arrival * dt, commands.arrives), before)
     times = step_times(inputs, index, method, arrivals)
-    along = LoopAlongStep(evaluated, inputs, state, (torques.torque, torques.next))
+    along = LoopAlongStep(evaluate, inputs, state, (commands.first, commands.next))
     accumulators, metric_samples = _before_sample(along, carry, due, times)
     length = jnp.where(due, jnp.zeros_like(dt), times.previous_piece_length)
     times = times._replace(previous_piece_length=length)
@@ -71,15 +76,15 @@ def _before_sample(
 ) -> tuple[tuple, tuple[MetricSample, ...]]:
     """The accumulators after the sample just before the law runs, where it is due; and that sample.
 
-    The law's signals, and without a delay the torque, jump there.
+    The law's signals, and without a delay the command, jump there.
     """
     folds, scenario, dt = along.inputs.folds, along.inputs.scenario, along.inputs.dt
     if not folds:
         return carry.accumulators, ()
     commands = carry.state.sampled.commands
     pending = along.state.sampled.commands
-    schedule: Any = scenario.sampling
-    torque = sampling.torque_before(schedule, dt, commands, pending)
+    schedule = checks.given(scenario.sampling)
+    command = sampling.command_before(schedule, dt, commands, pending)
     t, previous_piece_length = times.span.start, times.previous_piece_length
     seen_at = (
         t
@@ -88,9 +93,9 @@ def _before_sample(
     )
 
     def seen(accumulators):
-        sample = along.evaluate(scenario, seen_at, carry.state, dt, torque)[1]
+        sample = along.evaluate(scenario, seen_at, carry.state, command)[1]
         sample = weighed(sample, t, 0.5 * previous_piece_length, jnp.zeros_like(dt))
         return updated(folds, accumulators, sample), sample
 
-    after, sample = run_if(due, seen, carry.accumulators)
+    after, sample = cond_or_zeros(due, seen, carry.accumulators)
     return after, (MetricSample(carry.accumulators, sample, due),)

@@ -312,9 +312,9 @@ def _piece(
     g, dg = along(target, since, state, first)
     until, early = _time_to(g, dg, dt)
     length = jnp.where(aims, until, dt - since)
-    middle, sample = evaluated(since + 0.5 * length, _moved(state, 0.5 * length, first))
+    middle, sample = evaluated(since + 0.5 * length, _later(state, 0.5 * length, first))
     middle = _sum(middle, sliding)
-    reached = _moved(state, length, middle)
+    reached = _later(state, length, middle)
     last = jax.tree.map(lambda half, full: 2.0 * half - full, middle, first)
     g, dg = along(target, since + length, reached, last)
     correction, late = _time_to(g, dg, dt)
@@ -326,7 +326,7 @@ def _piece(
     gained = [x + gain * length for x, gain in zip(before.gained, gains, strict=True)]
     usable = before.usable & ((early & late) | ~aims)
     return Progress(
-        _moved(reached, correction, last),
+        _later(reached, correction, last),
         since + length,
         last,
         sliding,
@@ -358,7 +358,7 @@ def _along(
     """The switching functions, and their rates along a rate of the state, (m,) each."""
 
     def at(h):
-        return surfaces(scenario, t + h, _moved(state, h, rate))
+        return surfaces(scenario, t + h, _later(state, h, rate))
 
     return jax.jvp(at, (jnp.zeros_like(t),), (jnp.ones_like(t),))
 
@@ -371,7 +371,7 @@ def _time_to(g: jax.Array, dg: jax.Array, dt: jax.Array) -> tuple[jax.Array, jax
     return -jnp.where(usable, g, 0.0) / jnp.where(usable, dg, 1.0), usable
 
 
-def _moved(state: LoopState, time: jax.Array, rate: LoopState) -> LoopState:
+def _later(state: LoopState, time: jax.Array, rate: LoopState) -> LoopState:
     """The state a time later at a constant rate."""
     return jax.tree.map(lambda x, dx: x + time * dx, state, rate)
 

@@ -9,7 +9,7 @@ to a bound, because the loop is stiffest there.  At the last instant the loop is
 integrated.
 
 A step is a function (inputs, carry, index) -> (carry, records) of ONE run.  It is hashable, and
-equal steps are compiled once.  `carry.start` creates the carry before the first step, and
+equal steps are compiled once.  `carry.initial_carry` creates the carry before the first step, and
 `outcome.outcome_of` computes the result after the last one.  Neither evaluates the closed loop:
 `linearization` computes the Jacobian that both need, also in steps.
 """
@@ -27,19 +27,21 @@ import jax.numpy as jnp
 from iblf_jax.core.attributes import attributes
 from iblf_jax.core.pytree import is_absent
 from iblf_jax.core.status import Status, flag
-from iblf_jax.engine.carry import Carry, Inputs, Nearest, Step, StepOptions, keep_if
-from iblf_jax.engine.metric_folds import begun_at, updated, weighed
+from iblf_jax.engine.carry import Carry, Inputs, Nearest, Step, StepOptions, tree_where
+from iblf_jax.engine.metric_folds import initialised_at, updated, weighed
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.status_flags import has_no_input, is_valid, sample_status
 from iblf_jax.engine.step_pieces import (
     LoopAlongStep,
     MetricSample,
+    StepTimes,
     across_jumps,
-    integrated,
+    integrate_piece,
     later_pieces,
 )
 from iblf_jax.engine.step_start import continuous_start, sampled_start
 from iblf_jax.simulation import (
+    closed_loop,
     delays,
     discontinuities,
     error_estimate,
@@ -48,7 +50,6 @@ from iblf_jax.simulation import (
 )
 from iblf_jax.simulation.closed_loop import (
     LoopState,
-    evaluate,
     integrated_part,
     perturbed_state,
     with_integrated_part,
@@ -82,7 +83,7 @@ class TimeStep(Step):
         return found.carry, self.record(inputs.folds, found)
 
 
-class Advanced(NamedTuple):
+class StepOutput(NamedTuple):
     """What one step of a run gives."""
 
     carry: Carry
@@ -104,8 +105,8 @@ def advance(
     index: jax.Array,
     method: str,
     options: StepOptions,
-    loop: Callable = evaluate,
-) -> Advanced:
+    evaluate: Callable = closed_loop.evaluate,
+) -> StepOutput:
     """One step: evaluates the closed loop, updates the metrics, integrates piece by piece, and
     freezes a state that diverges.
 
@@ -114,18 +115,18 @@ def advance(
       index: number of the instant, () int.
       method: the integrator.
       options: how the code of the step is generated.
-      loop: replaces `closed_loop.evaluate`.
+      evaluate: replaces `closed_loop.evaluate`.
     """
-    begin = continuous_start
-    if inputs.scenario.sampling is not None:
-        begin = sampled_start
-    start = begin(inputs, carry, index, method, loop)
+    if inputs.scenario.sampling is None:
+        start = continuous_start(inputs, carry, index, method, evaluate)
+    else:
+        start = sampled_start(inputs, carry, index, method, evaluate)
     along, times = start.along, start.times
     state = along.state
     first = times.division.pieces[0]
-    stepped = integrated(along, first, integrated_part(state), method, options)
-    if along.arriving:
-        commands = [slope.delayed for slope in stepped.slopes]
+    stepped = integrate_piece(along, first, integrated_part(state), method, options)
+    if not is_absent(along.arriving):
+        commands = [slope.command for slope in stepped.slopes]
         along = along._replace(arriving=along.arriving.with_commands_of_step(commands))
     ahead = jnp.where(times.span.in_run, first.length, jnp.zeros_like(inputs.dt))
     step = jnp.where(index > 0, inputs.dt, jnp.zeros_like(inputs.dt))
@@ -134,41 +135,41 @@ def advance(
     )
     walls = distances(inputs.scenario, sample)
     sample = with_extremes(
-        inputs.scenario, inputs.noise, index, inputs.dt, sample, state.x, carry.distances, walls
+        inputs.scenario, inputs.noise_key, index, inputs.dt, sample, state.x, carry.distances, walls
     )
-    begun = begun_at(index, inputs.folds, sample, start.accumulators)
-    accumulators = updated(inputs.folds, begun, sample)
+    before_sample = initialised_at(index, inputs.folds, sample, start.accumulators)
+    accumulators = updated(inputs.folds, before_sample, sample)
     if along.jumps_with_law:
         stepped, accumulators = across_jumps(
-            along, first, state, method, stepped, begun, accumulators
+            along, first, state, method, stepped, before_sample, accumulators
         )
     later = later_pieces(along, times.division.pieces, stepped, accumulators, method, options)
-    parts = [(first.length, stepped.slopes), *later.parts]
+    piece_slopes = [(first.length, stepped.slopes), *later.piece_slopes]
     state_after = with_integrated_part(state, later.moved)
-    if along.arriving:
-        state_after, parts = _with_commands(
-            along, method, times.division.pieces, state_after, parts
+    if not is_absent(along.arriving):
+        state_after, piece_slopes = _with_commands(
+            along, method, times.division.pieces, state_after, piece_slopes
         )
-    after, status, nearest, estimate = _concluded(
-        method,
-        inputs,
-        carry,
-        index,
-        sample,
-        parts,
-        (state_after, later.status),
-        state,
-        times.span.in_run,
-        times.restarts,
-        times.division.too_many_jumps,
+    in_run = times.span.in_run
+    status = carry.status | sample_status(sample)
+    if later.status is not None:
+        status = status | later.status
+    after, status = _frozen_if_invalid(
+        inputs.scenario, state, state_after, piece_slopes, status, in_run
     )
+    nearest = _nearest_to_bound(carry.nearest, sample, state)
+    accuracy = carry.accuracy
+    if inputs.scenario.process_noise is None:
+        accuracy = _updated_accuracy(
+            method, inputs, carry, index, piece_slopes, state, sample.upper - sample.lower, times
+        )
     metric_samples = (
-        MetricSample(begun, sample, True),
+        MetricSample(before_sample, sample, True),
         *start.metric_samples,
         *later.metric_samples,
     )
-    return Advanced(
-        Carry(after, later.accumulators, status, nearest, estimate, walls), metric_samples, state
+    return StepOutput(
+        Carry(after, later.accumulators, status, nearest, accuracy, walls), metric_samples, state
     )
 
 
@@ -177,83 +178,97 @@ def _with_commands(
     method: str,
     pieces: tuple[discontinuities.Piece, ...],
     after: LoopState,
-    parts: list,
+    piece_slopes: list,
 ) -> tuple[LoopState, list]:
     """The state after a step, which keeps the commands of the step for a delayed input; and the
     pieces of the step, whose slopes no longer contain the commands.
     """
     of_pieces = [
-        delays.PieceCommands(piece.begin, length, piece.exists, [slope.delayed for slope in slopes])
-        for piece, (length, slopes) in zip(pieces, parts, strict=True)
+        delays.PieceCommands(piece.begin, length, piece.exists, [slope.command for slope in slopes])
+        for piece, (length, slopes) in zip(pieces, piece_slopes, strict=True)
     ]
     commands = delays.with_step(along.state.delayed, method, along.arriving, of_pieces)
     without_commands = [
-        (length, [slope._replace(delayed=()) for slope in slopes]) for length, slopes in parts
+        (length, [slope._replace(command=()) for slope in slopes])
+        for length, slopes in piece_slopes
     ]
     return after._replace(delayed=commands), without_commands
 
 
-def _concluded(
+def _nearest_to_bound(before: Nearest, sample: Sample, state: LoopState) -> Nearest:
+    """The instant nearest to a bound so far, with that of a sample and its state."""
+    near = jnp.max(jnp.abs(jax.lax.stop_gradient(sample.xi)))
+    here = Nearest(near, sample.t, jax.lax.stop_gradient(perturbed_state(state)))
+    return tree_where(near > before.xi, here, before)
+
+
+def _updated_accuracy(
     method: str,
     inputs: Inputs,
     carry: Carry,
     index: jax.Array,
-    sample: Sample,
-    parts: list,
-    later: tuple[LoopState, Any],
-    before: LoopState,
-    in_run: jax.Array,
-    restarts: Any,
-    too_many_jumps: Any,
-) -> tuple[LoopState, jax.Array, Nearest, error_estimate.Accuracy]:
-    """State, status, nearest instant and accuracy after a step; a state that diverges is frozen.
+    piece_slopes: list,
+    state: LoopState,
+    width: jax.Array,
+    times: StepTimes,
+) -> error_estimate.Accuracy:
+    """The estimate of the accuracy after a step.
 
     Args:
       method: the integrator.
       inputs, carry: of the run.
       index: number of the instant, () int.
-      sample: of the instant.
-      parts: lengths and slopes of the pieces of the step.
-      later: the state at the end of the step, and the flags raised within it.
-      before: the state at its start.
-      in_run: whether the run goes on after the instant, () bool.
-      restarts, too_many_jumps: of `StepTimes` and its division.
+      piece_slopes: lengths and slopes of the pieces of the step.
+      state: at the start of the step.
+      width: of the tube, (n,) [rad].
+      times: of the step.
     """
-    near = jnp.max(jnp.abs(jax.lax.stop_gradient(sample.xi)))
-    here = Nearest(near, sample.t, jax.lax.stop_gradient(perturbed_state(before)))
-    nearest = keep_if(near > carry.nearest.xi, here, carry.nearest)
-    is_sampled = inputs.scenario.sampling is not None
-    width = sample.upper - sample.lower
-    estimate = carry.accuracy
-    if inputs.scenario.process_noise is None:
-        estimate = error_estimate.update(
-            estimate,
-            method,
-            inputs.dt,
-            index,
-            parts,
-            width,
-            is_sampled,
-            restarts,
-            too_many_jumps,
-            error_growth.rounds_continuously(inputs.scenario),
-        )
-        if not is_absent(estimate.growth):
-            grown = _grown_error(method, inputs, carry, index, parts, before, width)
-            estimate = estimate._replace(growth=grown)
-    after, raised = later
-    status = carry.status | sample_status(sample)
-    if raised is not None:
-        status = status | raised
-    plant = inputs.scenario.loop.plant
-    limit = plants.speed_limit(plant)
-    valid = is_valid(after, limit) & (status & int(Status.NOT_FINITE) == 0)
+    accuracy = error_estimate.update(
+        carry.accuracy,
+        method,
+        inputs.dt,
+        index,
+        piece_slopes,
+        width,
+        inputs.scenario.sampling is not None,
+        times.restarts,
+        times.division.too_many_jumps,
+        error_growth.rounds_continuously(inputs.scenario),
+    )
+    if is_absent(accuracy.error_growth):
+        return accuracy
+    grown = _grown_error(method, inputs, carry, index, piece_slopes, state, width)
+    return accuracy._replace(error_growth=grown)
+
+
+def _frozen_if_invalid(
+    scenario: Scenario,
+    before: LoopState,
+    after: LoopState,
+    piece_slopes: list,
+    status: jax.Array,
+    in_run: jax.Array,
+) -> tuple[LoopState, jax.Array]:
+    """State and status after a step; a state that diverges is frozen, as is one at the end of a
+    run.
+
+    Args:
+      scenario: the scenario.
+      before, after: the state at the start and at the end of the step.
+      piece_slopes: lengths and slopes of the pieces of the step.
+      status: with the flags of its samples, () int32.
+      in_run: whether the run goes on after the instant, () bool.
+    """
+    plant = scenario.loop.plant
+    valid = is_valid(after, plants.speed_limit(plant)) & (status & int(Status.NOT_FINITE) == 0)
     status |= flag(~valid & in_run, Status.NOT_FINITE)
     if plant.loses_input:
-        stages = [slope for _, slopes in parts for slope in slopes]
-        lost = jnp.any(jnp.stack([has_no_input(slope) for slope in stages]))
-        status |= flag(lost & in_run, Status.SINGULAR_GAIN)
-    return keep_if(valid & in_run, after, before), status, nearest, estimate
+        lost, *later = [has_no_input(slope) for _, slopes in piece_slopes for slope in slopes]
+        if later:
+            # The later stages of the last instant lie beyond the end of the run.
+            lost |= jnp.any(jnp.stack(later)) & in_run
+        status |= flag(lost, Status.SINGULAR_GAIN)
+    return tree_where(valid & in_run, after, before), status
 
 
 def _grown_error(
@@ -261,25 +276,27 @@ def _grown_error(
     inputs: Inputs,
     carry: Carry,
     index: jax.Array,
-    parts: list,
+    piece_slopes: list,
     state: LoopState,
     width: jax.Array,
 ) -> error_growth.ErrorGrowth:
-    """The error after a step of a loop whose feedback is interrupted; arguments as `_concluded`."""
+    """The error after a step of a loop whose feedback is interrupted; arguments as
+    `_updated_accuracy`.
+    """
     scenario, dt = inputs.scenario, inputs.dt
     now = None
     if scenario.sampling is not None:
         now = sampling.instant(scenario.sampling, dt, index)
     local_error = error_estimate.local_error_of_state(
-        method, parts, partial(error_growth.rate_at_end, scenario, dt, index, now, state)
+        method, piece_slopes, partial(error_growth.rate_at_end, scenario, dt, index, now, state)
     )
     return error_growth.update(
-        carry.accuracy.growth,
+        carry.accuracy.error_growth,
         scenario,
         dt,
         index,
         now,
-        inputs.noise,
+        inputs.noise_key,
         carry.state,
         state,
         local_error,
@@ -297,11 +314,13 @@ class Record(NamedTuple):
     measured: Any
 
 
-def recorded(folds: Any, found: Advanced) -> Record:
-    """The signals of an instant, and the states of law, observer, actuator and sensor."""
+def recorded(folds: Any, found: StepOutput) -> Record:
+    """The signals of an instant, the states of law, observer and actuator, and what a sampled law
+    received.
+    """
     state, measured = found.state, ()
     if not is_absent(state.sampled):
-        measured = state.sampled.measured
+        measured = state.sampled.received
     signals = attributes(found.sample, FIELDS)
     return Record(signals, state.controller, state.observer, state.actuator, measured)
 
@@ -310,13 +329,13 @@ POSITIONS = ("t", "q", "e1", "lower", "upper", "q_d")
 """Signals of `positions`."""
 
 
-def positions(folds: Any, found: Advanced) -> dict[str, jax.Array]:
+def positions(folds: Any, found: StepOutput) -> dict[str, jax.Array]:
     """The time, and the positions of an instant with their errors, bounds and reference."""
     return attributes(found.sample, POSITIONS)
 
 
 def samples_of_step(scenario: Scenario) -> int:
-    """How many samples the folds see of a step at most: `Advanced.metric_samples`."""
+    """How many samples the folds see of a step at most: `StepOutput.metric_samples`."""
     arrives = scenario.sampling is not None and scenario.sampling.queue > 0
     cuts = min(scenario.jump_times().size, discontinuities.MAX_CUTS) + arrives
     return 1 + (scenario.sampling is not None) + 2 * cuts

@@ -39,7 +39,7 @@ from iblf_jax.engine.compile import (
 )
 from iblf_jax.engine.derivatives import DerivativeSizes, choose_derivatives
 from iblf_jax.engine.direction import TracedRuns, derivative
-from iblf_jax.engine.loops import kernel_loop, scan
+from iblf_jax.engine.loops import kernel_stepper, scan
 from iblf_jax.engine.outcome import Outcome
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.single_run import run_one
@@ -56,16 +56,16 @@ def run_transformable(
     folds: tuple[Fold, ...],
     dt: jax.Array,
     request: RunRequest,
-    noise: jax.Array | None = None,
+    noise_key: jax.Array | None = None,
 ) -> Outcome:
     """One run that may be batched and differentiated from outside.
 
     Args:
-      scenario, folds, dt, noise: as `single_run.run_one`.
+      scenario, folds, dt, noise_key: as `single_run.run_one`.
       request: its backend is that of the derivatives: "vmap" for plain JAX, else kernels where they
         can be built.
     """
-    leaves, treedef = jax.tree.flatten(inputs_of(scenario, folds, dt, request, noise))
+    leaves, treedef = jax.tree.flatten(inputs_of(scenario, folds, dt, request, noise_key))
     backend, reason = registry.default_backend()
     compiles = request.backend != "vmap" and reason is None
     request = request._replace(constants=constants_of(scenario), backend="auto")
@@ -79,8 +79,8 @@ def run_transformable(
 def _run_by_scan(runs: TracedRuns, *leaves: jax.Array) -> Outcome:
     """The run by the scan."""
     inputs = jax.tree.unflatten(runs.treedef, leaves)
-    loop = partial(scan, rolled=thresholds.rolls_stages(operations(inputs)))
-    return run_all(loop, Batch.of(inputs, None), runs.request)
+    run_steps = partial(scan, rolled=thresholds.rolls_stages(operations(inputs)))
+    return run_all(run_steps, Batch.of(inputs, None), runs.request)
 
 
 @CACHE.memoised(64)
@@ -98,14 +98,14 @@ def _differentiable(runs: TracedRuns, beside_derivative: bool = False) -> Callab
     run: Any = jax.custom_jvp(partial(value, runs))
 
     def rule(leaves, tangents):
-        places, moves = _moves(tangents)
+        places, nonzero = _nonzero_tangents(tangents)
 
         def by_scan(_=None):
             moved = partial(_replaced, leaves, places)
             return jax.jvp(
                 lambda *values: _run_by_scan(runs, *moved(values)),
                 [leaves[i] for i in places],
-                moves,
+                nonzero,
             )
 
         if not _is_by_scenario(runs, (places,)):
@@ -120,8 +120,8 @@ def _differentiable(runs: TracedRuns, beside_derivative: bool = False) -> Callab
         def attempt(_):
             found = _differentiable(runs, True)(*leaves)
             if method == "reverse":
-                return found, _in_form_of(found, *derivative(runs, places, leaves, moves))
-            return found, _in_form_of(found, *_times(by_kernel, moves, 0))
+                return found, _in_form_of(found, *derivative(runs, places, leaves, nonzero))
+            return found, _in_form_of(found, *_times(by_kernel, nonzero, 0))
 
         return first_that_works(runs.plan, attempt, by_scan)
 
@@ -129,15 +129,15 @@ def _differentiable(runs: TracedRuns, beside_derivative: bool = False) -> Callab
     return run
 
 
-def _moves(tangents: tuple) -> tuple[tuple[int, ...], list[jax.Array]]:
+def _nonzero_tangents(tangents: tuple) -> tuple[tuple[int, ...], list[jax.Array]]:
     """Which leaves move, and how."""
     places = tuple(i for i, x in enumerate(tangents) if not isinstance(x, SymbolicZero))
     return places, [tangents[i] for i in places]
 
 
-def _times(J: Any, moves: list[jax.Array], axis: int) -> Any:
+def _times(J: Any, nonzero: list[jax.Array], axis: int) -> Any:
     """A derivative times how far the leaves move."""
-    direction = jnp.concatenate([jnp.ravel(x) for x in moves])
+    direction = jnp.concatenate([jnp.ravel(x) for x in nonzero])
     return jax.tree.map(lambda x: jnp.tensordot(x, direction, ((axis,), (0,))), J)
 
 
@@ -152,7 +152,7 @@ def _run_by_kernel(runs: TracedRuns, *leaves: jax.Array) -> Outcome:
     if checks.is_concrete(leaves):
         inputs = jax.tree.unflatten(runs.treedef, leaves)
         request = runs.request._replace(constants=constants_of(inputs.scenario))
-        return run_one(inputs.scenario, inputs.folds, inputs.dt, request, inputs.noise)
+        return run_one(inputs.scenario, inputs.folds, inputs.dt, request, inputs.noise_key)
     return jax.tree.map(lambda x: x[0], _over_runs(_values, runs)(*leaves))
 
 
@@ -160,7 +160,7 @@ def _is_by_scenario(runs: TracedRuns, places: Places) -> bool:
     """Whether all leaves at these places belong to the scenario."""
     scenario = jax.tree.unflatten(runs.treedef, runs.is_per_run).scenario
     number_of_leaves = len(jax.tree.leaves(scenario))
-    return all(i < number_of_leaves for level in places for i in level)
+    return all(i < number_of_leaves for of_order in places for i in of_order)
 
 
 def _by_kernel(runs: TracedRuns, places: Places, leaves: tuple) -> Any:
@@ -178,14 +178,14 @@ def _by_kernel(runs: TracedRuns, places: Places, leaves: tuple) -> Any:
     )
 
     def rule(leaves, tangents):
-        more, moves = _moves(tangents)
+        more, nonzero = _nonzero_tangents(tangents)
         second = _by_kernel(runs, (*places, more), leaves)
         if second is not None:
-            return kernel(*leaves), _times(second, moves, len(places))
+            return kernel(*leaves), _times(second, nonzero, len(places))
         return jax.jvp(
             lambda *moved: _by_scan(runs, places, _replaced(leaves, more, moved)),
             [leaves[i] for i in more],
-            moves,
+            nonzero,
         )
 
     kernel.defjvp(rule, symbolic_zeros=True)
@@ -200,27 +200,27 @@ def _by_scan(runs: TracedRuns, places: Places, leaves: tuple) -> Any:
         return floats_of(found.records), {
             name: x for name, x in folded.items() if jnp.issubdtype(x.dtype, jnp.floating)
         }
-    level = places[-1]
-    shapes = [jnp.shape(leaves[i]) for i in level]
+    of_order = places[-1]
+    shapes = [jnp.shape(leaves[i]) for i in of_order]
     ends = np.cumsum([math.prod(shape) for shape in shapes])
 
     def along(unit):
         parts = jnp.split(unit, ends[:-1])
         directions = [x.reshape(shape) for x, shape in zip(parts, shapes, strict=True)]
         return jax.jvp(
-            lambda *moved: _by_scan(runs, places[:-1], _replaced(leaves, level, moved)),
-            [leaves[i] for i in level],
+            lambda *moved: _by_scan(runs, places[:-1], _replaced(leaves, of_order, moved)),
+            [leaves[i] for i in of_order],
             directions,
         )[1]
 
-    units = jnp.eye(ends[-1], dtype=leaves[level[0]].dtype)
+    units = jnp.eye(ends[-1], dtype=leaves[of_order[0]].dtype)
     return jax.vmap(along, out_axes=len(places) - 1)(units)
 
 
 def _derivative_sizes(runs: TracedRuns, places: Places, leaves: tuple) -> DerivativeSizes:
     """The sizes that decide how a derivative of one run's records and metrics is computed."""
     every = runs.request.record_every
-    columns = [sum(jnp.size(leaves[i]) for i in level) for level in places]
+    columns = [sum(jnp.size(leaves[i]) for i in of_order) for of_order in places]
 
     def count_kept_numbers() -> int:
         if every is None:
@@ -253,8 +253,8 @@ def _over_runs(function: Callable, runs: TracedRuns, *static: Any) -> Callable:
 
 @programs.jit(static_argnums=0)
 def _values(runs: TracedRuns, leaves: tuple) -> Outcome:
-    def run(loop, batch):
-        return run_all(loop, batch, runs.request)
+    def run(run_steps, batch):
+        return run_all(run_steps, batch, runs.request)
 
     executor = registry.EXECUTORS[runs.backend]
     return run_by_executor(executor, runs.batch(leaves), runs.request, run)
@@ -262,8 +262,8 @@ def _values(runs: TracedRuns, leaves: tuple) -> Outcome:
 
 @programs.jit(static_argnums=(0, 1))
 def _columns(runs: TracedRuns, places: Places, leaves: tuple) -> Any:
-    loop = kernel_loop(registry.EXECUTORS[runs.backend])
-    return columns(loop, runs.batch(leaves), places, runs.request)
+    run_steps = kernel_stepper(registry.EXECUTORS[runs.backend])
+    return columns(run_steps, runs.batch(leaves), places, runs.request)
 
 
 def _in_form_of(found: Outcome, records: list[jax.Array], metrics: dict[str, jax.Array]) -> Outcome:

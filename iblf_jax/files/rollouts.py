@@ -215,7 +215,7 @@ def _rollout_of(
             "controller_state": start.controller,
             "observer_state": start.observer,
             "actuator_state": start.actuator,
-            "measured": start.sampled.measured if scenario.sampling is not None else (),
+            "measured": start.sampled.received if scenario.sampling is not None else (),
         }
         arrays = {str(name): variable.values for name, variable in data.data_vars.items()}
         levels = {name: jnp.asarray(earlier.levels(arrays, name)) for name in LEVEL_SIGNALS}
@@ -341,10 +341,10 @@ def _trajectories(run: Rollout, batch: tuple[str, ...]) -> dict[str, Any]:
         # The views show all rows of the signals of a robot.
         is_shown = name in LEVEL_SIGNALS and np.shape(value)[-2] <= len(LEVEL_SIGNALS[name])
         if name != "t" and not is_absent(value) and not is_shown:
-            if name in ("level_lower", "level_upper"):
-                # Only the first levels have bounds.
+            missing = SIGNALS[name].missing
+            if missing is not None:
                 rows = value
-                value = np.full_like(run.x, np.inf if name == "level_upper" else -np.inf)
+                value = np.full_like(run.x, missing)
                 value[..., : np.shape(rows)[-2], :] = rows
             add(name, value, signal_unit(run.scenario, name), meanings[name])
     for state, tree in attributes(run, STATES).items():

@@ -6,14 +6,15 @@
     V2 = sum V1 + 1/2 e2^T M0 e2 + 1/2 f_tilde^T f_tilde                                   (3.12)
 
 The equations are those of a robot; another plant has its own (`plants`). The second term of V2 is
-left out for a law whose V1 `includes_e2`.
+left out for a law whose V1 `includes_e2`. `Scenario.loop` wraps every robot part once, so below
+everything takes x, (r, n).
 
 `evaluate` returns the rate of the state and a `Sample` of every signal. Where a caller uses the
 rate only, as in the later stages of an integrator, the compiler removes the rest.
 
 A law with a `Sampling` runs in discrete time. `run_sampled_law` runs sensor, law and observer once
 at the start of a period. Within the period the integrator advances the plant and the actuator, and
-the signals of the law (alpha, V1, f_hat) keep the values of its last run.
+the signals of the law (alphas, V1, estimate) keep the values of its last run.
 """
 
 from __future__ import annotations
@@ -54,20 +55,20 @@ from iblf_jax.world.regions import margins
 
 
 class LawSignals(NamedTuple):
-    """Signals of a law at one instant, besides its torque; (n,) unless noted."""
+    """Signals of a law at one instant, besides its command; (n,) unless noted."""
 
-    alpha: jax.Array
-    """Virtual velocity [rad/s]."""
+    alphas: jax.Array
+    """Virtual controls of the levels from the second on, (k, n); of a law of robots the virtual
+    velocity [rad/s] alone."""
     V1: jax.Array
     """Lyapunov function of the position error, joint by joint."""
-    f_hat: jax.Array
-    """Estimate of the uncertain term that the law used [N m]."""
+    estimate: jax.Array
+    """Estimate that the law received: f_hat, (n,) [N m], or d_hat, (r, n)."""
     guard_active: jax.Array
     saturated: jax.Array
     slack: jax.Array | Absent = ()
     region_slack: jax.Array | Absent = ()
-    alpha_higher: jax.Array | Absent = ()
-    torque: jax.Array | Absent = ()
+    joint_torque: jax.Array | Absent = ()
     """The torque that a law of a robot commanded through another input, (n,) [N m]; `()` where the
     input is the torque."""
     estimated: EstimatedLevels | Absent = ()
@@ -77,34 +78,35 @@ class LawSignals(NamedTuple):
 
 
 def law_signals(
-    command: Command,
-    f_hat: jax.Array,
+    output: Command,
+    estimate: jax.Array,
     estimated: EstimatedLevels | Absent = (),
     sent: SentCommand | Absent = (),
 ) -> LawSignals:
-    """The signals of a law that answered with `command` to the estimate `f_hat`; `estimated` are
-    the levels that it received from an observer, and `sent` is the `SentCommand` of an event
-    trigger, or `()`.
+    """The signals of a law with this output for an estimate; `estimated` are the levels that it
+    received from an observer, and `sent` is the `SentCommand` of an event trigger, or `()`.
     """
+    alphas = output.alpha[None]
+    if not is_absent(output.alpha_higher):
+        alphas = jnp.concatenate([alphas, output.alpha_higher])
     return LawSignals(
-        alpha=command.alpha,
-        V1=command.V1,
-        f_hat=f_hat,
-        guard_active=command.guard_active,
-        saturated=command.saturated,
-        slack=command.slack,
-        region_slack=command.region_slack,
-        alpha_higher=command.alpha_higher,
-        torque=() if is_absent(command.input) else command.tau,
+        alphas=alphas,
+        V1=output.V1,
+        estimate=estimate,
+        guard_active=output.guard_active,
+        saturated=output.saturated,
+        slack=output.slack,
+        region_slack=output.region_slack,
+        joint_torque=() if is_absent(output.input) else output.tau,
         estimated=estimated,
-        auxiliary=command.auxiliary,
+        auxiliary=output.auxiliary,
         events=() if is_absent(sent) else sent.number,
     )
 
 
-def plant_input(command: Command) -> jax.Array:
+def plant_input(output: Command) -> jax.Array:
     """The input of the plant that a law commands, (n,): its torque, unless it has another input."""
-    return command.tau if is_absent(command.input) else command.input
+    return output.tau if is_absent(output.input) else output.input
 
 
 class SampledState(NamedTuple):
@@ -114,8 +116,9 @@ class SampledState(NamedTuple):
     """Commands in transit to the actuator, newest first, (queue + 1, n) [N m]."""
     sensor: Pytree
     """State of the sensor."""
-    measured: Measurement
-    """The last measurement."""
+    received: Measurement
+    """What the law received at its last run: the measurement, with the observer's estimates of
+    levels that are not measured."""
     signals: LawSignals
     """Signals of the law at its last run."""
     sent: SentCommand | Absent = ()
@@ -123,7 +126,9 @@ class SampledState(NamedTuple):
 
 
 class LoopState(NamedTuple):
-    """State of the closed loop; its rate has the structure of the `integrated_part`."""
+    """State of the closed loop, its rate, or its `integrated_part`, which has the structure of the
+    rate.
+    """
 
     x: jax.Array
     """State of the plant, (r, n): of a robot q and q'."""
@@ -133,18 +138,20 @@ class LoopState(NamedTuple):
     sampled: Any = ()
     """A `SampledState` where the law is sampled."""
     delayed: Any = ()
-    """Commands of the last steps, newest first, (history, stages, n) [N m], where the input of a
-    continuous loop has a delay; `()` without one.  In the rate of the state it is the command of
-    the law, (n,)."""
+    """Commands of the last steps, newest first, (history, stages, n) [N m], of the state of a
+    continuous loop whose input has a delay; `()` without one."""
+    command: Any = ()
+    """Of the rate of such a loop the command of the law, (n,); of its integrated part the integral
+    of it over the step."""
 
     @property
     def q(self) -> jax.Array:
-        """The first level, (n,); after leading axes of many states, as in `dq`."""
+        """Position level, (..., n)."""
         return self.x[..., 0, :]
 
     @property
     def dq(self) -> jax.Array:
-        """The second level, (n,)."""
+        """Velocity level, (..., n)."""
         return self.x[..., 1, :]
 
 
@@ -161,33 +168,37 @@ def initial_state(scenario: Scenario) -> LoopState:
     )
     if scenario.sampling is None and isinstance(scenario.actuator, Ideal):
         return state
-    balance = steady_input(scenario, x[0])
-    state = state._replace(actuator=scenario.actuator.init(balance))
+    steady = steady_input(scenario, x[0])
+    state = state._replace(actuator=scenario.actuator.init(steady))
     if scenario.sampling is None:
-        return state._replace(delayed=initial_commands(scenario, balance))
-    return state._replace(sampled=_initial_sampled_state(scenario, state, balance))
+        return state._replace(delayed=initial_commands(scenario, steady))
+    return state._replace(sampled=_initial_sampled_state(scenario, state, steady))
 
 
-def _initial_sampled_state(scenario: Scenario, state: LoopState, tau: jax.Array) -> SampledState:
-    """State of a sampled loop before its first sample: every command in transit is `tau`."""
+def _initial_sampled_state(scenario: Scenario, state: LoopState, steady: jax.Array) -> SampledState:
+    """State of a sampled loop before its first sample: every command in transit is the steady
+    input.
+    """
     sampling = checks.given(scenario.sampling)
     loop, x = scenario.loop, state.x
     x_model, t = x[: loop.model.order], jnp.zeros_like(x[0, 0])
-    f_hat = jax.eval_shape(partial(estimate, scenario, loop.observer), t, x_model, state.observer)
-    command, _ = jax.eval_shape(
-        loop.law.command, t, x_model, f_hat, scenario.context, state.controller
+    law_estimate = jax.eval_shape(
+        partial(estimate, scenario, loop.observer), t, x_model, state.observer
+    )
+    output, _ = jax.eval_shape(
+        loop.law.command, t, x_model, law_estimate, scenario.context, state.controller
     )
     here = measurement_of(x)
     estimated = jax.eval_shape(
         partial(estimated_levels, scenario, loop.observer), t, here, here, x, state.observer
     )
-    sent = () if sampling.trigger is None else nothing_sent(tau)
-    signals = law_signals(command, f_hat, estimated, sent)
+    sent = () if sampling.trigger is None else nothing_sent(steady)
+    signals = jax.eval_shape(law_signals, output, law_estimate, estimated, sent)
     blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), signals)
     return SampledState(
-        commands=jnp.repeat(tau[None], sampling.queue + 1, axis=0),
+        commands=jnp.repeat(steady[None], sampling.queue + 1, axis=0),
         sensor=loop.sensor.init(x, sampling.period),
-        measured=here,
+        received=here,
         signals=blank,
         sent=sent,
     )
@@ -201,12 +212,12 @@ def has_delay(state: LoopState) -> bool:
 def integrated_part(state: LoopState) -> LoopState:
     """The part of the state that the integrator advances.
 
-    Of a continuous loop this is the whole state. Where the input has a delay, the integral of the
-    command over the step takes the place of the past commands. Of a sampled loop it is the plant
-    and the actuator; law, observer and sensor change at samples only.
+    Of a continuous loop this is the whole state. Where the input has a delay, it has the integral
+    of the command over the step and not the past commands. Of a sampled loop it is the plant and
+    the actuator; law, observer and sensor change at samples only.
     """
     if has_delay(state):
-        return state._replace(delayed=jnp.zeros_like(state.x[0]))
+        return state._replace(delayed=(), command=jnp.zeros_like(state.x[0]))
     if is_absent(state.sampled):
         return state
     return state._replace(controller=(), observer=(), sampled=())
@@ -215,7 +226,7 @@ def integrated_part(state: LoopState) -> LoopState:
 def with_integrated_part(state: LoopState, part: LoopState) -> LoopState:
     """The state with its `integrated_part` replaced."""
     if is_absent(state.sampled):
-        return part._replace(delayed=state.delayed)
+        return part._replace(delayed=state.delayed, command=())
     return state._replace(x=part.x, actuator=part.actuator)
 
 
@@ -228,54 +239,64 @@ def evaluate(
     scenario: Scenario,
     t: jax.Array,
     state: LoopState,
-    dt: jax.Array | float = 0.0,
-    torque: jax.Array | None = None,
+    command: jax.Array | None = None,
 ) -> tuple[LoopState, Sample]:
-    """The rate of the state and the sample at time t.
+    """The rate of the state and the sample at time t; the weight of the sample is 0.
 
     Args:
       scenario: the scenario.
       t: time, () [s].
       state: state at t.
-      dt: weight of the sample in an integral over time, () [s].
-      torque: command at the actuator, (n,) [N m], where the law is sampled or its command has a
-        delay; the newest command if not given.
+      command: at the actuator, (n,) [N m], where the law is sampled or its command has a delay;
+        the newest command of the law if not given.
     """
-    loop, x = scenario.loop, state.x
-    x_model = x[: loop.model.order]
-    controller_rate: Pytree = ()
-    observer_rate: Pytree = ()
-    undelayed: jax.Array | Absent = ()
+    x = state.x
     if scenario.sampling is None:
-        f_hat = estimate(scenario, loop.observer, t, x_model, state.observer)
-        true = measurement_of(x)
-        measured = completed(scenario, loop.observer, t, true, state.observer)
-        answer, controller_rate = loop.law.command(
-            t, measured.x[: loop.model.order], f_hat, scenario.context, state.controller
-        )
-        command = plant_input(answer)
-        estimated = estimated_levels(scenario, loop.observer, t, true, measured, x, state.observer)
-        signals = law_signals(answer, f_hat, estimated)
-        if has_delay(state):
-            undelayed = command
-        if torque is not None:
-            command = torque
+        law = _continuous_law(scenario, t, state)
     else:
-        command = state.sampled.commands[0] if torque is None else torque
-        signals = state.sampled.signals
-    delivered = scenario.actuator.at(t).deliver(command, x[1], state.actuator)
+        law = _LawOutput(state.sampled.commands[0], state.sampled.signals)
+    applied = law.input if command is None else command
+    delivered = scenario.actuator.at(t).deliver(applied, x[1], state.actuator)
     x_rate = motion(scenario, t, x, delivered.tau)
-    if scenario.sampling is None:
-        observer_rate = loop.observer.derivative(t, x_model, answer.tau, loop.model, state.observer)
     rate = LoopState(
         x_rate,
-        controller=controller_rate,
-        observer=observer_rate,
+        controller=law.controller_rate,
+        observer=law.observer_rate,
         actuator=delivered.rate,
-        delayed=undelayed,
+        command=law.input if has_delay(state) else (),
     )
-    sample = sample_at(scenario, t, dt, x, x_rate, delivered.tau, delivered.limited, signals)
+    sample = sample_at(scenario, t, x, x_rate, delivered.tau, delivered.limited, law.signals)
     return rate, sample
+
+
+class _LawOutput(NamedTuple):
+    """What the law gives at one instant."""
+
+    input: jax.Array
+    """Of the plant, (n,)."""
+    signals: LawSignals
+    controller_rate: Pytree = ()
+    """Rate of the law's state; `()` for a sampled law."""
+    observer_rate: Pytree = ()
+
+
+def _continuous_law(scenario: Scenario, t: jax.Array, state: LoopState) -> _LawOutput:
+    """What the law gives for a measurement of the state that the observer completes."""
+    loop, x, observer = scenario.loop, state.x, scenario.loop.observer
+    x_model = x[: loop.model.order]
+    law_estimate = estimate(scenario, observer, t, x_model, state.observer)
+    measurement = measurement_of(x)
+    received = completed(scenario, observer, t, measurement, state.observer)
+    output, controller_rate = loop.law.command(
+        t, received.x[: loop.model.order], law_estimate, scenario.context, state.controller
+    )
+    estimated = estimated_levels(scenario, observer, t, measurement, received, x, state.observer)
+    return _LawOutput(
+        plant_input(output),
+        law_signals(output, law_estimate, estimated),
+        controller_rate,
+        observer.derivative(t, x_model, output.tau, loop.model, state.observer),
+    )
 
 
 def rate(scenario: Scenario, t: jax.Array, state: LoopState) -> LoopState:
@@ -312,19 +333,18 @@ def with_process_noise(
 def sample_at(
     scenario: Scenario,
     t: jax.Array,
-    dt: jax.Array | float,
     x: jax.Array,
     x_rate: jax.Array,
     tau: jax.Array,
     limited: jax.Array,
     signals: LawSignals,
 ) -> Sample:
-    """The sample at time t of a loop with a given motion, torque and signals of the law.
+    """The sample at time t of a loop with a given motion, torque and signals of the law, without
+    its weight.
 
     Args:
       scenario: its reference, bounds and model are used.
       t: time, () [s].
-      dt: weight of the sample in an integral over time, () [s].
       x: state of the plant, (r, n).
       x_rate: x', (r, n).
       tau: input of the plant, (n,): of a robot the torque on the joints [N m].
@@ -332,11 +352,9 @@ def sample_at(
       signals: of the law.
     """
     tube = scenario.context.tube(t)
+    virtual = jnp.concatenate([tube.q_d[None], signals.alphas])
     terms = _uncertain_signals(scenario, t, x, x_rate, tau, signals)
     lower, upper = _bounds_of_levels(scenario, t, tube, x, signals)
-    errors = [x[0] - tube.q_d, x[1] - signals.alpha]
-    if not is_absent(signals.alpha_higher):
-        errors += list(x[2:] - signals.alpha_higher)
     optional: dict[str, Any] = {}
     robot = scenario.loop.plant.robot
     if scenario.regions and robot is not None:
@@ -345,18 +363,18 @@ def sample_at(
         optional |= signals.estimated._asdict()
     return Sample(
         t=t,
-        dt=jnp.asarray(dt, t.dtype),
+        dt=jnp.zeros_like(t),
         step=jnp.zeros_like(t),
         x=x,
         tau=tau,
-        e=jnp.stack(errors),
+        e=x[: len(virtual)] - virtual,
         xi=tube.xi(x[0]),
         q_d=tube.q_d,
         dq_d=tube.dq_d,
         level_lower=lower,
         level_upper=upper,
-        alpha=signals.alpha,
-        gravity=terms.gravity,
+        alpha=signals.alphas[0],
+        gravity=terms.steady_input,
         disturbance=terms.disturbance,
         disturbance_estimate=terms.estimate,
         V=terms.V,
@@ -373,7 +391,7 @@ def sample_at(
 class _UncertainSignals(NamedTuple):
     """Signals of a sample that depend on the model's equation of motion."""
 
-    gravity: jax.Array
+    steady_input: jax.Array
     disturbance: jax.Array
     estimate: jax.Array
     V: jax.Array
@@ -392,19 +410,20 @@ def _uncertain_signals(
     """
     model = scenario.loop.model
     x, x_rate = x[: model.order], x_rate[: model.order]
-    balance = model.steady_input(x[0])
-    if not is_absent(signals.torque):
+    steady = model.steady_input(x[0])
+    if not is_absent(signals.joint_torque):
         # The plant has another input than the torque of the law.
-        tau, balance = signals.torque, None
-    if balance is None:
-        balance = steady_input(scenario, x[0])
+        tau = signals.joint_torque
+        steady = None
+    if steady is None:
+        steady = steady_input(scenario, x[0])
     found = model.uncertain(t, x, x_rate, tau)
-    estimated = model.as_uncertain(x, signals.f_hat)
+    estimated = model.as_uncertain(x, signals.estimate)
     includes_e2 = unwrapped(scenario.controller).includes_e2
-    e2 = None if includes_e2 else x[1] - signals.alpha
+    e2 = None if includes_e2 else x[1] - signals.alphas[0]
     V = jnp.sum(signals.V1)
     added = model.energy_of_errors(x, e2, found - estimated)
-    return _UncertainSignals(balance, found, estimated, V if added is None else V + added)
+    return _UncertainSignals(steady, found, estimated, V if added is None else V + added)
 
 
 def _bounds_of_levels(
@@ -417,12 +436,10 @@ def _bounds_of_levels(
     """
     bounds_of_levels = [(tube.lower, tube.upper)]
     last = max(i for i, bounds in enumerate(scenario.bounds) if bounds is not None)
-    centres = [signals.alpha, *jnp.zeros_like(x[2:])]
-    if not is_absent(signals.alpha_higher):
-        centres[1:] = signals.alpha_higher
+    centres = [*signals.alphas, *jnp.zeros_like(x[1 + len(signals.alphas) :])]
     infinite = jnp.full_like(x[0], jnp.inf)
-    above = zip(scenario.bounds[1 : last + 1], centres, strict=False)
-    for level, (bounds, centre) in enumerate(above, start=2):
+    others = zip(scenario.bounds[1 : last + 1], centres, strict=False)
+    for level, (bounds, centre) in enumerate(others, start=2):
         if bounds is None:
             bounds_of_levels.append((-infinite, infinite))
         elif level == 2 and has_speed_limits(scenario):
@@ -439,17 +456,17 @@ def _bounds_of_levels(
 class LawUpdate(NamedTuple):
     """Result of one run of a sampled law and its observer."""
 
-    measured: Measurement
-    """The measurement, with the observer's estimates of levels that are not measured."""
-    command: Command
+    received: Measurement
+    """What the law received: the measurement, with the observer's estimates of levels that are not
+    measured."""
+    output: Command
     """That of the law; with an event trigger its torque and its input are those that were sent."""
-    f_hat: jax.Array
+    estimate: jax.Array
+    """Estimate that the law received: f_hat, (n,) [N m], or d_hat, (r, n)."""
     controller: Pytree
     """State of the law at the next sample."""
     observer: Pytree
     """State of the observer at the next sample."""
-    reading: Measurement
-    """The measurement without estimates."""
     sent: SentCommand | Absent = ()
     """Of a loop with an event trigger."""
 
@@ -469,7 +486,7 @@ def discrete_observer(scenario: Scenario) -> Observer:
 def law_update(
     scenario: Scenario,
     t: jax.Array,
-    measured: Measurement,
+    measurement: Measurement,
     controller: Pytree,
     observer: Pytree,
     sent: SentCommand | Absent = (),
@@ -481,40 +498,34 @@ def law_update(
     Args:
       scenario: with a sampling.
       t: start of the period, () [s].
-      measured: measurement at t.
+      measurement: at t.
       controller, observer: their states at t.
       sent: the `SentCommand` before t of a loop with an event trigger.
-      applied: torque of the period that the observer receives, (n,) [N m]; that of the command if
-        not given.
+      applied: torque of the period that the observer receives, (n,) [N m]; that of the law if not
+        given.
     """
     sampling = checks.given(scenario.sampling)
     running = discrete_observer(scenario)
-    reading = measured
-    measured = completed(scenario, running, t, reading, observer)
+    received = completed(scenario, running, t, measurement, observer)
     loop = scenario.loop
     law, model = loop.law, loop.model
-    x = measured.x[: model.order]
-    f_hat = estimate(scenario, running, t, x, observer)
-    command, controller_rate = law.command(t, x, f_hat, scenario.context, controller)
+    x = received.x[: model.order]
+    law_estimate = estimate(scenario, running, t, x, observer)
+    output, controller_rate = law.command(t, x, law_estimate, scenario.context, controller)
     if sampling.trigger is not None:
         assert not is_absent(sent)
-        sent = sampling.trigger.sent(plant_input(command), command.tau, sent)
-        command = _with_sent_input(command, sent)
-    torque = command.tau if applied is None else applied
+        sent = sampling.trigger.sent(plant_input(output), output.tau, sent)
+        output = output._replace(tau=sent.torque)
+        if not is_absent(output.input):
+            output = output._replace(input=sent.input)
+    torque = output.tau if applied is None else applied
     if sampling.observer == "exact" and running.advances:
         next_observer = running.advance(t, x, torque, model, observer, sampling.period)
     else:
         observer_rate = running.derivative(t, x, torque, model, observer)
         next_observer = _euler(observer, observer_rate, sampling.period)
     next_controller = _euler(controller, controller_rate, sampling.period)
-    return LawUpdate(measured, command, f_hat, next_controller, next_observer, reading, sent)
-
-
-def _with_sent_input(command: Command, sent: SentCommand) -> Command:
-    """A command with the torque and the input that an event trigger sent."""
-    if is_absent(command.input):
-        return command._replace(tau=sent.input)
-    return command._replace(tau=sent.torque, input=sent.input)
+    return LawUpdate(received, output, law_estimate, next_controller, next_observer, sent)
 
 
 def _euler(state: Pytree, rate: Pytree, period: jax.Array) -> Pytree:
@@ -539,34 +550,37 @@ def run_sampled_law(
       normal: standard normal numbers for the sensor, (draws, n).
       applied: as in `law_update`.
     """
-    before, sampling = state.sampled, scenario.sampling
-    assert sampling is not None
-    measured, sensor = scenario.loop.sensor.measure(state.x, normal, sampling.period, before.sensor)
+    before, sampling = state.sampled, checks.given(scenario.sampling)
+    measurement, sensor = scenario.loop.sensor.measure(
+        state.x, normal, sampling.period, before.sensor
+    )
     parts = (state.controller, state.observer, before.sent)
-    update = law_update(scenario, t, measured, *parts, applied)
-    commands = jnp.concatenate([plant_input(update.command)[None], before.commands[:-1]])
+    update = law_update(scenario, t, measurement, *parts, applied)
+    commands = jnp.concatenate([plant_input(update.output)[None], before.commands[:-1]])
     estimated = estimated_levels(
         scenario,
         discrete_observer(scenario),
         t,
-        update.reading,
-        update.measured,
+        measurement,
+        update.received,
         state.x,
         state.observer,
     )
-    signals = law_signals(update.command, update.f_hat, estimated, update.sent)
+    signals = law_signals(update.output, update.estimate, estimated, update.sent)
     return state._replace(
         controller=update.controller,
         observer=update.observer,
-        sampled=SampledState(commands, sensor, update.measured, signals, update.sent),
+        sampled=SampledState(commands, sensor, update.received, signals, update.sent),
     )
 
 
 def run_sampled_law_if_due(
-    scenario: Scenario, t: jax.Array, state: LoopState, now: Instant, noise: jax.Array
+    scenario: Scenario, t: jax.Array, state: LoopState, now: Instant, noise_key: jax.Array
 ) -> LoopState:
     """The state after `run_sampled_law` if the instant is the start of a period, else the state."""
-    normal = normals(noise, now.sample, scenario.sensor.draws, scenario.n).astype(state.x.dtype)
+    normal = normals(noise_key, now.sampling_index, scenario.sensor.draws, scenario.n).astype(
+        state.x.dtype
+    )
     return jax.lax.cond(
         now.phase == 0,
         lambda state: run_sampled_law(scenario, t, state, normal),
@@ -583,8 +597,8 @@ class PerturbedState(NamedTuple):
 
     plant: LoopState
     """The `integrated_part`."""
-    torque: jax.Array
-    """The newest command, (n,) [N m]."""
+    command: jax.Array
+    """The newest one, (n,) [N m]."""
     memory: tuple[Pytree, Pytree, Pytree]
     """States of law, observer and sensor."""
 
@@ -603,7 +617,6 @@ def perturbed_rate(
     scenario: Scenario,
     t: jax.Array,
     perturbed: LoopState | PerturbedState,
-    dt: jax.Array | None = None,
 ) -> LoopState | PerturbedState:
     """The function whose derivative linearises the loop.
 
@@ -618,17 +631,12 @@ def perturbed_rate(
       scenario: the scenario.
       t: time, () [s].
       perturbed: a `perturbed_state` at t.
-      dt: of the step, () [s]. The result does not depend on it; a caller that passes the same
-        arguments to `evaluate` elsewhere shares the traced function.
     """
     if not isinstance(perturbed, PerturbedState):
         actuator = scenario.actuator.smooth
         if actuator is not scenario.actuator:
             scenario = dataclasses.replace(scenario, actuator=actuator)
-        arguments = [scenario, t, perturbed]
-        if dt is not None:
-            arguments.append(dt)
-        return evaluate(*arguments)[0]
+        return evaluate(scenario, t, perturbed)[0]
     sampling = checks.given(scenario.sampling)
     scenario = dataclasses.replace(
         scenario,
@@ -644,7 +652,6 @@ def perturbed_rate(
     )
     normal = jnp.zeros((scenario.sensor.draws, scenario.n), t.dtype)
     after = run_sampled_law(scenario, t, state, normal)
-    weight = 0.0 if dt is None else dt
-    plant_rate = evaluate(scenario, t, state, weight, perturbed.torque)[0]
+    plant_rate = evaluate(scenario, t, state, perturbed.command)[0]
     memory = (after.controller, after.observer, after.sampled.sensor)
     return PerturbedState(plant_rate, after.sampled.commands[0], memory)

@@ -4,7 +4,7 @@ A Runge-Kutta step across a jump is of first order, whatever the method. A step 
 integrated in pieces that end where
 
     a jump time of the scenario lies in it,   t_k < t_j <= t_(k+1)   (`Scenario.jump_times`),
-    a command of a sampled law arrives in it  (`sampling.step_torques`).
+    a command of a sampled law arrives in it  (`sampling.step_commands`).
 
 A jump at the end of a step belongs to that step and is followed by a piece of length 0. The
 lengths of the pieces, this one included, depend on jump times and delays, so the derivative of the
@@ -238,7 +238,7 @@ class DividedStepResult(NamedTuple):
     """State at the end of the step."""
     aux: Any
     """What the function returned besides the rate at the start of the step."""
-    parts: list[tuple[jax.Array, list]]
+    piece_slopes: list[tuple[jax.Array, list]]
     """Length [s] of each piece, and the slopes of its stages; 0 for a piece that the step lacks."""
 
 
@@ -267,7 +267,7 @@ def integrate_pieces(
         )
 
     start = over(division.pieces[0], state)
-    state, parts = start.state, [(division.pieces[0].length, start.slopes)]
+    state, piece_slopes = start.state, [(division.pieces[0].length, start.slopes)]
     no_slopes = jax.tree.map(jnp.zeros_like, start.slopes)
 
     def skip(state):
@@ -280,5 +280,5 @@ def integrate_pieces(
             return result.state, result.slopes
 
         state, slopes = jax.lax.cond(piece.exists, integrate, skip, state)
-        parts.append((piece.length, slopes))
-    return DividedStepResult(state, start.aux, parts)
+        piece_slopes.append((piece.length, slopes))
+    return DividedStepResult(state, start.aux, piece_slopes)

@@ -92,7 +92,7 @@ class Accuracy(NamedTuple):
     """Largest position error so far, (n,) [rad]."""
     relative: jax.Array
     """Largest position error so far, relative to the width of its tube, () [1]."""
-    growth: Any = ()
+    error_growth: Any = ()
     """The `error_growth.ErrorGrowth` of a loop whose feedback is interrupted; `()` of others."""
 
 
@@ -155,7 +155,7 @@ def steps_back(method: str) -> int:
     return (len(table.differences) - 1) // _rates_per_step(table)
 
 
-def begin(method: str, jacobian: jax.Array, state: LoopState) -> Accuracy:
+def initial_accuracy(method: str, jacobian: jax.Array, state: LoopState) -> Accuracy:
     """The estimate before the first step.
 
     Args:
@@ -328,7 +328,7 @@ def local_error_of_state(
     """
 
     def flat(slope: LoopState) -> jax.Array:
-        slope = slope._replace(delayed=())
+        slope = slope._replace(command=())
         return jax.lax.stop_gradient(ravel_pytree(slope)[0])
 
     table = tableau(method)
@@ -395,6 +395,12 @@ class UnresolvedSignals(NamedTuple):
     that it causes, (n,) [rad/s^2]."""
     width: jax.Array
     """Smallest width of the tube, (n,) [rad]."""
+
+    @staticmethod
+    def zero(n: int, dtype: Any) -> UnresolvedSignals:
+        """Zeros, where no estimate is of interest."""
+        none = jnp.zeros(n, dtype)
+        return UnresolvedSignals(none, none, none)
 
 
 def unresolved_signals(

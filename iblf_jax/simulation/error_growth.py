@@ -93,9 +93,9 @@ from iblf_jax.simulation.closed_loop import (
 )
 from iblf_jax.simulation.error_estimate import RELATIVE, TOLERANCE, Accuracy
 from iblf_jax.simulation.noise import normals
-from iblf_jax.simulation.sampling import Instant, step_torques
+from iblf_jax.simulation.sampling import Instant, step_commands
 from iblf_jax.simulation.scenario import Scenario
-from iblf_jax.simulation.stability import flow, period_map
+from iblf_jax.simulation.stability import linear_flow, period_map
 
 T = TypeVar("T")
 
@@ -175,7 +175,7 @@ def _variables(scenario: Scenario, state: LoopState) -> Any:
     return integrated_part(state), memory, sampled.commands, sampled.sent
 
 
-def begin(scenario: Scenario, state: LoopState, derivative: jax.Array) -> Any:
+def initial_growth(scenario: Scenario, state: LoopState, derivative: jax.Array) -> Any:
     """The error before the first step, 0; `()` for a loop that is not interrupted.
 
     Args:
@@ -228,7 +228,7 @@ def _rows_of_levels(state: LoopState) -> list[slice]:
 # --- a step --------------------------------------------------------------------------------------
 
 
-def _moved(x: T, by: Any, factor: jax.Array) -> T:
+def _shifted(x: T, by: Any, factor: jax.Array) -> T:
     """A pytree x + factor by; leaves that are no floats stay."""
 
     def one(a: jax.Array, b: jax.Array) -> jax.Array:
@@ -252,7 +252,7 @@ def update(
     dt: jax.Array,
     index: jax.Array,
     now: Instant | None,
-    noise: jax.Array,
+    noise_key: jax.Array,
     before: LoopState,
     state: LoopState,
     local_error: jax.Array,
@@ -266,7 +266,7 @@ def update(
       dt: time step, () [s].
       index: number of the step, () int.
       now: its position between samples; None for a continuous loop.
-      noise: the key of the random numbers.
+      noise_key: key of the run's random numbers.
       before, state: the state at the start of the step, before and after the law has run.
       local_error: of the step, of the flat `integrated_part`.
       width: of the tube, (n,) [rad].
@@ -275,26 +275,26 @@ def update(
         (scenario, before, state, local_error, width)
     )
     t = index.astype(dt.dtype) * dt
-    torque_error: jax.Array | None = None
-    torque: jax.Array | None = None
+    command_error: jax.Array | None = None
+    command: jax.Array | None = None
     if now is not None:
         growth = jax.lax.cond(
             now.phase == 0,
-            lambda old: _at_sample(old, scenario, t, now, noise, before, state),
+            lambda old: _at_sample(old, scenario, t, now, noise_key, before, state),
             lambda old: old,
             growth,
         )
-        torque, torque_error = _torques(scenario, dt, now, state, growth)
+        command, command_error = _command_with_error(scenario, dt, now, state, growth)
     part = growth.error
     if now is not None:
         part = part[0]  # of the `_variables`
-    errors = (part, torque_error)
+    errors = (part, command_error)
     small, back = _scales(errors)
     base = integrated_part(state)
-    rate = _rate(scenario, t, state, base, dt, torque)
-    if torque is not None and torque_error is not None:
-        torque = torque + small * torque_error
-    shifted = _rate(scenario, t, state, _moved(base, part, small), dt, torque)
+    rate = _rate(scenario, t, state, base, command)
+    if command is not None and command_error is not None:
+        command = command + small * command_error
+    shifted = _rate(scenario, t, state, _shifted(base, part, small), command)
     flat, unflatten = ravel_pytree(part)
     grown = flat + dt * back * (ravel_pytree(shifted)[0] - ravel_pytree(rate)[0])
     rounding = jnp.finfo(dt.dtype).eps * jnp.abs(ravel_pytree(base)[0])
@@ -316,13 +316,13 @@ def rate_at_end(
     scenario: Scenario, dt: jax.Array, index: jax.Array, now: Instant | None, state: LoopState
 ) -> LoopState:
     """The rate at the end of a step of Euler's method from a state."""
-    t, torque = index.astype(dt.dtype) * dt, None
+    t, command = index.astype(dt.dtype) * dt, None
     if now is not None:
         sampling = checks.given(scenario.sampling)
-        torque = step_torques(sampling, dt, now, state.sampled.commands).torque
+        command = step_commands(sampling, dt, now, state.sampled.commands).first
     part = integrated_part(state)
-    end = _moved(part, _rate(scenario, t, state, part, dt, torque), dt)
-    return _rate(scenario, t + dt, state, end, dt, torque)
+    end = _shifted(part, _rate(scenario, t, state, part, command), dt)
+    return _rate(scenario, t + dt, state, end, command)
 
 
 def _rate(
@@ -330,28 +330,27 @@ def _rate(
     t: jax.Array,
     state: LoopState,
     part: LoopState,
-    dt: jax.Array,
-    torque: jax.Array | None,
+    command: jax.Array | None,
 ) -> LoopState:
     """The rate of the `integrated_part` of a state."""
-    arguments = () if torque is None else (torque,)
-    return evaluate(scenario, t, with_integrated_part(state, part), dt, *arguments)[0]
+    arguments = () if command is None else (command,)
+    return evaluate(scenario, t, with_integrated_part(state, part), *arguments)[0]
 
 
-def _torques(
+def _command_with_error(
     scenario: Scenario, dt: jax.Array, now: Instant, state: LoopState, growth: ErrorGrowth
 ) -> tuple[jax.Array, jax.Array]:
     """The command at the actuator at the start of a step, (n,), and its mean error over the
     step.
     """
     sampling = checks.given(scenario.sampling)
-    torque = step_torques(sampling, dt, now, state.sampled.commands).torque
+    command = step_commands(sampling, dt, now, state.sampled.commands).first
     is_cut = _rounds_readings(scenario) or _rounds_torque(scenario)
     if is_cut:
-        return torque, jnp.zeros_like(torque)
-    errors = step_torques(sampling, dt, now, growth.error[2])
-    mean = errors.arrival * errors.torque + (1.0 - errors.arrival) * errors.next
-    return torque, jnp.where(errors.arrives, mean, errors.torque)
+        return command, jnp.zeros_like(command)
+    errors = step_commands(sampling, dt, now, growth.error[2])
+    mean = errors.arrival * errors.first + (1.0 - errors.arrival) * errors.next
+    return command, jnp.where(errors.arrives, mean, errors.first)
 
 
 def _at_sample(
@@ -359,12 +358,14 @@ def _at_sample(
     scenario: Scenario,
     t: jax.Array,
     now: Instant,
-    noise: jax.Array,
+    noise_key: jax.Array,
     before: LoopState,
     state: LoopState,
 ) -> ErrorGrowth:
     """The errors after the law has run, and whether a code may differ (A.3)."""
-    normal = normals(noise, now.sample, scenario.sensor.draws, scenario.n).astype(state.x.dtype)
+    normal = normals(noise_key, now.sampling_index, scenario.sensor.draws, scenario.n).astype(
+        state.x.dtype
+    )
     if _rounds_readings(scenario):
         reaches = _reaches_code(growth.error[0].x, scenario, before, normal)
         return growth._replace(jumped=jnp.where(reaches, 1.0, growth.jumped))
@@ -404,8 +405,8 @@ def _after_law(
     small, back = _scales((part.x, memory))
 
     def law(scale: jax.Array) -> tuple[jax.Array, Any]:
-        x = _moved(before.x, part.x, scale)
-        controller, observer, sensor = _moved(states, memory, scale)
+        x = _shifted(before.x, part.x, scale)
+        controller, observer, sensor = _shifted(states, memory, scale)
         at = before._replace(x=x, controller=controller, observer=observer)
         at = at._replace(sampled=sampled._replace(sensor=sensor, sent=()))
         after = run_sampled_law(always, t, at, normal)
@@ -414,7 +415,7 @@ def _after_law(
 
     unshifted, shifted = law(jnp.zeros_like(small)), law(small)
     command = unshifted[0]
-    command_error, memory = _moved(
+    command_error, memory = _shifted(
         jax.tree.map(jnp.zeros_like, unshifted), _difference(unshifted, shifted), back
     )
     blur = ARITHMETIC * jnp.finfo(command.dtype).eps * jnp.abs(command)
@@ -578,7 +579,7 @@ def _inputs(
     plant = ravel_pytree(integrated_part(state))[0].size
     memory = len(derivative) - plant - n
     A, B = derivative[:plant, :plant], derivative[:plant, plant : plant + n]
-    by_torque = flow(A, B, sampling.period)[:, plant:]
+    by_torque = linear_flow(A, B, sampling.period)[:, plant:]
 
     def columns(plant_rows: jax.Array, memory_rows: jax.Array) -> jax.Array:
         rest = jnp.zeros((size - plant - memory, n), derivative.dtype)
@@ -612,7 +613,7 @@ def with_growth(
       bounds: of `bound`, (n,) [rad].
       width: smallest width of the tube, (n,) [rad].
     """
-    growth = accuracy.growth
+    growth = accuracy.error_growth
     of_codes = jnp.max(bounds / width)
     bounds = bounds + accuracy.error
     relative = of_codes + accuracy.relative

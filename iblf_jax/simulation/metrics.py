@@ -44,10 +44,10 @@ from iblf_jax.simulation.error_estimate import ACCURACY_UNITS
 from iblf_jax.simulation.scenario import Scenario, fit_joints
 from iblf_jax.simulation.signals import Sample as Sample
 from iblf_jax.simulation.signals import (
-    alpha_margins_above,
     has,
+    higher_alpha_margins,
+    least_higher_margins,
     least_margin,
-    least_margins_above,
     least_xi_margin,
     margin_of,
 )
@@ -357,8 +357,9 @@ class LevelMargin(Fold):
     follow, to the bounds of these levels, and the first violation.
 
     level_margin = min(x_i - lower_i, upper_i - x_i) and level_alpha_margin = min(alpha_{i-1} -
-    lower_i, upper_i - alpha_{i-1}), both continuous through zero, and infinite for a level without
-    bounds; a law that follows an alpha_{i-1} outside the bounds cannot keep them.
+    lower_i, upper_i - alpha_{i-1}) have one row a level, the first of them for level 3.  Both are
+    continuous through zero, and infinite for a level without bounds; a law that follows an
+    alpha_{i-1} outside the bounds cannot keep them.
     first_level_violation_time is infinite, first_level_violation_level (counted from 1) and
     first_level_violation_component (from 0) are -1 on a run that keeps them.  Only for scenarios
     with bounds of such levels, whose runs carry it by default.
@@ -371,7 +372,7 @@ class LevelMargin(Fold):
         "first_level_violation_level": "1",
         "first_level_violation_component": "1",
     }
-    needs: ClassVar[str] = "level_lower"
+    needs: ClassVar[str] = "higher_lower"
 
     def init(self, sample: Sample) -> _MarginState:
         """Infinitely far from the bounds."""
@@ -406,8 +407,8 @@ def _level_margins(sample: Sample) -> list[jax.Array]:
         missing = len(sample.x) - 2 - len(margins)
         return jnp.pad(margins, ((0, missing), (0, 0)), constant_values=jnp.inf)
 
-    of_alphas = alpha_margins_above(sample)
-    found = [for_all_levels(least_margins_above(sample))]
+    of_alphas = higher_alpha_margins(sample)
+    found = [for_all_levels(least_higher_margins(sample))]
     return found if of_alphas is None else [*found, for_all_levels(of_alphas)]
 
 
@@ -745,10 +746,6 @@ class SignalSource(NamedTuple):
     """Whether a scenario has it."""
 
 
-def _has_bounds_above_second(scenario: Scenario) -> bool:
-    return any(bounds is not None for bounds in scenario.bounds[2:])
-
-
 def _has_filter(scenario: Scenario) -> bool:
     return any(law.filters for law in layers(scenario.controller))
 
@@ -762,7 +759,10 @@ SIGNAL_SOURCES = {
         "bounds of the second level, such as bounds=(positions, velocities)",
         lambda scenario: scenario.bounds[1] is not None,
     ),
-    "level_lower": SignalSource("bounds of a level from the third on", _has_bounds_above_second),
+    "higher_lower": SignalSource(
+        "bounds of a level from the third on",
+        lambda scenario: any(bounds is not None for bounds in scenario.bounds[2:]),
+    ),
     "region_margin": SignalSource(
         "regions, such as (ij.regions.HalfSpace(normal=[0, 1], offset=0.1),)",
         lambda scenario: bool(scenario.regions),

@@ -20,7 +20,6 @@ from iblf_jax.simulation.discontinuities import Piece
 from iblf_jax.simulation.integrators import STOCHASTIC, TABLEAUS, tableau
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import Sample
-from iblf_jax.world.robots import Dynamics
 
 NOISE_NAME = "noise"
 """Name of the noise key among the replaced values of a run; no leaf of a scenario has this name."""
@@ -50,18 +49,13 @@ def noise_key(key: jax.Array, run: int | jax.Array = 0) -> jax.Array:
     return jax.random.bits(own, (4,), jnp.uint16).astype(jnp.float32)
 
 
-def has_sensor_noise(scenario: Scenario) -> bool:
-    """Whether the sensor of a scenario draws noise."""
-    return scenario.sampling is not None and scenario.sensor.draws > 0
-
-
 def has_noise(scenario: Scenario) -> bool:
     """Whether a run of a scenario draws random numbers: noise of the sensor, process noise, or
     switching times.
     """
     if scenario.process_noise is not None or scenario.plant.mode_draws:
         return True
-    return has_sensor_noise(scenario)
+    return scenario.sampling is not None and scenario.sensor.draws > 0
 
 
 def needs_key(scenario: Scenario) -> bool:
@@ -350,11 +344,7 @@ def realised(scenario: Scenario, key: jax.Array) -> Scenario:
     words = _words(key, MODES_STREAM)
     numbers = jnp.arange(draws, dtype=jnp.int32)
     pairs = jax.vmap(lambda k: jnp.stack(_uniforms(words, jnp.int32(0), k, dtype)))(numbers)
-    return _with_plant(scenario, scenario.plant.with_path(pairs))
-
-
-def _with_plant(scenario: Scenario, plant: Dynamics) -> Scenario:
-    """A copy with another plant, without checks: its numbers may be traced."""
+    # A copy without checks, because the numbers may be traced.
     new = copy.copy(scenario)
-    object.__setattr__(new, "plant", plant)
+    object.__setattr__(new, "plant", scenario.plant.with_path(pairs))
     return new

@@ -172,7 +172,7 @@ def commands_in_transit(delay: float, period: float) -> int:
 class Instant(NamedTuple):
     """Position of an instant between samples."""
 
-    sample: jax.Array
+    sampling_index: jax.Array
     """Number of the last sample, () int."""
     phase: jax.Array
     """Steps since its start, () int."""
@@ -190,10 +190,10 @@ def instant(sampling: Sampling, dt: jax.Array, index: jax.Array) -> Instant:
     return Instant(sample, index - sample * steps)
 
 
-class StepTorques(NamedTuple):
-    """The torques of a step, (n,) each [N m], and the time of the change between them."""
+class StepCommands(NamedTuple):
+    """The commands of a step, (n,) each [N m], and the time of the change between them."""
 
-    torque: jax.Array
+    first: jax.Array
     """From the start of the step."""
     next: jax.Array
     """From the arrival of the next command."""
@@ -203,13 +203,13 @@ class StepTorques(NamedTuple):
     """Whether a command arrives in the step or at its end, () bool."""
 
 
-def step_torques(
+def step_commands(
     sampling: Sampling, dt: jax.Array, now: Instant, commands: jax.Array
-) -> StepTorques:
-    """The torques of a step, within which the torque may change once.
+) -> StepCommands:
+    """The commands at the actuator in a step, within which they may change once.
 
-    A command that arrives at the end of a step belongs to that step, so that its torque has a
-    derivative by the delay there, too.
+    A command that arrives at the end of a step belongs to that step, so that it has a derivative by
+    the delay there, too.
 
     Args:
       sampling: the period and the delay.
@@ -218,15 +218,14 @@ def step_torques(
       commands: newest first, (queue + 1, n) [N m].
     """
     if sampling.queue == 0:
-        one = jnp.ones_like(dt)
-        # Only commands without a delay fit in an empty queue: any delay counts as too large an age.
-        torque = _if_consistent(sampling, dt, sampling.delay, commands[0])
-        return StepTorques(torque, commands[0], one, one < 0)
+        # Only commands without a delay fit in an empty queue.
+        first = _if_consistent(sampling, dt, sampling.delay <= 0, commands[0])
+        return StepCommands(first, commands[0], jnp.ones_like(dt), jnp.zeros((), bool))
     age, arrival, arrives = _arrival(sampling, dt, now.phase)
     old = command_at(commands, age)
     new = command_at(commands, age - 1.0)
-    torque = _if_consistent(sampling, dt, age, old)
-    return StepTorques(torque, new, jnp.where(arrives, arrival, 1.0), arrives)
+    first = _if_consistent(sampling, dt, age <= sampling.queue, old)
+    return StepCommands(first, new, jnp.where(arrives, arrival, 1.0), arrives)
 
 
 def _arrival(
@@ -263,10 +262,10 @@ def arrival_before(
     return arrival * dt, arrives
 
 
-def torque_before(
+def command_before(
     sampling: Sampling, dt: jax.Array, before: jax.Array, after: jax.Array
 ) -> jax.Array:
-    """The active torque just before a sample, (n,) [N m].
+    """The active command just before a sample, (n,) [N m].
 
     Args:
       sampling: the period and the delay.
@@ -283,14 +282,14 @@ def torque_before(
 
 
 def _if_consistent(
-    sampling: Sampling, dt: jax.Array, age: jax.Array, torque: jax.Array
+    sampling: Sampling, dt: jax.Array, fits: jax.Array, command: jax.Array
 ) -> jax.Array:
-    """The torque; NaN where its command left the queue before it arrived, or where a period is not
-    a whole number of steps.
+    """The command; NaN where it does not fit in the queue until it arrives, or where a period is
+    not a whole number of steps.
     """
     steps = sampling.period / dt
     is_whole = jnp.abs(steps - _steps(sampling, dt)) <= PERIOD_TOLERANCE * steps
-    return jnp.where((age <= sampling.queue) & is_whole, torque, jnp.nan)
+    return jnp.where(fits & is_whole, command, jnp.nan)
 
 
 def command_at(commands: jax.Array, position: jax.Array) -> jax.Array:

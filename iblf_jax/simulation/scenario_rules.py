@@ -620,7 +620,7 @@ START = (
 class BoundedLevel(NamedTuple):
     """A level of a plant at the start, from the second one on, with its bounds."""
 
-    level: int
+    level_index: int
     """From 0, as in a path."""
     noun: str
     x: jax.Array
@@ -631,14 +631,14 @@ class BoundedLevel(NamedTuple):
 
 BOUNDED_LEVEL = (
     Rule(
-        "bounds[{s.level}] of {s.noun} {i}",
+        "bounds[{s.level_index}] of {s.noun} {i}",
         lambda s: _crossed(s.bounds, s.limits),
         ORDERED,
         "{remedy}",
     ),
     Rule(
-        "initial.x[{s.level}][{i}]",
-        lambda s: _outside(s.x, s.limits, f"bounds of level {s.level + 1}"),
+        "initial.x[{s.level_index}][{i}]",
+        lambda s: _outside(s.x, s.limits, f"bounds of level {s.level_index + 1}"),
         INSIDE,
         MOVE_START + "{s.without_dq}",
     ),

@@ -1,4 +1,8 @@
-"""The signals of a closed loop, with the only list of their names, units and meanings."""
+"""The signals of a closed loop, with the only list of their names, units and meanings.
+
+To add a signal: a field here and its value in `closed_loop.sample_at`; a law's signal also in
+`Command` and `LawSignals`; figures show it by `LEVEL_PARTS`.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +25,8 @@ from iblf_jax.core.units import (
 )
 
 PER_LEVEL = ("level", "joint")
-"""Dimensions of a signal or metric with one row per level of the plant."""
+"""Dimensions of a signal or metric with one row per level of the plant, up to the last level that
+has a value."""
 PER_MODEL_LEVEL = ("model_level", "joint")
 """With one row per level of the model, which has fewer where a robot is the model of a plant of
 higher order."""
@@ -38,6 +43,8 @@ class Recorded(NamedTuple):
     meaning: str
     dimensions: tuple[str, ...] = ()
     """At an instant, where they are others than one number a joint."""
+    missing: float | None = None
+    """Value of the rows that a run lacks, for a signal of the levels that may have fewer rows."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -56,12 +63,22 @@ class Signals:
     """Inside the bounds if |xi| < 1."""
     q_d: Annotated[Array, Recorded(POSITION, "reference position")]
     dq_d: Annotated[Array, Recorded(VELOCITY, "reference velocity")]
-    level_lower: Annotated[Array, Recorded(LEVELS, "lower bounds of the levels", PER_LEVEL)]
-    """Up to the last level with bounds, -infinity for one without."""
-    level_upper: Annotated[Array, Recorded(LEVELS, "upper bounds of the levels", PER_LEVEL)]
+    level_lower: Annotated[
+        Array, Recorded(LEVELS, "lower bounds of the levels", PER_LEVEL, missing=-float("inf"))
+    ]
+    """Of the levels from the first to the last one with bounds, (m, n); -infinity for one
+    without."""
+    level_upper: Annotated[
+        Array, Recorded(LEVELS, "upper bounds of the levels", PER_LEVEL, missing=float("inf"))
+    ]
     alpha: Annotated[Array, Recorded(VELOCITY, "virtual velocity")]
-    """The virtual control of the second level; those of others are x_i - e_i."""
-    disturbance: Annotated[Array, Recorded(UNCERTAIN, "lumped uncertain term f", PER_LEVEL)]
+    """alpha_1, the virtual control of level 2; alpha_{i-1} = x_i - e_i for rows that `e` has."""
+    disturbance: Annotated[
+        Array,
+        Recorded(
+            UNCERTAIN, "lumped disturbance f: disturbance, friction and model error", PER_LEVEL
+        ),
+    ]
     """Of (2.1), (n,); of a model in strict-feedback form d of (S.1), (r, n)."""
     disturbance_estimate: Annotated[
         Array, Recorded(UNCERTAIN, "estimate of the uncertain term", PER_LEVEL)
@@ -124,16 +141,23 @@ class Signals:
     @property
     def dq_lower(self) -> Any:
         """The lower bound of the second level, (n,); `()` where only the first level has bounds."""
-        return self.level_lower[..., 1, :] if has_bounds_above(self) else ()
+        return self.level_lower[..., 1, :] if has_velocity_level_bounds(self) else ()
 
     @property
     def dq_upper(self) -> Any:
         """As `dq_lower`."""
-        return self.level_upper[..., 1, :] if has_bounds_above(self) else ()
+        return self.level_upper[..., 1, :] if has_velocity_level_bounds(self) else ()
+
+    @property
+    def higher_lower(self) -> Any:
+        """The lower bounds of the levels from the third on, (m - 2, n); `()` where none of them has
+        bounds.
+        """
+        return self.level_lower[..., 2:, :] if self.level_lower.shape[-2] > 2 else ()
 
 
-def has_bounds_above(sample: Signals) -> bool:
-    """Whether a level above the first has bounds."""
+def has_velocity_level_bounds(sample: Signals) -> bool:
+    """Whether the second level, or one above it, has bounds."""
     return sample.level_lower.shape[-2] > 1
 
 
@@ -168,8 +192,8 @@ class Sample(Signals):
     """The loop at one instant: the recorded signals, and further ones that metrics use."""
 
     dt: Array
-    """Weight of this sample in an integral over time, sum dt g, () [s]; `step` is the time since
-    the instant before.
+    """Weight of the sample in an integral over time, sum dt g, () [s]; `step` is the time since the
+    instant before.
 
     The weights are those of the trapezoidal rule: the step, and half of it for the first and the
     last sample.  Where signals jump there are two samples of one time, the limits from either side,
@@ -226,14 +250,14 @@ def margin_of(sample: Sample, level: int, value: Array) -> Array:
     return jnp.minimum(value - sample.level_lower[i], sample.level_upper[i] - value)
 
 
-def least_margins_above(sample: Sample) -> Array:
-    """`least_margin` of the levels from the third to the last one with bounds, (m, n)."""
+def least_higher_margins(sample: Sample) -> Array:
+    """`least_margin` of the levels from the third to the last one with bounds, (m - 2, n)."""
     levels = range(3, len(sample.level_lower) + 1)
     return jnp.stack([least_margin(sample, level) for level in levels])
 
 
-def alpha_margins_above(sample: Sample) -> Array | None:
-    """`margin_of` the virtual controls for these levels, (m, n); None under a law without."""
+def higher_alpha_margins(sample: Sample) -> Array | None:
+    """`margin_of` the virtual controls for these levels, (m - 2, n); None under a law without."""
     levels = range(3, len(sample.level_lower) + 1)
     _, *alphas = virtual_controls(sample)
     if not alphas:
@@ -255,7 +279,7 @@ SIGNALS: dict[str, Recorded] = {
     },
     **{name: view.recorded for name, view in VIEWS.items()},
 }
-"""Name of a signal -> its unit and meaning, time first."""
+"""Name of a signal -> what is known of it, time first."""
 
 METRIC_DIMENSIONS = {
     "estimate_rmse": PER_LEVEL,

@@ -223,7 +223,7 @@ def jacobian(scenario: Scenario, t: jax.Array, state: LoopState) -> jax.Array:
     return resolved_jacobian(by_size, scenario.sampling is not None)
 
 
-def flow(A: jax.Array, B: jax.Array, t: jax.Array) -> jax.Array:
+def linear_flow(A: jax.Array, B: jax.Array, t: jax.Array) -> jax.Array:
     """The flow of x' = A x + B u over a time t with a constant u: the derivative of x(t) by x(0)
     and by u, (m, m + n) for A (m, m) and B (m, n).
     """
@@ -301,12 +301,14 @@ def _plant_over_period(
     """
     plant = len(A)
     if not sampling.queue:
-        by_state, by_torque = jnp.split(flow(A, B, sampling.period), [plant], axis=1)
+        by_state, by_torque = jnp.split(linear_flow(A, B, sampling.period), [plant], axis=1)
         return by_state, [by_torque]
     # The delay is a number of periods and a rest; the torque changes once a period, after the rest.
     periods = jnp.floor(sampling.delay / sampling.period + 1e-9)
     rest = jnp.maximum(sampling.delay - periods * sampling.period, 0.0)
-    before, after = jax.lax.map(partial(flow, A, B), jnp.stack([rest, sampling.period - rest]))
+    before, after = jax.lax.map(
+        partial(linear_flow, A, B), jnp.stack([rest, sampling.period - rest])
+    )
     after, by_later = after[:, :plant], after[:, plant:]
     by_state, by_earlier = jnp.split(matmul_in_order(after, before), [plant], axis=1)
     by_command = [
@@ -342,7 +344,7 @@ def continuous_map(scenario: Scenario, state: LoopState, derivative: jax.Array) 
     unchanged = jnp.eye(len(x), dtype=derivative.dtype)[plant:]
     memory_rate = (derivative[plant + n :, x] - unchanged) / sampling.period
     rate = jnp.concatenate([plant_rate, memory_rate])
-    return flow(rate, jnp.zeros((len(x), 0), rate.dtype), sampling.period)
+    return linear_flow(rate, jnp.zeros((len(x), 0), rate.dtype), sampling.period)
 
 
 def growth_by_sampling(radius: Any, continuous_radius: Any, period: Any) -> Any:

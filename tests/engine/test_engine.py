@@ -19,7 +19,7 @@ from iblf_jax.core.status import Status
 from iblf_jax.engine import compile, native, plan, registry, thresholds
 from iblf_jax.engine.batch import Batch, run_all
 from iblf_jax.engine.carry import Inputs
-from iblf_jax.engine.loops import checkpointed, kernel_loop, scan
+from iblf_jax.engine.loops import checkpointed, kernel_stepper, scan
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.simulation import stability
 from iblf_jax.simulation.integrators import TABLEAUS, Tableau
@@ -109,7 +109,7 @@ def test_any_explicit_method_is_a_row_of_the_table(short_loop, monkeypatch):
     assert_same(written_out, outcome(inputs, run, loop=ROLLED))
     if native.unavailable() is None:
         start = {"initial.q": inputs.scenario.initial.q[None]}
-        lowered = outcome(inputs, run, varied=start, loop=kernel_loop(registry.NATIVE))
+        lowered = outcome(inputs, run, varied=start, loop=kernel_stepper(registry.NATIVE))
         assert_same(jax.tree.map(lambda x: x[0], lowered), written_out)
     off = np.max(
         np.abs(

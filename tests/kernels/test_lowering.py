@@ -17,7 +17,7 @@ import iblf_jax as ij
 from iblf_jax.core.caches import CACHE
 from iblf_jax.engine import RunRequest, compile, execute, thresholds
 from iblf_jax.engine.batch import Batch, carry_shapes
-from iblf_jax.engine.carry import Inputs, StepOptions, start
+from iblf_jax.engine.carry import Inputs, StepOptions, initial_carry
 from iblf_jax.engine.loops import program_of
 from iblf_jax.engine.time_step import TimeStep
 from iblf_jax.kernels import passes, program
@@ -153,7 +153,7 @@ def carry_of(inputs, varied, method):
         jacobian = 0.1 * jnp.cos(jnp.arange(1.0, 1.0 + size * size, dtype=inputs.dt.dtype)).reshape(
             size, size
         )
-        return start(inputs, method, jacobian - jnp.eye(size, dtype=inputs.dt.dtype))
+        return initial_carry(inputs, method, jacobian - jnp.eye(size, dtype=inputs.dt.dtype))
 
     return Batch.of(inputs, varied).map_runs(one)
 

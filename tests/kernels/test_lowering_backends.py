@@ -22,7 +22,7 @@ import iblf_jax as ij
 from iblf_jax.core.caches import CACHE
 from iblf_jax.engine import RunRequest, compile, execute, loops, native, registry, thresholds
 from iblf_jax.engine.batch import Batch
-from iblf_jax.engine.carry import Inputs, start
+from iblf_jax.engine.carry import Inputs, initial_carry
 from iblf_jax.engine.time_step import TimeStep
 from iblf_jax.kernels import cpu, directory, packed, toolchain
 from iblf_jax.kernels.toolchain import ToolchainError
@@ -94,7 +94,7 @@ def recorded_steps():
 
     def steps(loop, values):
         batch = Batch.of(inputs, values)
-        carry = batch.map_runs(lambda inputs: start(inputs, "euler", jnp.zeros((6, 6))))
+        carry = batch.map_runs(lambda inputs: initial_carry(inputs, "euler", jnp.zeros((6, 6))))
         return loop(step, batch, carry, 40, 5)
 
     values = {k: jnp.asarray(v) for k, v in draws(19).items()}
@@ -114,7 +114,7 @@ def test_every_compiler_gives_the_same_numbers(tmp_path, monkeypatch, recorded_s
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     steps, values, expected = recorded_steps
     cpu.kernel.cache_clear()
-    compiled = jax.jit(partial(steps, loops.kernel_loop(registry.NATIVE)))
+    compiled = jax.jit(partial(steps, loops.kernel_stepper(registry.NATIVE)))
     found = jax.tree.map(np.asarray, compiled(values))
     assert_same(found, jax.tree.map(np.asarray, expected), 1e-12)
     fewer = jax.tree.map(np.asarray, compiled({k: v[2:] for k, v in values.items()}))

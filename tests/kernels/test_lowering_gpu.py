@@ -29,7 +29,7 @@ from iblf_jax.engine import RunRequest, compile, execute, gpu, registry, thresho
 from iblf_jax.engine.batch import Batch
 from iblf_jax.engine.carry import Inputs
 from iblf_jax.engine.derivatives import Directions, run_with_tangents
-from iblf_jax.engine.loops import kernel_loop, program_of
+from iblf_jax.engine.loops import kernel_stepper, program_of
 from iblf_jax.engine.time_step import TimeStep
 from iblf_jax.kernels import nvrtc
 from iblf_jax.kernels.emit_c import CUDA, source
@@ -260,7 +260,7 @@ def test_forward_sensitivities(paper):
     along = Directions.of({"controller.K2": np.eye(3, 2), "observer.kf": np.eye(3, 2, -1)})
     varied = {k: jnp.asarray(v) for k, v in draws(3).items()}
     inputs, run = Inputs(scenario, standard()[:1], dt, jnp.asarray(60.0)), RunRequest(60, "euler")
-    loop = kernel_loop(registry.GPU._replace(run=run_program))
+    loop = kernel_stepper(registry.GPU._replace(run=run_program))
     numbers = {path: np.reshape(x, shape) for path, shape, x in along.items}
     pushed = jax.jit(lambda v: run_with_tangents(loop, Batch.of(inputs, v), along, run))(varied)
     by_scan = run._replace(backend="vmap")

@@ -230,11 +230,11 @@ def test_the_bounds_are_those_of_the_worst_and_of_random_rounding_errors():
     scenario = canonical(LOOPS["both"]())
     state = initial_state(scenario)
     derivative = stability.jacobian(scenario, jnp.zeros(()), state)
-    growth = error_growth.begin(scenario, state, derivative)
+    growth = error_growth.initial_growth(scenario, state, derivative)
     plant = ravel_pytree(integrated_part(state))[0].size
     Phi = np.asarray(stability.period_map(scenario, state, derivative))
     A, B = derivative[:plant, :plant], derivative[:plant, plant : plant + 2]
-    by_torque = np.asarray(stability.flow(A, B, scenario.sampling.period))[:, plant:]
+    by_torque = np.asarray(stability.linear_flow(A, B, scenario.sampling.period))[:, plant:]
     law = np.asarray(derivative[plant:, :2])
     by_reading = np.concatenate([by_torque @ law[:2], law[2:]]) * 2 * np.pi / 1024
     by_level = np.concatenate([by_torque, np.zeros_like(law[2:])]) * 1.5
@@ -264,7 +264,7 @@ def test_the_bound_covers_the_longest_run(periods):
     scenario = canonical(LOOPS["quantiser"]())
     state = initial_state(scenario)
     derivative = jnp.zeros_like(stability.jacobian(scenario, jnp.zeros(()), state))
-    growth = error_growth.begin(scenario, state, derivative)
+    growth = error_growth.initial_growth(scenario, state, derivative)
     plant = ravel_pytree(integrated_part(state))[0].size
     derivative = derivative.at[:2, plant : plant + 2].set(jnp.eye(2))
     found = error_growth.bound(scenario, growth, state, derivative, jnp.asarray(periods))
@@ -275,7 +275,7 @@ def test_a_bound_that_overflows_is_infinite():
     scenario = canonical(LOOPS["quantiser"]())
     state = initial_state(scenario)
     derivative = stability.jacobian(scenario, jnp.zeros(()), state)
-    growth = error_growth.begin(scenario, state, derivative)
+    growth = error_growth.initial_growth(scenario, state, derivative)
     derivative = derivative + 100.0 * jnp.eye(len(derivative))
     found = error_growth.bound(scenario, growth, state, derivative, jnp.asarray(1e6))
     assert np.all(np.isposinf(found))
@@ -320,7 +320,7 @@ def test_the_error_of_the_held_command_moves_the_threshold(distance, jumped):
     scenario = canonical(sampled(trigger=ij.EventTrigger(relative=0.5)))
     state = initial_state(scenario)
     zero = jnp.zeros(())
-    growth = error_growth.begin(scenario, state, jnp.eye(1))
+    growth = error_growth.initial_growth(scenario, state, jnp.eye(1))
     part, *others = growth.error
     growth = growth._replace(error=(part._replace(x=part.x.at[0].set(1e-6)), *others))
     normal = jnp.zeros(scenario.sensor.draws)
