@@ -36,7 +36,6 @@ from iblf_jax.simulation.delays import initial_commands
 from iblf_jax.simulation.levels import (
     EstimatedLevels,
     completed,
-    estimate,
     estimated_levels,
     has_speed_limits,
     motion,
@@ -173,7 +172,7 @@ def _initial_sampled_state(scenario: Scenario, state: LoopState, tau: jax.Array)
     sampling = checks.given(scenario.sampling)
     loop, x = scenario.loop, state.x
     x_model, t = x[: loop.model.order], jnp.zeros_like(x[0, 0])
-    f_hat = jax.eval_shape(partial(estimate, scenario, loop.observer), t, x_model, state.observer)
+    f_hat = jax.eval_shape(loop.observer.estimate, t, x_model, loop.model, state.observer)
     command, _ = jax.eval_shape(
         loop.law.command, t, x_model, f_hat, scenario.context, state.controller
     )
@@ -247,7 +246,7 @@ def evaluate(
     observer_rate: Pytree = ()
     undelayed: jax.Array | Absent = ()
     if scenario.sampling is None:
-        f_hat = estimate(scenario, loop.observer, t, x_model, state.observer)
+        f_hat = loop.observer.estimate(t, x_model, loop.model, state.observer)
         true = measurement_of(x)
         measured = completed(scenario, loop.observer, t, true, state.observer)
         answer, controller_rate = loop.law.command(
@@ -494,7 +493,7 @@ def law_update(
     loop = scenario.loop
     law, model = loop.law, loop.model
     x = measured.x[: model.order]
-    f_hat = estimate(scenario, running, t, x, observer)
+    f_hat = running.estimate(t, x, model, observer)
     command, controller_rate = law.command(t, x, f_hat, scenario.context, controller)
     if sampling.trigger is not None:
         assert not is_absent(sent)

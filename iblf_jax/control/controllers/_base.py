@@ -23,6 +23,7 @@ from iblf_jax.core import checks, families
 from iblf_jax.core.families import attribute
 from iblf_jax.core.pytree import Leaf, component, layers, wrapped_field
 from iblf_jax.core.time import Timed
+from iblf_jax.world import plants
 from iblf_jax.world.bounds import Bounds, Tube, speed_limits_at, tube_at
 from iblf_jax.world.references import Reference
 from iblf_jax.world.regions import Along, Region, along
@@ -138,6 +139,8 @@ class TrackingLaw(Timed):
     in (`engine.structural_constants`)."""
     uses_observer: ClassVar[bool] = True
     """Whether it uses f_hat."""
+    needs_robot: ClassVar[bool] = False
+    """Whether its model must be a robot."""
     needs_velocity_bounds: ClassVar[bool] = False
     """Whether it requires bounds of the second level, `LawContext.bounds[1]`."""
     includes_e2: ClassVar[bool] = False
@@ -283,6 +286,8 @@ class RobotLaw(TrackingLaw):
     A law with a proof of its own is a `LyapunovLaw`; then `certify` checks what it states.
     """
 
+    needs_robot = True
+
     @abc.abstractmethod
     def init(self, q: jax.Array, dq: jax.Array, context: LawContext) -> State:
         """State at the start of a run, given q [rad] and dq [rad/s] there; `()` for most laws."""
@@ -400,11 +405,12 @@ class LawOfRobot(Law):
     def command(
         self, t: jax.Array, x: jax.Array, d_hat: jax.Array, context: LawContext, state: State
     ) -> tuple[Command, State]:
-        """Command of the law."""
+        """Command of the law, which receives the estimate as the torque f_hat."""
+        f_hat = plants.as_plant(context.model).as_uncertain(x, d_hat)
         # One array for each level: robots test whether two velocities are the same object.
         q, dq = x[0], x[1]
         with _explained_for_wrappers(self.law):
-            return self.law.command(t, q, dq, d_hat, context, state)
+            return self.law.command(t, q, dq, f_hat, context, state)
 
     def switching(
         self, t: jax.Array, x: jax.Array, d_hat: jax.Array, context: LawContext, state: State

@@ -504,9 +504,7 @@ def _dependence(
     """Derivatives by the parameters at both ends of their box and in its middle: of the torque, (3,
     POINTS, n, p), and of virtual controls, V1 and the slope of V, (3, POINTS, m, p).
     """
-    estimate = jnp.zeros_like(x[0, 0])
-    if isinstance(law.law, Law):
-        estimate = jnp.zeros_like(x[0])
+    estimate = jnp.zeros(plants.as_plant(context.model).estimate_shape, x.dtype)
 
     def outputs(theta, t, x):
         changed = law._with_parameters(context, theta)

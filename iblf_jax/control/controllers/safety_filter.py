@@ -48,6 +48,7 @@ from iblf_jax.core import checks
 from iblf_jax.core.linalg import matmul, matvec, solve_spd
 from iblf_jax.core.pytree import Leaf, component, leaf, static
 from iblf_jax.core.qp import Solution, quadratic_program
+from iblf_jax.world import plants
 from iblf_jax.world.bounds import bounds_at
 
 NEAREST = ("torque", "acceleration")
@@ -99,6 +100,7 @@ class SafetyFilter(Wrapping):
     shape2: str = static(default="linear")
     margin: Leaf = leaf("rad/s^2", sign="nonnegative", default=None)
     filters: ClassVar[bool] = True
+    needs_robot: ClassVar[bool] = True
 
     def check(self) -> None:
         """Raises ValueError for something that is not a law, or an unknown measure."""
@@ -150,8 +152,9 @@ class SafetyFilter(Wrapping):
         q, dq = x[0], x[1]
         command, rate = self.inner.command(t, x, d_hat, context, state)
         model, tau_law = context.model, command.tau
+        f_hat = plants.as_plant(model).as_uncertain(x, d_hat)
         M = model.mass_matrix(q)
-        nominal = solve_spd(M, tau_law + d_hat - model.coriolis(q, dq, dq) - model.gravity(q))
+        nominal = solve_spd(M, tau_law + f_hat - model.coriolis(q, dq, dq) - model.gravity(q))
         lowest, highest = self.box(t, q, dq, context)
         if self.nearest == "acceleration" and self.limit is None and not context.regions:
             # An empty box is violated equally on both sides.

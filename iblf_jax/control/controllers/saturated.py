@@ -1,8 +1,9 @@
 """Actuator limits around any law, without and with an auxiliary state; the paper leaves them to
 future work.
 
-The loop passes the applied torque to observer and plant, so the observer estimates f without the
-torque that was cut.
+The loop passes the input that the law commands, after the limits of `Saturated`, to observer and
+actuator, so that the observer estimates f without the torque that was cut.  Lag, delay and faults
+of an actuator are not in it.
 
 **Auxiliary state.**  The level of the input, x_r, has the rate f_r + G_r sat(u) + d_r.  With
 

@@ -1,9 +1,10 @@
 """The contract of a disturbance observer.
 
-An observer knows the model, measures q and q' or all levels x, receives the applied input and
+An observer knows the model, measures q and q' or all levels x, and receives the input that the law
+commands, after the limits of `Saturated`; lag, delay and faults of an actuator are not in it.  It
 returns an estimate of what its model does not contain: of the torque f of (2.1), or of the rates d
-of (S.1).  Its state is part of the loop's state
-and is integrated with the plant; in a sampled loop it goes from one period to the next.
+of (S.1).  Its state is part of the loop's state and is integrated with the plant; in a sampled loop
+it goes from one period to the next.
 """
 
 from __future__ import annotations
@@ -94,7 +95,9 @@ class Observer(DisturbanceObserver):
     def derivative(
         self, t: jax.Array, x: jax.Array, u: jax.Array, model: Plant, state: State
     ) -> State:
-        """Rate of the state, given the input u, (n,), that was applied (after any saturation)."""
+        """Rate of the state, given the input u, (n,), that the law commands, after the limits of
+        `Saturated`.
+        """
 
     def advance(
         self,
@@ -142,8 +145,8 @@ class RobotObserver(DisturbanceObserver):
     def derivative(
         self, t: jax.Array, q: jax.Array, dq: jax.Array, tau: jax.Array, model: Robot, state: State
     ) -> State:
-        """Rate of the state, given the torque `tau` (n,) [N m] that was applied (after any
-        saturation).
+        """Rate of the state, given the torque `tau` (n,) [N m] that the law commands, after the
+        limits of `Saturated`.
         """
 
     def advance(
