@@ -45,7 +45,6 @@ from iblf_jax.control.controllers._base import law_of_x, layers_with_states, pos
 from iblf_jax.core.linalg import matvec, solve_spd
 from iblf_jax.core.pytree import layers, unwrapped
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, plant_input, rate
-from iblf_jax.simulation.levels import estimate
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import Sample, margin_of
 from iblf_jax.world import plants
@@ -405,7 +404,7 @@ def _arguments(
     order = loop.model.order
 
     def estimated(t: jax.Array, state: LoopState) -> jax.Array:
-        return estimate(scenario, loop.observer, t, state.x[:order], state.observer)
+        return loop.observer.estimate(t, state.x[:order], loop.model, state.observer)
 
     found, rates = jax.jvp(estimated, (t, state), (jnp.ones_like(t), state_rate))
     at = Arguments(t, state.x[:order], found, state.controller)

@@ -25,7 +25,7 @@ from iblf_jax.core.pytree import Leaf, component, is_absent, leaf
 from iblf_jax.engine import LOWERING_LIMITS
 from iblf_jax.kernels import Program, Shapes, compile_step, written_out
 from iblf_jax.simulation.closed_loop import discrete_observer, law_update, plant_input
-from iblf_jax.simulation.levels import start_levels
+from iblf_jax.simulation.levels import start_levels, steady_input
 from iblf_jax.simulation.sampling import SentCommand, nothing_sent
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.world import plants
@@ -143,9 +143,7 @@ def start(scenario: Scenario, inputs: SampleInputs) -> tuple[LawState, jax.Array
     filtered = tuple(
         velocity.init(x[row - 1], x[row], period) for row, velocity in velocity_filters(scenario)
     )
-    balance = loop.model.steady_input(x[0])
-    if balance is None:
-        balance = jnp.zeros_like(x[0])
+    balance = steady_input(scenario, x[0])
     sent: SentCommand | tuple[()] = ()
     if scenario.sampling.trigger is not None:  # type: ignore[union-attr]
         sent = nothing_sent(balance)

@@ -44,7 +44,6 @@ from iblf_jax.control.controllers import Law
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.simulation.closed_loop import LoopState
 from iblf_jax.simulation.integrators import StepResult, stage_states, tableau
-from iblf_jax.simulation.levels import estimate
 from iblf_jax.simulation.scenario import Scenario
 
 T = TypeVar("T")
@@ -147,7 +146,7 @@ def surfaces(scenario: Scenario, t: jax.Array, state: LoopState) -> jax.Array | 
     # Switching functions of laws of robots do not depend on the estimate.
     d_hat = jnp.zeros(loop.model.estimate_shape, x.dtype)
     if isinstance(unwrapped(scenario.controller), Law):
-        d_hat = estimate(scenario, loop.observer, t, x, state.observer)
+        d_hat = loop.observer.estimate(t, x, loop.model, state.observer)
     return loop.law.switching(t, x, d_hat, scenario.context, state.controller)
 
 

@@ -36,13 +36,12 @@ from iblf_jax.core.pytree import Absent, Pytree, is_absent, unwrapped
 from iblf_jax.simulation.delays import initial_commands
 from iblf_jax.simulation.levels import (
     EstimatedLevels,
-    completed,
-    estimate,
     estimated_levels,
     has_speed_limits,
     motion,
     start_levels,
     steady_input,
+    with_estimates,
 )
 from iblf_jax.simulation.noise import normals
 from iblf_jax.simulation.sampling import Instant, SentCommand, nothing_sent
@@ -182,9 +181,7 @@ def _initial_sampled_state(scenario: Scenario, state: LoopState, steady: jax.Arr
     sampling = checks.given(scenario.sampling)
     loop, x = scenario.loop, state.x
     x_model, t = x[: loop.model.order], jnp.zeros_like(x[0, 0])
-    law_estimate = jax.eval_shape(
-        partial(estimate, scenario, loop.observer), t, x_model, state.observer
-    )
+    law_estimate = jax.eval_shape(loop.observer.estimate, t, x_model, loop.model, state.observer)
     output, _ = jax.eval_shape(
         loop.law.command, t, x_model, law_estimate, scenario.context, state.controller
     )
@@ -284,9 +281,9 @@ def _continuous_law(scenario: Scenario, t: jax.Array, state: LoopState) -> _LawO
     """What the law gives for a measurement of the state that the observer completes."""
     loop, x, observer = scenario.loop, state.x, scenario.loop.observer
     x_model = x[: loop.model.order]
-    law_estimate = estimate(scenario, observer, t, x_model, state.observer)
+    law_estimate = observer.estimate(t, x_model, loop.model, state.observer)
     measurement = measurement_of(x)
-    received = completed(scenario, observer, t, measurement, state.observer)
+    received = with_estimates(scenario, observer, t, measurement, state.observer)
     output, controller_rate = loop.law.command(
         t, received.x[: loop.model.order], law_estimate, scenario.context, state.controller
     )
@@ -506,11 +503,11 @@ def law_update(
     """
     sampling = checks.given(scenario.sampling)
     running = discrete_observer(scenario)
-    received = completed(scenario, running, t, measurement, observer)
+    received = with_estimates(scenario, running, t, measurement, observer)
     loop = scenario.loop
     law, model = loop.law, loop.model
     x = received.x[: model.order]
-    law_estimate = estimate(scenario, running, t, x, observer)
+    law_estimate = running.estimate(t, x, model, observer)
     output, controller_rate = law.command(t, x, law_estimate, scenario.context, controller)
     if sampling.trigger is not None:
         assert not is_absent(sent)

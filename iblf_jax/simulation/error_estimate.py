@@ -52,6 +52,7 @@ from iblf_jax.core.units import POSITION
 from iblf_jax.simulation.closed_loop import LoopState, perturbed_state
 from iblf_jax.simulation.discontinuities import has_jump
 from iblf_jax.simulation.integrators import Tableau, tableau
+from iblf_jax.simulation.levels import disturbed_parts
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.stability import SLOWEST_RATE
 from iblf_jax.world.bounds import Tube
@@ -465,13 +466,11 @@ def _disturbance_error(
     """
 
     def torque(t: jax.Array, q: jax.Array, dq: jax.Array) -> jax.Array:
-        robot = loop.plant.at(t).robot
-        known: Any = loop.model.robot
-        if robot is None:
+        if scenario.loop.plant.robot is None:
             return jnp.zeros_like(q)
-        return scenario.disturbance.torque(t, q, dq, robot, known)
+        return scenario.disturbance.torque(t, q, dq, *disturbed_parts(scenario, t))
 
-    loop, stages = scenario.loop, len(table.c)
+    stages = len(table.c)
     own = np.asarray(table.b, times.dtype)[:, None]
     exact = np.asarray([weight for _, weight in GAUSS], times.dtype)[:, None]
     # The first stage of every method is at the start of the step.

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from iblf_jax.control.observers import Observer
 from iblf_jax.control.sensors._base import Measurement, measurement_of
 from iblf_jax.core import checks, taylor
-from iblf_jax.core.pytree import Absent, Pytree, unwrapped
+from iblf_jax.core.pytree import Absent, Pytree
 from iblf_jax.world import plants
 from iblf_jax.world.plants import Plant
 from iblf_jax.world.robots import at_time, friction_torque, inverse_dynamics
@@ -96,26 +96,7 @@ def has_speed_limits(scenario: Scenario) -> bool:
 # --- law and observer -----------------------------------------------------------------------------
 
 
-def estimate(
-    scenario: Scenario, observer: Observer, t: jax.Array, x: jax.Array, state: Pytree
-) -> jax.Array:
-    """The estimate that the law receives: the torque f_hat, (n,) [N m], or d_hat, (r, n).
-
-    Args:
-      scenario: its law and its model.
-      observer: as the loop runs it.
-      t: time, () [s].
-      x: state of the model, (r, n).
-      state: of the observer.
-    """
-    model = scenario.loop.model
-    found = observer.estimate(t, x, model, state)
-    if unwrapped(scenario.controller).receives_x:
-        return found
-    return model.as_uncertain(x, found)  # type: ignore[no-any-return]
-
-
-def completed(
+def with_estimates(
     scenario: Scenario, observer: Observer, t: jax.Array, measured: Measurement, state: Pytree
 ) -> Measurement:
     """The levels that the law receives: those of a measurement, with the estimates of an observer
@@ -175,20 +156,28 @@ def estimated_levels(
 
 def motion(scenario: Scenario, t: jax.Array, x: jax.Array, u: jax.Array) -> jax.Array:
     """The rate x' of the plant's state under the input u, (r, n)."""
-    given, model, disturbance = scenario.plant.at(t), scenario.model, scenario.disturbance
+    given, disturbance = scenario.plant.at(t), scenario.disturbance
     plant = plants.as_plant(given)
     q, dq = x[0], x[1]
-    robot = plant.robot
-    if robot is None:
+    external = disturbance.torque(t, q, dq, *disturbed_parts(scenario, t))
+    if plant.robot is None:
         friction = plant.friction_torque(x)
         torque: jax.Array | float = 0.0 if friction is None else friction
-        u = u + disturbance.torque(t, q, dq, given, model)
+        u = u + external
     else:
-        known: Any = scenario.loop.model.robot
-        torque = disturbance.torque(t, q, dq, robot, known) + friction_torque(robot, dq)
+        torque = external + friction_torque(plant.robot, dq)
     rate = plants.flow(plant, t, x, u, torque)
-    added = disturbance.rates(t, x, given, model)
+    added = disturbance.rates(t, x, given, scenario.model)
     return rate if added is None else rate + added
+
+
+def disturbed_parts(scenario: Scenario, t: jax.Array) -> tuple[Any, Any]:
+    """Plant and model as the torque of a disturbance receives them: a robot as it is, another plant
+    as the robot inside it, or as it is if it contains none.
+    """
+    given, known = scenario.plant.at(t), scenario.model
+    plant, model = plants.robot_of(given), plants.robot_of(known)
+    return given if plant is None else plant, known if model is None else model
 
 
 def acceleration(

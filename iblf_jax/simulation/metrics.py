@@ -747,7 +747,7 @@ class SignalSource(NamedTuple):
 
 
 def _has_filter(scenario: Scenario) -> bool:
-    return any(law.filters for law in layers(scenario.controller))
+    return any(law.has_slack for law in layers(scenario.controller))
 
 
 SIGNAL_SOURCES = {

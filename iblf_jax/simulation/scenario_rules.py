@@ -31,7 +31,7 @@ from iblf_jax.core.modules import NUMBERS
 from iblf_jax.core.pytree import field_values, layers, unwrapped
 from iblf_jax.core.units import as_text
 from iblf_jax.simulation.initial import Initial
-from iblf_jax.simulation.levels import has_speed_limits, start_levels
+from iblf_jax.simulation.levels import disturbed_parts, has_speed_limits, start_levels
 from iblf_jax.simulation.sampling import Sampling
 from iblf_jax.world import plants, process_noise, regions
 from iblf_jax.world.bounds import Bounds, Funnel, Side, bounds_at, speed_limits_at
@@ -160,10 +160,13 @@ def _other_components(s: Combination) -> Found | None:
 
 
 def _law_without_robot(s: Combination) -> Found | None:
-    if s.model.is_robot or s.law.receives_x:
+    if s.model.is_robot:
         return None
     others = "" if s.model.robot is None else ", or model=plant.robot"
-    return Found(s.model_kind, {"others": others})
+    for law in layers(s.scenario.controller):
+        if law.needs_robot:
+            return Found(s.model_kind, {"kind": type(law).__name__, "others": others})
+    return None
 
 
 def _wrapped_drive(s: Combination) -> Found | None:
@@ -173,6 +176,14 @@ def _wrapped_drive(s: Combination) -> Found | None:
             words = {"kind": type(law).__name__, "outermost": type(outermost).__name__}
             return Found(type(outermost).__name__, words)
     return None
+
+
+def _other_centre(s: Combination) -> checks.Words | None:
+    bounds = s.scenario.bounds[1]
+    if bounds is None or s.model.reference_levels == s.plant.reference_levels:
+        return None
+    follows = isinstance(bounds.lower, Funnel) or isinstance(bounds.upper, Funnel)
+    return checks.Words("a Funnel") if follows else None
 
 
 UNKNOWN_UNIT = "1"
@@ -226,8 +237,15 @@ COMBINATION = (
     Rule(
         "Scenario.model",
         _law_without_robot,
-        "a robot as the model of the law {s.law_kind}",
+        "a robot as the model of the law {kind}",
         "Take controllers.BarrierBackstepping{others}.",
+    ),
+    Rule(
+        "Scenario.bounds[1]",
+        _other_centre,
+        "no Funnel: it follows q_d' for a robot and alpha_1 for another plant, and only one of"
+        " plant and model is a robot",
+        "Take the plant as the model, or other bounds, such as Constant.",
     ),
     Rule(
         "Scenario.controller",
@@ -470,8 +488,7 @@ def _initial_values(scenario: Scenario) -> InitialValues:
             _shaped(f"{name}.mass_matrix(q)", partial(part.robot.mass_matrix, q), n, n)
             _shaped(f"{name}.coriolis(q, v, u)", partial(part.robot.coriolis, q, dq, dq), n)
             _shaped(f"{name}.gravity(q)", partial(part.robot.gravity, q), n)
-    disturbed: list[Any] = [part if part.robot is None else part.robot for part in (plant, model)]
-    torque = partial(scenario.disturbance.torque, t, q, dq, *disturbed)
+    torque = partial(scenario.disturbance.torque, t, q, dq, *disturbed_parts(scenario, t))
     _shaped("disturbance.torque(t, q, dq, plant, model)", torque, n)
     speed_limits = None
     if velocities is not None and has_speed_limits(scenario):
@@ -487,13 +504,14 @@ def _initial_values(scenario: Scenario) -> InitialValues:
 def _check_shapes_of_plant(name: str, plant: Plant, t: jax.Array, x: jax.Array) -> None:
     """Raises ValueError where drift or gain of a plant has another shape than its state."""
     order, n = x.shape
-    _shaped(f"{name}.drift(t, x)", partial(plant.drift, t, x), order, n)
+    remedy = f"The {name} has {order} levels of {plants.counted_components(plant, n)}."
+    _shaped(f"{name}.drift(t, x)", partial(plant.drift, t, x), order, n, remedy=remedy)
     diagonal = jnp.ndim(jax.eval_shape(plant.gain, t, x)) == 2
     shape = (order, n) if diagonal else (order, n, n)
-    _shaped(f"{name}.gain(t, x)", partial(plant.gain, t, x), *shape)
+    _shaped(f"{name}.gain(t, x)", partial(plant.gain, t, x), *shape, remedy=remedy)
 
 
-def _shaped(name: str, call: Callable[[], jax.Array], *shape: int) -> jax.Array:
+def _shaped(name: str, call: Callable[[], jax.Array], *shape: int, remedy: str = "") -> jax.Array:
     """The value of `call()`, or a ValueError that names it if it raises or has another shape."""
     try:
         value = call()
@@ -501,7 +519,7 @@ def _shaped(name: str, call: Callable[[], jax.Array], *shape: int) -> jax.Array:
         got = f"{type(error).__name__}: {error}"
         raise checks.fail(name, got, f"an array of shape {shape}") from error
     if jnp.shape(value) != shape:
-        remedy = f"The plant has {shape[0]} joints."
+        remedy = remedy or f"The plant has {shape[0]} joints."
         raise checks.fail(name, f"shape {jnp.shape(value)}", f"shape {shape}", remedy)
     return value
 

@@ -347,3 +347,34 @@ def test_the_reference_of_a_filter_may_leave_the_bounds_and_that_of_no_other_law
         filtered(falling(controller=law, **parts), nearest="acceleration"), duration=0.3, dt=1e-3
     )
     assert certificate["reference inside"].verdict == certificate.verdict == "fails"
+
+
+@pytest.mark.parametrize("nearest", ["torque", "acceleration"])
+def test_an_estimate_of_rates_acts_as_its_torque(nearest):
+    """A `LevelObserver` passes rates d_hat to a law of x; M0 d_hat_2 is the same estimate as a
+    torque."""
+    full_state = ij.presets.zhang_yan_2024_full_state()
+    observer = ij.observers.LevelObserver(gain=(0.0, 20.0), eta0=[[0.0, 0.0], [3.0, -2.0]])
+    scenario = filtered(ij.with_parts(full_state, observer=observer), nearest=nearest)
+    loop, start = scenario.loop, initial_state(scenario)
+    t = jnp.zeros(())
+    d_hat = loop.observer.estimate(t, start.x, loop.model, start.observer)
+    f_hat = scenario.model.mass_matrix(start.q) @ d_hat[1]
+    assert d_hat.shape == (2, 2)
+    taus = []
+    for estimate in (d_hat, f_hat):
+        command, _ = loop.law.command(t, start.x, estimate, scenario.context, start.controller)
+        taus.append(command.tau)
+    np.testing.assert_allclose(taus[0], taus[1], rtol=1e-9)
+    # The law's own torque is passed on where it meets the conditions.
+    alone, _ = full_state.loop.law.command(t, start.x, d_hat, scenario.context, start.controller)
+    np.testing.assert_allclose(taus[0], alone.tau, rtol=1e-9)
+
+
+def test_a_model_that_is_no_robot_is_refused():
+    """The filter turns accelerations into torques by a mass matrix, whatever law it wraps."""
+    flexible = ij.presets.flexible_joint_two_link()
+    law = controllers.Saturated(controllers.SafetyFilter(flexible.controller), limit=60.0)
+    words = r"Scenario\.model: got 'FlexibleJoint', expected a robot .* of the law SafetyFilter"
+    with pytest.raises(ValueError, match=words):
+        ij.with_parts(flexible, controller=law)

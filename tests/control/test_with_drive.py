@@ -148,3 +148,19 @@ def test_a_model_with_the_motors_is_accepted(payload):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         canonical(plant)
+
+
+@pytest.mark.parametrize("side", ["lower", "upper"])
+def test_velocity_bounds_around_two_centres_are_refused(side):
+    """A funnel of a robot's velocities follows q_d', that of another plant's second level alpha_1:
+    the law would keep another one than the one that runs record."""
+    sides = {"lower": ij.bounds.Constant(-6.0), "upper": ij.bounds.Constant(6.0)}
+    constant = ij.Bounds(**sides)
+    sides[side] = ij.bounds.Funnel(*((-6.0, -4.0) if side == "lower" else (6.0, 4.0)), 1.0)
+    around = ij.Bounds(**sides)
+    law = BarrierBackstepping(k=(2.0, 10.0), weights=np.ones((2, 2)))
+    positions = PAPER.bounds[0]
+    on(FLEXIBLE, law, model=FLEXIBLE.rigid(), bounds=(positions, constant))
+    ij.with_parts(PAPER, controller=law, bounds=(positions, around))
+    with pytest.raises(ValueError, match=r"Scenario\.bounds\[1\]: got a Funnel, expected no"):
+        on(FLEXIBLE, law, model=FLEXIBLE.rigid(), bounds=(positions, around))

@@ -13,8 +13,11 @@ import numpy as np
 import pytest
 
 import iblf_jax as ij
+from iblf_jax.deployment import control_law
 from iblf_jax.deployment.control_law import GivenReference
 from iblf_jax.deployment.signal_units import one_unit, per_time
+from iblf_jax.simulation.closed_loop import initial_state
+from iblf_jax.simulation.scenario import canonical
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-Wconversion")
 PERIOD = 1e-3
@@ -161,3 +164,31 @@ def test_mujoco_refuses_process_noise():
     )
     with pytest.raises(ValueError, match=r"process_noise: got 'Additive'.*process_noise=None"):
         ij.cosimulate(scenario, "arm.xml", period=PERIOD, duration=0.1)
+
+
+def test_the_input_at_the_start_is_that_of_the_loop():
+    """Of a drive under a law of robots it is the voltage that holds the plant, and no torque."""
+    paper = ij.presets.zhang_yan_2024()
+    drive = ij.plants.ElectricDrive(
+        paper.plant,
+        torque_constant=[2.0, 1.5],
+        inductance=0.02,
+        resistance=[1.0, 0.5],
+        back_emf=0.5,
+    )
+    law = ij.controllers.WithDrive(ij.controllers.PDGravity(Kp=60.0, Kd=20.0), drive=drive)
+    scenario = canonical(
+        ij.with_parts(
+            paper,
+            plant=drive,
+            model=paper.plant,
+            controller=law,
+            observer=ij.observers.NoObserver(),
+            sampling=ij.Sampling(period=1e-3, delay=1e-3),
+        )
+    )
+    balance = control_law.start(scenario, control_law.inputs_at_start(scenario))[1]
+    in_transit = initial_state(scenario).sampled.commands
+    np.testing.assert_array_equal(in_transit, [balance] * len(in_transit))
+    q = scenario.initial.q
+    np.testing.assert_array_equal(balance, drive.steady_input(q))

@@ -100,7 +100,7 @@ def derivative_along_the_loop(scenario, weights):
     def energy(t, state):
         x = state.x
         loop = scenario.loop
-        d_hat = levels.estimate(scenario, loop.observer, t, x, state.observer)
+        d_hat = loop.observer.estimate(t, x, loop.model, state.observer)
         if d_hat.ndim == 1:
             d_hat = jnp.zeros_like(x)
         command, _ = scenario.controller.command(t, x, d_hat, scenario.context, ())

@@ -11,6 +11,8 @@ import pytest
 
 import iblf_jax as ij
 from iblf_jax.core.status import Status
+from iblf_jax.simulation.levels import motion, start_levels
+from iblf_jax.simulation.scenario import canonical
 from iblf_jax.tuning.objectives import fitted
 
 ROOT_OF_2G = 4.429  # [m^0.5/s]
@@ -159,3 +161,51 @@ def test_a_certificate_counts_inaccurate_runs():
     assert accurate.inaccurate == 0
     assert "INACCURATE" not in str(accurate) + accurate.table_html()
     assert accurate.accuracy_note == ""
+
+
+@ij.component
+class Noting(ij.disturbances.Disturbance):
+    """Notes the kinds of the plant and of the model that it receives."""
+
+    seen: ClassVar[set[tuple[str, str]]] = set()
+
+    def torque(self, t, q, dq, plant, model):
+        self.seen.add((type(plant).__name__, type(model).__name__))
+        return jnp.zeros_like(q)
+
+    def jump_times(self):
+        return jnp.zeros(0)
+
+
+@pytest.mark.parametrize("plant", ["a robot", "Rigid"])
+def test_a_disturbance_receives_the_same_parts_at_the_check_and_in_the_loop(plant):
+    """A model without a robot is the model itself, under a plant that is or contains one."""
+    robot = ij.presets.zhang_yan_2024().plant
+    model = ij.plants.StrictFeedback(
+        drift=lambda t, x: jnp.stack([0.0 * x[0], -x[1]]),
+        gain=lambda t, x: jnp.ones_like(x),
+        n=2,
+        order=2,
+    )
+    noting = Noting()
+    noting.seen.clear()
+    scenario = ij.with_parts(
+        ij.presets.zhang_yan_2024(),
+        plant=robot if plant == "a robot" else ij.plants.Rigid(robot),
+        model=model,
+        controller=ij.controllers.BarrierBackstepping(k=(2.0, 10.0), weights=1.0),
+        observer=ij.observers.NoObserver(),
+        disturbance=noting,
+    )
+    checked = canonical(scenario)
+    assert noting.seen == {("TwoLink", "StrictFeedback")}
+    motion(checked, jnp.zeros(()), start_levels(checked), jnp.zeros(2))
+    assert noting.seen == {("TwoLink", "StrictFeedback")}
+
+
+def test_the_message_about_a_drift_of_another_shape_counts_levels_and_components():
+    plant = ij.plants.StrictFeedback(
+        drift=lambda t, x: x[0], gain=lambda t, x: jnp.ones_like(x), n=1, order=2
+    )
+    with pytest.raises(ValueError, match=r"drift.*The plant has 2 levels of 1 component\."):
+        canonical(tanks(plant=plant))

@@ -3,7 +3,7 @@
 A law is a `Law` of the state x or a `RobotLaw` of (q, q'); the loop calls both as a `Law`
 (`law_of_x`).  It knows the model, the reference and the bounds (its `LawContext`), receives the
 observer's estimate and commands an input.  It also returns signals for records and certificates:
-its virtual velocity alpha, its Lyapunov function V1, and whether a guard or a limit was active.
+its virtual control alpha, its Lyapunov function V1, and whether a guard or a limit was active.
 """
 
 from __future__ import annotations
@@ -13,17 +13,19 @@ import dataclasses
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Annotated, Any, ClassVar, NamedTuple, Self
 
 import jax
 
 from iblf_jax.control.barriers import Barrier
 from iblf_jax.control.decays import Decay, Exponential
-from iblf_jax.core import checks, families
+from iblf_jax.core import checks, families, former_names
 from iblf_jax.core.families import attribute
 from iblf_jax.core.pytree import Leaf, component, layers, wrapped_field
 from iblf_jax.core.time import Timed
+from iblf_jax.world import plants
 from iblf_jax.world.bounds import Bounds, Tube, speed_limits_at, tube_at
+from iblf_jax.world.plants import Plant
 from iblf_jax.world.references import Reference
 from iblf_jax.world.regions import Along, Region, along
 from iblf_jax.world.robots import Robot
@@ -46,7 +48,8 @@ class Shift(NamedTuple):
 class LawContext(NamedTuple):
     """The inputs of a law besides measurements: model, reference and bounds."""
 
-    model: Robot
+    model: Annotated[Robot, Plant]
+    """As the scenario has it; `plants.as_plant` converts it."""
     reference: Reference
     bounds: tuple[Bounds, Bounds | None, *tuple[Bounds | None, ...]]
     """Of the levels x_1, x_2, ... of the plant; None for a level without."""
@@ -102,9 +105,11 @@ class Command(NamedTuple):
     """The output of a law at one instant; all fields are (n,)."""
 
     tau: jax.Array
-    """Torque [N m]."""
+    """Output of the law, (n,): of a law of robots the torque [N m], else the input u in its
+    unit."""
     alpha: jax.Array
-    """Virtual velocity [rad/s]; e2 = q' - alpha.  A law without one gives q_d'."""
+    """Virtual control alpha_1 of the second level, [rad/s] for a robot; e2 = x_2 - alpha.  A law
+    without one gives q_d'."""
     V1: jax.Array
     """Lyapunov function of the position error, joint by joint."""
     guard_active: jax.Array
@@ -140,11 +145,13 @@ class TrackingLaw(Timed):
     in (`engine.structural_constants`)."""
     uses_observer: ClassVar[bool] = True
     """Whether it uses f_hat."""
+    needs_robot: ClassVar[bool] = False
+    """Whether its model must be a robot."""
     needs_velocity_bounds: ClassVar[bool] = False
     """Whether it requires bounds of the second level, `LawContext.bounds[1]`."""
     includes_e2: ClassVar[bool] = False
     """Whether its V1 contains its term of e2, so that V2 adds no 1/2 e2^T M0 e2."""
-    filters: ClassVar[bool] = False
+    has_slack: ClassVar[bool] = False
     """Whether its commands have a `slack`."""
     input_unit: ClassVar[str | None] = None
     """The unit of the input that an input map such as `WithDrive` commands; None for the input of
@@ -190,7 +197,7 @@ class TrackingLaw(Timed):
         """Warnings about the values of the fields."""
         return []
 
-    def completed(self, context: LawContext, x: jax.Array) -> Self:
+    def with_defaults(self, context: LawContext, x: jax.Array) -> Self:
         """The law with values that depend on the model and on the start x, (r, n), where none were
         given.
         """
@@ -288,6 +295,7 @@ class RobotLaw(TrackingLaw):
     """
 
     receives_x: ClassVar[bool] = False
+    needs_robot = True
 
     @abc.abstractmethod
     def init(self, q: jax.Array, dq: jax.Array, context: LawContext) -> State:
@@ -386,9 +394,9 @@ class RobotLaw(TrackingLaw):
 
 @component
 class RobotLawAdapter(Law):
-    """command(t, x, ...) = law.command(t, x_1, x_2, ...): a law of q and q' in the closed loop.
+    """Adapter from `RobotLaw` to `Law`: calls the law with q = x[0], dq = x[1].
 
-    It is no part of a scenario.
+    The loop creates it (`law_of_x`); users do not.
 
     Args:
       law: any law of robots.
@@ -406,11 +414,12 @@ class RobotLawAdapter(Law):
     def command(
         self, t: jax.Array, x: jax.Array, d_hat: jax.Array, context: LawContext, state: State
     ) -> tuple[Command, State]:
-        """Command of the law."""
+        """Command of the law, which receives the estimate as the torque f_hat."""
+        f_hat = plants.as_plant(context.model).as_uncertain(x, d_hat)
         # One array for each level: robots test whether two velocities are the same object.
         q, dq = x[0], x[1]
         with _explained_for_wrappers(self.law):
-            return self.law.command(t, q, dq, d_hat, context, state)
+            return self.law.command(t, q, dq, f_hat, context, state)
 
     def switching(
         self, t: jax.Array, x: jax.Array, d_hat: jax.Array, context: LawContext, state: State
@@ -453,8 +462,8 @@ class RobotLawAdapter(Law):
 
 @contextmanager
 def _explained_for_wrappers(law: RobotLaw) -> Iterator[None]:
-    """Says what to change where a law of q and q' called a law of x that it contains as if that
-    were a law of q and q', with one argument too many.
+    """Turns the TypeError of a `RobotLaw` that calls a wrapped `Law` with (q, dq) into a message
+    with the remedy.
     """
     try:
         yield
@@ -521,6 +530,11 @@ def check_law(name: str, law: object, remedy: str) -> None:
     that it wraps.
     """
     checks.conforms(name, law, contract_of(law), remedy)
+    for former, present in former_names.ATTRIBUTES_OF_LAWS.items():
+        member = getattr(law, former, None)
+        if member is True or callable(member):
+            expected = f"`{present}` in its place"
+            raise checks.fail(f"{name}.{former}", checks.Words("a member"), expected)
     field = wrapped_field(law)
     if field:
         check_law(f"{name}.{field}", vars(law)[field], remedy)
