@@ -50,7 +50,7 @@ FAMILIES = (
     ("Sensors", sensors, "`iblf_jax.sensors`", ()),
     (
         "Sensors of one level",
-        SimpleNamespace(MEMBERS=sensors.LEVELS),
+        SimpleNamespace(MEMBERS=sensors.LEVEL_SENSORS),
         "`iblf_jax.sensors`, parts of `Levels`",
         (),
     ),

@@ -18,7 +18,7 @@ NAMES = {
         "Setting": "LawContext",
     },
     "iblf_jax.control.observers": {"Printed": "AsPublished"},
-    "iblf_jax.control.sensors": {"Part": "AnySensor"},
+    "iblf_jax.control.sensors": {"LEVELS": "LEVEL_SENSORS", "Part": "AnySensor"},
     "iblf_jax.studies": {"ThisProcess": "LocalExecutor"},
 }
 """Module -> former name -> what to write in its place."""
@@ -29,6 +29,9 @@ ARGUMENTS = {
     "velocity_bounds": ("bounds", "bounds=(positions, velocities)"),
 }
 """Former name of an argument -> the present one, and how it is given."""
+
+ATTRIBUTES_OF_LAWS = {"completed": "with_defaults", "filters": "has_slack"}
+"""Former name of an optional member of a user's law -> the present one."""
 
 
 def no_attribute(module: str, name: str) -> AttributeError:

@@ -230,7 +230,7 @@ def _region_violation(result: Rollout) -> str:
     if "first_region_violation_time" not in metrics:
         return ""
     i = int(metrics["first_region_violation_region"])
-    robot = plants.robot_inside(result.scenario.loop.plant)
+    robot = checks.given(result.scenario.loop.plant.robot)
     region = in_words(result.scenario.regions[i], robot)
     return _first_violation(
         f"regions[{i}]: {region} crossed its boundary",
@@ -521,6 +521,6 @@ def _infeasible(result: Rollout, steps: int) -> ValueError:
         float(q_d[sample, joint]),
         f"a value inside the bounds ({float(lower[sample, joint]):.6g},"
         f" {float(upper[sample, joint]):.6g}) at {where}",
-        f"{remedy} A law that keeps the bounds whatever the reference is has filters = True, and"
+        f"{remedy} A law that keeps the bounds whatever the reference is has has_slack = True, and"
         " its Command a slack.",
     )

@@ -77,7 +77,7 @@ FAMILIES: dict[Any, Family] = {
     decays.Decay: family("decays", decays.MEMBERS),
     observers.DisturbanceObserver: family("observers", observers.MEMBERS),
     sensors.AnySensor: family("sensors", sensors.MEMBERS),
-    sensors.LevelSensor: Family("sensors", {"LEVELS": sensors.LEVELS}),
+    sensors.LevelSensor: Family("sensors", {"LEVEL_SENSORS": sensors.LEVEL_SENSORS}),
     sensors.Velocity: Family("sensors", {"VELOCITIES": sensors.VELOCITIES}),
     process_noise.ProcessNoise: family("process_noise", process_noise.MEMBERS),
     actuators.Actuator: family("actuators", actuators.MEMBERS),

@@ -350,7 +350,7 @@ def region_margins(runs: Runs, *, zoom: float | None = None) -> Figure:
         came = f"runs with {', '.join(map(str, counts))} regions"
         raise checks.fail("runs", came, "runs with the same number of regions, at least one")
     scenario = curves[0].run.scenario
-    robot = plants.robot_inside(scenario.loop.plant)
+    robot = checks.given(scenario.loop.plant.robot)
     names = [escaped(in_words(region, robot)) for region in scenario.regions]
     quantities = [QUANTITIES["region_margin"]] * len(names)
     return _named_rows("Distance to the boundaries", curves, quantities, names, zoom)

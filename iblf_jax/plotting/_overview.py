@@ -32,7 +32,7 @@ from iblf_jax.plotting._panels import (
 )
 from iblf_jax.plotting._workspace import draw_paths
 from iblf_jax.simulation.results import Rollout
-from iblf_jax.world.plants import Plant, robot_inside
+from iblf_jax.world.plants import Plant
 from iblf_jax.world.regions import in_words
 
 WIDTH = 10.0
@@ -185,7 +185,7 @@ def _regions(figure: Figure, where: SubplotSpec, curve: Curve, window: Window) -
     axes = figure.add_subplot(grid[0])
     quantity = QUANTITIES["region_margin"]
     scenario = curve.run.scenario
-    robot = robot_inside(scenario.loop.plant)
+    robot = checks.given(scenario.loop.plant.robot)
     names = []
     for i, region in enumerate(scenario.regions):
         draw(axes, curve, quantity.field, i, window, label="_", **_style.series(i))

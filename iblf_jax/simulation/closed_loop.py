@@ -35,12 +35,12 @@ from iblf_jax.core.pytree import Absent, Pytree, is_absent, unwrapped
 from iblf_jax.simulation.delays import initial_commands
 from iblf_jax.simulation.levels import (
     EstimatedLevels,
-    completed,
     estimated_levels,
     has_speed_limits,
     motion,
     start_levels,
     steady_input,
+    with_estimates,
 )
 from iblf_jax.simulation.noise import normals
 from iblf_jax.simulation.sampling import Instant, SentCommand, nothing_sent
@@ -56,11 +56,11 @@ class LawSignals(NamedTuple):
     """Signals of a law at one instant, besides its torque; (n,) unless noted."""
 
     alpha: jax.Array
-    """Virtual velocity [rad/s]."""
+    """Virtual control alpha_1, [rad/s] for a robot."""
     V1: jax.Array
     """Lyapunov function of the position error, joint by joint."""
     f_hat: jax.Array
-    """Estimate of the uncertain term that the law used [N m]."""
+    """Estimate of the observer, as the law received it: (n,) [N m], or rates (r, n)."""
     guard_active: jax.Array
     saturated: jax.Array
     slack: jax.Array | Absent = ()
@@ -248,7 +248,7 @@ def evaluate(
     if scenario.sampling is None:
         f_hat = loop.observer.estimate(t, x_model, loop.model, state.observer)
         true = measurement_of(x)
-        measured = completed(scenario, loop.observer, t, true, state.observer)
+        measured = with_estimates(scenario, loop.observer, t, true, state.observer)
         answer, controller_rate = loop.law.command(
             t, measured.x[: loop.model.order], f_hat, scenario.context, state.controller
         )
@@ -489,7 +489,7 @@ def law_update(
     sampling = checks.given(scenario.sampling)
     running = discrete_observer(scenario)
     reading = measured
-    measured = completed(scenario, running, t, reading, observer)
+    measured = with_estimates(scenario, running, t, reading, observer)
     loop = scenario.loop
     law, model = loop.law, loop.model
     x = measured.x[: model.order]

@@ -96,7 +96,7 @@ def has_speed_limits(scenario: Scenario) -> bool:
 # --- law and observer -----------------------------------------------------------------------------
 
 
-def completed(
+def with_estimates(
     scenario: Scenario, observer: Observer, t: jax.Array, measured: Measurement, state: Pytree
 ) -> Measurement:
     """The levels that the law receives: those of a measurement, with the estimates of an observer

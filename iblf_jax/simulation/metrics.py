@@ -750,7 +750,7 @@ def _has_bounds_above_second(scenario: Scenario) -> bool:
 
 
 def _has_filter(scenario: Scenario) -> bool:
-    return any(law.filters for law in layers(scenario.controller))
+    return any(law.has_slack for law in layers(scenario.controller))
 
 
 SIGNAL_SOURCES = {

@@ -165,10 +165,10 @@ class Scenario:
     def _complete_law(self) -> None:
         """Gives the law what it derives from its model and the start, such as weights."""
         law = unwrapped(self.controller)
-        if is_default(law.completed, TrackingLaw.completed):
+        if is_default(law.with_defaults, TrackingLaw.with_defaults):
             return
         with jax.ensure_compile_time_eval():
-            new = law.completed(self.context, start_levels(self)[: self.loop.model.order])
+            new = law.with_defaults(self.context, start_levels(self)[: self.loop.model.order])
         if new is not law:
             object.__setattr__(self, "controller", rewrapped(self.controller, new))
 

@@ -455,7 +455,7 @@ class Study(Result):
         bounded = next(bounded for bounded, x in first.items() if not np.min(x) > 0)
         worst, plant = int(np.argmin(first[bounded])), self.scenario.loop.plant
         if bounded == summaries.REGIONS:
-            name, unit = in_words(self.scenario.regions[worst], plants.robot_inside(plant)), "m"
+            name, unit = in_words(self.scenario.regions[worst], checks.given(plant.robot)), "m"
         else:
             level = summaries.LEVELS.index(bounded)
             name = plant.notation.component(level + 1, worst)

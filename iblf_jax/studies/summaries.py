@@ -89,7 +89,7 @@ def _initial_margins(scenario: Scenario, samples: Mapping[str, Any]) -> dict[str
                 low, high = bounds_at(bounds, zero, jnp.zeros_like(x[i]))
             found[LEVELS[i]] = jnp.minimum(x[i] - low, high - x[i])
         if perturbed.regions:
-            robot = plants.robot_inside(perturbed.loop.plant)
+            robot = checks.given(perturbed.loop.plant.robot)
             found[REGIONS] = margins(perturbed.regions, robot, q)
         return found
 

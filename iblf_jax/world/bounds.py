@@ -30,7 +30,7 @@ from iblf_jax.core.time import Timed
 from iblf_jax.core.units import POSITION
 from iblf_jax.world.references import Reference
 from iblf_jax.world.robots import Robot
-from iblf_jax.world.robots._base import is_robot
+from iblf_jax.world.robots._base import has_mass_matrix
 
 
 class Side(Timed):
@@ -177,7 +177,7 @@ def from_limits(robot: Robot, *, margin: float = 0.0, unlimited: float | None = 
       ValueError: a robot without `limits`, or with joints that have none and no `unlimited`; a
         margin that leaves nothing.
     """
-    stated = robot.limits if is_robot(robot) else None
+    stated = robot.limits if has_mass_matrix(robot) else None
     limits, replacement = _checked_limits(robot, "limits", stated, "joint", unlimited)
     margins = _distance("margin", margin, robot.n, None)
     lower = jnp.where(jnp.isfinite(limits[0]), limits[0] + margins, -replacement)
@@ -206,7 +206,7 @@ def from_speed_limits(
       ValueError: a robot without `speed`, or with joints that have no limit and no `unlimited`; a
         share that is not positive.
     """
-    stated = robot.speed if is_robot(robot) else None
+    stated = robot.speed if has_mass_matrix(robot) else None
     speed, replacement = _checked_limits(robot, "speed", stated, "speed", unlimited)
     share = checks.positive_number("share", share, "1")
     limit = share * jnp.where(jnp.isfinite(speed), speed, replacement)
@@ -253,7 +253,10 @@ class Tube(NamedTuple):
         return self.dupper - self.dq_d
 
     def xi(self, q: jax.Array) -> jax.Array:
-        """Xi = h e1/k_u + (1 - h) e1/k_l, h = 1 if e1 > 0 else 0, (n,) [1].    (2.4), (2.5)"""
+        """The error xi = h e1/k_u + (1 - h) e1/k_l, h = 1 if e1 > 0 else 0, (n,) [1].
+
+        (2.4), (2.5)
+        """
         e1 = q - self.q_d
         return e1 / jnp.where(e1 > 0, self.k_u, self.k_l)
 

@@ -13,7 +13,7 @@ from iblf_jax.barriers import Integral, Log, guard_is_active, guarded_error
 from iblf_jax.bounds import Tube
 from scipy.integrate import quad
 
-from iblf_jax.control.barriers._base import bound_motion_gain
+from iblf_jax.control.barriers._base import paper_virtual_velocity
 
 INSIDE = st.floats(-0.998, 0.998)
 WIDTH = st.floats(1e-3, 1e3)
@@ -46,7 +46,10 @@ derivative = compiled(
     lambda barrier, tube, q: jax.grad(lambda q: jnp.sum(barrier.slope(tube, q)))(q)
 )
 xi_of = compiled(lambda tube, q: tube.xi(q))
-kappa_of = compiled(bound_motion_gain)
+# alpha = q_d' - (k1 + kappa) e1 for k1 = 0 and e1 = 1.
+kappa_of = compiled(
+    lambda tube, o: tube.dq_d - paper_virtual_velocity(tube, tube.q_d + 1.0, 0.0, o)
+)
 
 
 @pytest.mark.slow

@@ -162,7 +162,5 @@ def test_velocity_bounds_around_two_centres_are_refused(side):
     positions = PAPER.bounds[0]
     on(FLEXIBLE, law, model=FLEXIBLE.rigid(), bounds=(positions, constant))
     ij.with_parts(PAPER, controller=law, bounds=(positions, around))
-    with pytest.raises(
-        ValueError, match=r"Scenario\.bounds\[1\]: got a Funnel, expected no"
-    ):
+    with pytest.raises(ValueError, match=r"Scenario\.bounds\[1\]: got a Funnel, expected no"):
         on(FLEXIBLE, law, model=FLEXIBLE.rigid(), bounds=(positions, around))

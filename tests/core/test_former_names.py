@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import re
 
@@ -36,3 +37,18 @@ def test_an_argument_is_a_former_one_only_where_the_present_one_is_known():
     with pytest.raises(TypeError, match="reading") as error:
         ij.presets.zhang_yan_2024_full_state(reading="corrected")
     assert "in its place" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("former", "member", "present"),
+    [("filters", True, "has_slack"), ("completed", lambda law, context, x: law, "with_defaults")],
+)
+def test_a_former_member_of_a_law_is_refused_with_the_present_one(former, member, present):
+    scenario = ij.presets.zhang_yan_2024()
+    cls = type("Own", (ij.controllers.PDGravity,), {former: member})
+    law = ij.controllers.Saturated(ij.controllers.PDGravity(Kp=60.0, Kd=20.0), limit=50.0)
+    own = ij.component(cls)(Kp=60.0, Kd=20.0)
+    with pytest.raises(ValueError, match=rf"Scenario\.controller\.{former}.*`{present}`"):
+        ij.with_parts(scenario, controller=own)
+    with pytest.raises(ValueError, match=rf"Saturated\.law\.{former}.*`{present}`"):
+        dataclasses.replace(law, law=own)

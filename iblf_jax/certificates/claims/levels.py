@@ -700,7 +700,7 @@ def _estimate_terms(point: LevelPoint) -> EstimateTerms:
     x = at.x
     if at.estimate.ndim == 1:
         # A torque observer: f_tilde = M0 d_tilde_2.
-        M0 = plants.robot_inside(scenario.loop.model).mass_matrix(x[0])
+        M0 = checks.given(scenario.loop.model.robot).mass_matrix(x[0])
         error, sizes, x = M0 @ error[1], jnp.abs(M0) @ sizes[1], jnp.abs(M0) @ jnp.abs(x[1])
     elif jnp.ndim(kappa) == 1:
         kappa = kappa[:, None]

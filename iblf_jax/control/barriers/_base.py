@@ -54,7 +54,7 @@ class Barrier(Part):
     exact_decay: ClassVar[bool] = False
     """Whether the claim of `decay_rate` is an equality."""
     ratio_jumps: ClassVar[bool] = True
-    """Whether `error_over_slope` may jump at e1 = 0 in an asymmetric tube."""
+    """Whether e/s is discontinuous at e = 0 if k_l != k_u."""
 
     @attribute
     def slope_derivatives(self) -> float:
@@ -173,7 +173,7 @@ def guarded_error(tube: Tube, q: jax.Array, guard: float) -> GuardedError:
         check_guard("guarded_error", guard)
     e1 = q - tube.q_d
     above = e1 > 0
-    k = jnp.where(above, tube.k_u, tube.k_l)
+    k = side_width(tube, above)
     dk = jnp.where(above, tube.dk_u, tube.dk_l)
     if unlimited:
         return GuardedError(e1, jnp.zeros_like(e1), k, dk)
@@ -238,17 +238,13 @@ def xi_bound_from_errors(barrier: Barrier, V: jax.Array, tube: Tube) -> jax.Arra
     return jnp.maximum(e_u / tube.k_u, -e_l / tube.k_l)
 
 
-def bound_motion_gain(tube: Tube, o: jax.Array) -> jax.Array:
-    """Kappa = sqrt((k_u'/k_u)^2 + (k_l'/k_l)^2 + o), (n,) [1/s].        (3.7), root restored
+def paper_virtual_velocity(tube: Tube, q: jax.Array, k1: jax.Array, o: Leaf) -> jax.Array:
+    """The virtual velocity alpha = q_d' - (k1 + kappa(t)) e1, (n,) [rad/s], with the margin   (3.5)
+
+        kappa = sqrt((k_u'/k_u)^2 + (k_l'/k_l)^2 + o).                      (3.7), root restored
 
     With the root, kappa + k'/k >= 0 on both sides for every o > 0, which is what the proof needs.
-    """
-    return jnp.sqrt((tube.dk_u / tube.k_u) ** 2 + (tube.dk_l / tube.k_l) ** 2 + o)
-
-
-def paper_virtual_velocity(tube: Tube, q: jax.Array, k1: jax.Array, o: Leaf) -> jax.Array:
-    """Alpha = q_d' - (k1 + kappa(t)) e1, (n,) [rad/s].                                     (3.5)
-
     The integral and the logarithmic barrier share it.
     """
-    return tube.dq_d - (k1 + bound_motion_gain(tube, o)) * (q - tube.q_d)
+    kappa = jnp.sqrt((tube.dk_u / tube.k_u) ** 2 + (tube.dk_l / tube.k_l) ** 2 + o)
+    return tube.dq_d - (k1 + kappa) * (q - tube.q_d)

@@ -1,27 +1,28 @@
 """The integral barrier on the state itself: the bound acts on the position, not on the error.
 
-With the bounds' centre c(t) and half-width kc(t), x = q - c and y = q_d - c, so that e1 = x - y and
-|x| < kc.  The barrier weighs the error by how near the *position* is to its bound,
+With the bounds' centre c(t) and half-width kc(t), p = q - c and p_d = q_d - c, so that
+e1 = p - p_d and |p| < kc.  The barrier weighs the error by how near the *position* is to its bound,
 
-    V1 = int_0^e1 s kc^2 / (kc^2 - (s + y)^2) ds,
+    V1 = int_0^e1 s kc^2 / (kc^2 - (s + p_d)^2) ds,
 
-so it needs no feasibility of the error's own bounds (k_l, k_u), only |y| < kc.  Its partial
+so it needs no feasibility of the error's own bounds (k_l, k_u), only |p_d| < kc.  Its partial
 derivatives are
 
-    dV1/dx = kc^2 e1 / (kc^2 - x^2),   dV1/dy = -e1 rho,   dV1/dkc = (2 V1 - x dV1/dx - y dV1/dy) /
-    kc, rho = kc / (2 e1) ln[ (kc + x)(kc - y) / ((kc - x)(kc + y)) ],
+    dV1/dp = kc^2 e1 / (kc^2 - p^2),   dV1/dp_d = -e1 rho,
+    dV1/dkc = (2 V1 - p dV1/dp - p_d dV1/dp_d) / kc,
+    rho = kc / (2 e1) ln[ (kc + p)(kc - p_d) / ((kc - p)(kc + p_d)) ],
 
-the last because V1 = kc^2 K(x/kc, y/kc).  Hence, with w = V1/e1^2 and g = (kc^2 - x^2)/kc^2, the
-virtual velocity that gives V1' = -k1 kc^2 e1^2 / (kc^2 - x^2) at e2 = 0, for a time-varying centre
+the last because V1 = kc^2 K(p/kc, p_d/kc).  Hence, with w = V1/e1^2 and g = (kc^2 - p^2)/kc^2, the
+virtual velocity that gives V1' = -k1 kc^2 e1^2 / (kc^2 - p^2) at e2 = 0, for a time-varying centre
 and half-width, is
 
-    alpha = c' + g rho (y' - y kc'/kc) - k1 e1 + x kc'/kc - 2 e1 w g kc'/kc
-          = q_d' - k1 e1 - (1 - g rho) (y' - y kc'/kc) + e1 (1 - 2 g w) kc'/kc.
+    alpha = c' + g rho (p_d' - p_d kc'/kc) - k1 e1 + p kc'/kc - 2 e1 w g kc'/kc
+          = q_d' - k1 e1 - (1 - g rho) (p_d' - p_d kc'/kc) + e1 (1 - 2 g w) kc'/kc.
 
-K is the relative entropy KL(P || Q) of two coins P = (1 + y/kc)/2 and Q = (1 + x/kc)/2, and kc^2
-e1^2 / (kc^2 - x^2) is kc^2 times their chi-square distance.  KL <= ln(1 + chi^2) <= chi^2 for any
+K is the relative entropy KL(P || Q) of two coins P = (1 + p_d/kc)/2 and Q = (1 + p/kc)/2, and kc^2
+e1^2 / (kc^2 - p^2) is kc^2 times their chi-square distance.  KL <= ln(1 + chi^2) <= chi^2 for any
 two distributions, so V1' <= -k1 V1; and k1 is the best such constant (reference at the bound).  In
-the code, kc + x = k_l + e1 and kc - x = k_u - e1: no differences of nearly equal numbers.
+the code, kc + p = k_l + e1 and kc - p = k_u - e1: no differences of nearly equal numbers.
 """
 
 from __future__ import annotations
@@ -42,11 +43,11 @@ BISECTIONS = 60
 class _Parts(NamedTuple):
     kc: jax.Array
     g: jax.Array
-    """1 - (x/kc)^2 [1]."""
+    """1 - (p/kc)^2 [1]."""
     w: jax.Array
     """V1 / e1^2 [1]."""
     rho: jax.Array
-    """-dV1/dy / e1 [1]."""
+    """-dV1/dp_d / e1 [1]."""
 
 
 def _parts(e: jax.Array, k_l: jax.Array, k_u: jax.Array) -> _Parts:
@@ -60,13 +61,13 @@ def _parts(e: jax.Array, k_l: jax.Array, k_u: jax.Array) -> _Parts:
 
 @component
 class StateBarrier(Barrier):
-    """V1 = int_0^e1 s kc^2 / (kc^2 - (s + y)^2) ds,   y = q_d - c,   bounds c(t) -+ kc(t).
+    """V1 = int_0^e1 s kc^2 / (kc^2 - (s + p_d)^2) ds,   p_d = q_d - c,   bounds c(t) -+ kc(t).
 
-        s = kc^2 e1 / (kc^2 - x^2),   x = q - c
-        alpha = q_d' - k1 e1 - (1 - g rho) (y' - y kc'/kc) + e1 (1 - 2 g V1/e1^2) kc'/kc
+        s = kc^2 e1 / (kc^2 - p^2),   p = q - c
+        alpha = q_d' - k1 e1 - (1 - g rho) (p_d' - p_d kc'/kc) + e1 (1 - 2 g V1/e1^2) kc'/kc
 
     (symbols and derivation at the head of this module).  At e2 = 0, V1' = -k1 kc^2 e1^2 / (kc^2 -
-    x^2) <= -k1 V1.  For kc -> infinity it is unconstrained backstepping.
+    p^2) <= -k1 V1.  For kc -> infinity it is unconstrained backstepping.
 
     Args:
       guard: distance from the bound in xi at which the guard begins, a number in (0, 1) [1];
@@ -97,7 +98,7 @@ class StateBarrier(Barrier):
         return e / _parts(e, tube.k_l, tube.k_u).g
 
     def error_over_slope(self, tube: Tube, q: jax.Array) -> jax.Array:
-        """(kc^2 - x^2)/kc^2, (n,) [1]."""
+        """(kc^2 - p^2)/kc^2, (n,) [1]."""
         e, _, _, _ = guarded_error(tube, q, self.guard)
         return _parts(e, tube.k_l, tube.k_u).g
 
@@ -107,9 +108,9 @@ class StateBarrier(Barrier):
         """alpha, (n,) [rad/s]."""
         e, beyond, _, _ = guarded_error(tube, q, self.guard)
         kc, g, w, rho = _parts(e, tube.k_l, tube.k_u)
-        y, dy = 0.5 * (tube.k_l - tube.k_u), 0.5 * (tube.dk_l - tube.dk_u)
+        p_d, dp_d = 0.5 * (tube.k_l - tube.k_u), 0.5 * (tube.dk_l - tube.dk_u)
         growth = 0.5 * (tube.dk_l + tube.dk_u) / kc
-        bound_rate = (1.0 - g * rho) * (dy - y * growth) - e * (1.0 - 2.0 * g * w) * growth
+        bound_rate = (1.0 - g * rho) * (dp_d - p_d * growth) - e * (1.0 - 2.0 * g * w) * growth
         return tube.dq_d - k1 * (e + beyond) - bound_rate
 
     def decay_rate(self, k1: jax.Array) -> jax.Array:

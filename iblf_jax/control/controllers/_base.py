@@ -2,7 +2,7 @@
 
 A law knows the model, the reference and the bounds (its `LawContext`), measures q and q', receives
 the observer's estimate and commands a torque.  It also returns signals for records and
-certificates: its virtual velocity alpha, its Lyapunov function V1, and whether a guard or a limit
+certificates: its virtual control alpha, its Lyapunov function V1, and whether a guard or a limit
 was active.
 """
 
@@ -13,18 +13,19 @@ import dataclasses
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Annotated, Any, ClassVar, NamedTuple, Self
 
 import jax
 
 from iblf_jax.control.barriers import Barrier
 from iblf_jax.control.decays import Decay, Exponential
-from iblf_jax.core import checks, families
+from iblf_jax.core import checks, families, former_names
 from iblf_jax.core.families import attribute
 from iblf_jax.core.pytree import Leaf, component, layers, wrapped_field
 from iblf_jax.core.time import Timed
 from iblf_jax.world import plants
 from iblf_jax.world.bounds import Bounds, Tube, speed_limits_at, tube_at
+from iblf_jax.world.plants import Plant
 from iblf_jax.world.references import Reference
 from iblf_jax.world.regions import Along, Region, along
 from iblf_jax.world.robots import Robot
@@ -47,7 +48,8 @@ class Shift(NamedTuple):
 class LawContext(NamedTuple):
     """The inputs of a law besides measurements: model, reference and bounds."""
 
-    model: Robot
+    model: Annotated[Robot, Plant]
+    """As the scenario has it; `plants.as_plant` converts it."""
     reference: Reference
     bounds: tuple[Bounds, Bounds | None, *tuple[Bounds | None, ...]]
     """Of the levels x_1, x_2, ... of the plant; None for a level without."""
@@ -103,9 +105,11 @@ class Command(NamedTuple):
     """The output of a law at one instant; all fields are (n,)."""
 
     tau: jax.Array
-    """Torque [N m]."""
+    """Output of the law, (n,): of a law of robots the torque [N m], else the input u in its
+    unit."""
     alpha: jax.Array
-    """Virtual velocity [rad/s]; e2 = q' - alpha.  A law without one gives q_d'."""
+    """Virtual control alpha_1 of the second level, [rad/s] for a robot; e2 = x_2 - alpha.  A law
+    without one gives q_d'."""
     V1: jax.Array
     """Lyapunov function of the position error, joint by joint."""
     guard_active: jax.Array
@@ -145,7 +149,7 @@ class TrackingLaw(Timed):
     """Whether it requires bounds of the second level, `LawContext.bounds[1]`."""
     includes_e2: ClassVar[bool] = False
     """Whether its V1 contains its term of e2, so that V2 adds no 1/2 e2^T M0 e2."""
-    filters: ClassVar[bool] = False
+    has_slack: ClassVar[bool] = False
     """Whether its commands have a `slack`."""
     input_unit: ClassVar[str | None] = None
     """The unit of the input that an input map such as `WithDrive` commands; None for the input of
@@ -191,7 +195,7 @@ class TrackingLaw(Timed):
         """Warnings about the values of the fields."""
         return []
 
-    def completed(self, context: LawContext, x: jax.Array) -> Self:
+    def with_defaults(self, context: LawContext, x: jax.Array) -> Self:
         """The law with values that depend on the model and on the start x, (r, n), where none were
         given.
         """
@@ -385,9 +389,9 @@ class RobotLaw(TrackingLaw):
 
 @component
 class LawOfRobot(Law):
-    """command(t, x, ...) = law.command(t, x_1, x_2, ...): a law of q and q' in the closed loop.
+    """Adapter from `RobotLaw` to `Law`: calls the law with q = x[0], dq = x[1].
 
-    It is no part of a scenario.
+    The loop creates it (`law_of_x`); users do not.
 
     Args:
       law: any law of robots.
@@ -453,8 +457,8 @@ class LawOfRobot(Law):
 
 @contextmanager
 def _explained_for_wrappers(law: RobotLaw) -> Iterator[None]:
-    """Says what to change where a law of q and q' called a law of x that it contains as if that
-    were a law of q and q', with one argument too many.
+    """Turns the TypeError of a `RobotLaw` that calls a wrapped `Law` with (q, dq) into a message
+    with the remedy.
     """
     try:
         yield
@@ -521,6 +525,11 @@ def check_law(name: str, law: object, remedy: str) -> None:
     that it wraps.
     """
     checks.conforms(name, law, contract_of(law), remedy)
+    for former, present in former_names.ATTRIBUTES_OF_LAWS.items():
+        member = getattr(law, former, None)
+        if member is True or callable(member):
+            expected = f"`{present}` in its place"
+            raise checks.fail(f"{name}.{former}", checks.Words("a member"), expected)
     field = wrapped_field(law)
     if field:
         check_law(f"{name}.{field}", vars(law)[field], remedy)

@@ -5,13 +5,14 @@ model, and `surface_levels` with filters in their place; `barrier_backstepping` 
 
 All derivatives are along one trajectory (`core.taylor`): those of x_j of the orders up to r - j,
 those of the reference and of the bounds, and then, level by level, those of alpha_i and of w_i s_i
-of the orders up to r - i.  A curve is a list: a value, and its derivatives by time of the orders
-1, 2, ...  The index i of a loop is that of a row of x, so that level i + 1 is in row i.
+of the orders up to r - i.  A *curve* is the list [y, y', y'', ...] at t.  `i` counts rows of x from
+0, `level` = i + 1.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -47,7 +48,7 @@ class Level(NamedTuple):
     """The results of one level of the law."""
 
     alpha: jax.Array
-    """alpha_i, the desired value of level i + 1, (n,); u for the last level."""
+    """The virtual control alpha_i, which level i + 1 follows, (n,); u for the last level."""
     slope: jax.Array
     """w_i s_i, (n,)."""
 
@@ -69,8 +70,8 @@ def exact_levels(
         the plant, (n,) [N m].
       context: model, reference and bounds.
     """
-    plant, order = plants.as_plant(context.model), len(designs)
-    state_curve = _curve_of_state(plant, t, x, d_hat)
+    model, order = plants.as_plant(context.model), len(designs)
+    state_curve = _curve_of_state(model, t, x, d_hat)
     time_curve = taylor.curve_of_time(t, order + 1)
     centre_curve = taylor.in_time(context.reference.position, t, order)
     slope_curve: list[Any] = [None] * order
@@ -82,17 +83,10 @@ def exact_levels(
             context, i + 1, time_curve[: terms + 1], centre_curve[: terms + 1]
         )
         # The tube with its rates, and its derivatives.
-        c = centre_curve
-        tube_curve = [
-            Tube(c[m], c[m + 1], lower[m], upper[m], lower[m + 1], upper[m + 1])
-            for m in range(terms)
-        ]
+        tube_curve = [_tube_of(centre_curve, lower, upper, m) for m in range(terms)]
         if i == order - 1:
             tube_curve = [context.shifted_tube(tube_curve[0])]
-
-        def level_at(t, x, tube, slope_below, i=i, design=design):
-            return _level(design, i, plant, t, x, tube, slope_below, d_hat)
-
+        level_at = partial(_level, design, i, model, d_hat)
         curves = (time_curve[:terms], state_curve[:terms], tube_curve, slope_curve[:terms])
         level_curve = taylor.along(level_at, list(zip(*curves, strict=True)))
         levels.append(level_curve[0])
@@ -104,7 +98,7 @@ def exact_levels(
 
 def surface_levels(
     designs: Sequence[Design],
-    filters: jax.Array,
+    time_constants: jax.Array,
     t: jax.Array,
     x: jax.Array,
     d_hat: jax.Array,
@@ -114,22 +108,22 @@ def surface_levels(
     """All levels of a dynamic surface and their tubes; arguments as `exact_levels`.
 
     Args:
-      filters: mu_i, (r - 1, n) [s].
+      time_constants: mu_i of the filters, (r - 1, n) [s].
       state: beta_i, (r - 1, n).
     """
-    plant = plants.as_plant(context.model)
+    model = plants.as_plant(context.model)
     levels: list[Level] = []
     tubes = [context.tube(t, acceleration=False)]
     slope = None
     for i, design in enumerate(designs):
-        levels.append(_level(design, i, plant, t, x, tubes[i], slope, d_hat))
+        levels.append(_level(design, i, model, d_hat, t, x, tubes[i], slope))
         slope = levels[i].slope
         if i < len(designs) - 1:
-            rate = (levels[i].alpha - state[i]) / filters[i]
+            rate = (levels[i].alpha - state[i]) / time_constants[i]
             # The tube of the next level is around the output of the filter.
             times = taylor.curve_of_time(t, 2)
             lower, upper = _curve_of_bounds(context, i + 2, times, [state[i], rate])
-            tube = Tube(state[i], rate, lower[0], upper[0], lower[1], upper[1])
+            tube = _tube_of([state[i], rate], lower, upper, 0)
             if i == len(designs) - 2:
                 tube = context.shifted_tube(tube)
             tubes.append(tube)
@@ -139,31 +133,33 @@ def surface_levels(
 def _level(
     design: Design,
     i: int,
-    plant: Plant,
+    model: Plant,
+    d_hat: jax.Array,
     t: jax.Array,
     x: jax.Array,
     tube: Tube,
     slope_below: jax.Array | None,
-    d_hat: jax.Array,
 ) -> Level:
     """The virtual control alpha and the weighted slope of level i + 1 of (S.2).
 
     Args:
       design: of the level.
       i: its row in x.
-      plant: the model.
-      t, x, d_hat: as `exact_levels`.
-      tube: of x[i] around the virtual control of level i; its positions are in the unit of the
-        level.
-      slope_below: the weighted slope of level i, (n,); None for the first level.
+      model: of the law.
+      d_hat, t, x: as `exact_levels`.
+      tube: of x[i] around the virtual control of the level below; its positions are in the unit of
+        the level.
+      slope_below: the weighted slope of the level below, (n,); None for the first level.
     """
+    level = i + 1
+    below = level - 1
     barrier = design.barrier
     slope = barrier.slope(tube, x[i])
     gain = gain_at(design.decay, t, design.k, barrier, tube, x[i])
     rate = barrier.virtual_velocity(tube, x[i], gain, design.o)
     if slope_below is not None:
         ratio: Any = barrier.error_over_slope(tube, x[i])
-        coupling = plants.transposed_gain(plant, i, t, x, slope_below) * ratio
+        coupling = plants.transposed_gain(model, below, t, x, slope_below) * ratio
         if design.weight is not None:
             coupling = coupling / design.weight
         rate = rate - coupling
@@ -172,16 +168,23 @@ def _level(
     rates, torque = _rates_and_torque(d_hat)
     if rates is not None:
         rate = rate - rates[i]
-    alpha = plants.level_input(plant, i + 1, t, x, rate, torque)
+    alpha = plants.level_input(model, level, t, x, rate, torque)
     if design.weight is not None:
         slope = design.weight * slope
     return Level(alpha, slope)
 
 
+def _tube_of(
+    centre: list[jax.Array], lower: list[jax.Array], upper: list[jax.Array], m: int
+) -> Tube:
+    """Derivative m of a tube and of its rates, from the curves of its centre and of its bounds."""
+    return Tube(centre[m], centre[m + 1], lower[m], upper[m], lower[m + 1], upper[m + 1])
+
+
 # --- curves in time -----------------------------------------------------------------------------
 
 
-def _curve_of_state(plant: Plant, t: jax.Array, x: jax.Array, d_hat: jax.Array) -> list[jax.Array]:
+def _curve_of_state(model: Plant, t: jax.Array, x: jax.Array, d_hat: jax.Array) -> list[jax.Array]:
     """The state and its derivatives along the flow of the model, of the orders 0 to r - 1, (r, n)
     each.
 
@@ -189,13 +192,13 @@ def _curve_of_state(plant: Plant, t: jax.Array, x: jax.Array, d_hat: jax.Array) 
     Entries beyond that are 0 and are not used.
     """
     rates, torque = _rates_and_torque(d_hat)
-    order = plant.order
+    order = model.order
     zero = jnp.zeros_like(x[0])
 
     def rates_below_the_last(t, x):
         rows = []
         for level in range(1, order):
-            rate = plants.level_rate(plant, level, t, x, x[level], torque)
+            rate = plants.level_rate(model, level, t, x, x[level], torque)
             if rates is not None:
                 rate = rate + rates[level - 1]
             rows.append(rate)

@@ -482,15 +482,15 @@ def _unit_at(part: Any, tokens: list[str | int]) -> str:
 def _points(context: LawContext, dtype: DTypeLike) -> tuple[jax.Array, jax.Array]:
     """Times (POINTS,) and states (POINTS, r, n) inside the bounds of the first level."""
     rng = np.random.default_rng(0)
-    plant = plants.as_plant(context.model)
+    model = plants.as_plant(context.model)
     times = jnp.asarray(rng.uniform(0.0, 5.0, POINTS), dtype)
-    spread = jnp.asarray(rng.uniform(-0.5, 0.5, (POINTS, plant.order, plant.n)), dtype)
+    spread = jnp.asarray(rng.uniform(-0.5, 0.5, (POINTS, model.order, model.n)), dtype)
     states = []
     for t, (q, dq, *above_second) in zip(times, spread, strict=True):
         tube = context.tube(t)
         q = tube.q_d + q * jnp.minimum(tube.k_l, tube.k_u)
         dq = tube.dq_d + dq
-        steady = plant.steady_levels(q, dq)
+        steady = model.steady_levels(q, dq)
         if steady is not None and above_second:
             above_second = [*(jnp.stack(above_second) + steady)]
         states.append(jnp.stack([q, dq, *above_second]))

@@ -261,7 +261,9 @@ def with_energy_decay(
 
 
 def virtual_velocity(law, t: jax.Array, q: jax.Array, context: LawContext) -> jax.Array:
-    """Alpha, (n,) [rad/s], of a law with `barrier`, `k1`, `o`, and with `decays` or without."""
+    """The virtual velocity alpha, (n,) [rad/s], of a law with `barrier`, `k1` and `o`, with or
+    without `decays`.
+    """
     tube = context.tube(t, acceleration=False)
     k1 = gain_at(decay_of(law, 0), t, law.k1, law.barrier, tube, q)
     return law.barrier.virtual_velocity(tube, q, k1, law.o)

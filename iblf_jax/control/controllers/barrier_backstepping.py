@@ -222,7 +222,7 @@ class BarrierBackstepping(Law):
 
     # --- checks against a scenario ----------------------------------------------------------------
 
-    def completed(self, context: LawContext, x: jax.Array) -> BarrierBackstepping:
+    def with_defaults(self, context: LawContext, x: jax.Array) -> BarrierBackstepping:
         """The law with weights, (r, n), that belong to its model and to a state x."""
         if self.weights is not None or plants.order_of(context.model) != self.order:
             return self
@@ -390,8 +390,8 @@ class BarrierBackstepping(Law):
             V = V + self.weights[i] * barrier.value(tube, x[i])
             guard_active |= guard_is_active(tube, x[i], barrier.guard)
         saturated = jnp.zeros_like(guard_active)
-        plant = plants.as_plant(context.model)
-        slope = plants.transposed_gain(plant, self.order, t, x, levels[-1].slope)
+        model = plants.as_plant(context.model)
+        slope = plants.transposed_gain(model, self.order, t, x, levels[-1].slope)
         alpha_higher: Any = ()
         if self.order > 2:
             alpha_higher = jnp.stack([tube.q_d for tube in tubes[2:]])

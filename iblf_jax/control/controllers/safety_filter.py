@@ -31,7 +31,7 @@ in acceleration as `nearest` says; the command holds it, runs record it, and it 
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -99,7 +99,7 @@ class SafetyFilter(Wrapping):
     shape1: str = static(default="linear")
     shape2: str = static(default="linear")
     margin: Leaf = leaf("rad/s^2", sign="nonnegative", default=None)
-    filters: ClassVar[bool] = True
+    has_slack: ClassVar[bool] = True
     needs_robot: ClassVar[bool] = True
 
     def check(self) -> None:
@@ -168,7 +168,10 @@ class SafetyFilter(Wrapping):
         torque, acceleration = M, unit
         if self.nearest == "torque":
             torque, acceleration = unit, jnp.stack([solve_spd(M, row) for row in unit])
-        rows = [(acceleration, highest - nominal, 1.0), (-acceleration, nominal - lowest, 1.0)]
+        conditions = [
+            Condition(acceleration, highest - nominal, is_soft=True),
+            Condition(-acceleration, nominal - lowest, is_soft=True),
+        ]
         if context.regions:
             levels = context.regions_along(q, dq)
             room = (
@@ -177,28 +180,39 @@ class SafetyFilter(Wrapping):
                 + (self.b1 + self.b2) * levels.rate
                 + self.b1 * self.b2 * levels.level
             )
-            rows.append((-matmul(levels.slope, acceleration), room, 1.0))
+            conditions.append(Condition(-matmul(levels.slope, acceleration), room, is_soft=True))
         saturated = command.saturated
         if self.limit is not None:
-            rows += [(torque, self.limit - tau_law, 0.0), (-torque, self.limit + tau_law, 0.0)]
+            conditions += [
+                Condition(torque, self.limit - tau_law, is_soft=False),
+                Condition(-torque, self.limit + tau_law, is_soft=False),
+            ]
             saturated = saturated | (jnp.abs(tau_law) > self.limit)
-        found = _nearest(rows)
-        n = len(q)
-        slack = jnp.maximum(found.slack[:n], found.slack[n : 2 * n])
-        region_slack: Any = ()
-        if context.regions:
-            region_slack = found.slack[2 * n : 2 * n + len(context.regions)]
+        found = _nearest(conditions)
+        n, m = len(q), len(context.regions)
+        above, below, of_regions, _ = jnp.split(found.slack, [n, 2 * n, 2 * n + m])
+        slack = jnp.maximum(above, below)
+        region_slack: Any = of_regions if context.regions else ()
         command = command._replace(tau=tau_law + matvec(torque, found.x), saturated=saturated)
         return command._replace(slack=slack, region_slack=region_slack), rate
 
 
-def _nearest(rows: list[tuple[jax.Array, jax.Array, float]]) -> Solution:
-    """The smallest x with  row x <= room  for all rows (row, room, 1 if it may be violated, else
-    0); zero if no row has a negative room.
-    """
-    room = jnp.concatenate([room for _, room, _ in rows])
-    soft = jnp.concatenate([jnp.full_like(room, is_soft) for _, room, is_soft in rows])
-    G = jnp.concatenate([row for row, _, _ in rows])
+class Condition(NamedTuple):
+    """m conditions  rows x <= room  on the change x of the torque or of the acceleration."""
+
+    rows: jax.Array
+    """(m, n)."""
+    room: jax.Array
+    """(m,)."""
+    is_soft: bool
+    """Whether they may be violated, by a slack."""
+
+
+def _nearest(conditions: list[Condition]) -> Solution:
+    """The smallest x that meets all conditions; zero if none has a negative room."""
+    room = jnp.concatenate([x.room for x in conditions])
+    soft = jnp.concatenate([jnp.full_like(x.room, float(x.is_soft)) for x in conditions])
+    G = jnp.concatenate([x.rows for x in conditions])
     found = quadratic_program(jnp.eye(G.shape[1], dtype=G.dtype), G, room, soft)
     free = jnp.all(room >= 0)
     return Solution(*(jnp.where(free, 0.0, x) for x in found))

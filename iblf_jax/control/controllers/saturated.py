@@ -66,7 +66,7 @@ from iblf_jax.core.pytree import Leaf, component, is_absent, leaf, static
 from iblf_jax.core.units import INPUT
 from iblf_jax.world import plants
 from iblf_jax.world.robots import Robot
-from iblf_jax.world.robots._base import is_robot
+from iblf_jax.world.robots._base import has_mass_matrix
 
 EDGES = ("hard", "smooth")
 SHARPNESS = 8
@@ -155,7 +155,7 @@ class Saturated(Wrapping):
         if self.auxiliary is None:
             command, rate = self.inner.command(t, x, d_hat, context, state)
             return self._limited(command), rate
-        plant, shift = plants.as_plant(context.model), self.shift(state)
+        model, shift = plants.as_plant(context.model), self.shift(state)
         if self.law.takes_shift:
             shifted = context._replace(shift=shift)
             command, rate = self.inner.command(t, x, d_hat, shifted, state.law)
@@ -163,11 +163,11 @@ class Saturated(Wrapping):
             # The command of (A.4), for a law that does not take the shift.
             y = _at_shifted_state(x, shift.value)
             command, rate = self.inner.command(t, y, d_hat, context, state.law)
-            without_limit = plants.level_rate(plant, plant.order, t, y, command.tau)
-            tau = plants.level_input(plant, plant.order, t, x, without_limit + shift.rate)
-            command = _with_shifted_control(command._replace(tau=tau), plant.order, shift.value)
+            without_limit = plants.level_rate(model, model.order, t, y, command.tau)
+            tau = plants.level_input(model, model.order, t, x, without_limit + shift.rate)
+            command = _with_shifted_control(command._replace(tau=tau), model.order, shift.value)
         limited = self._limited(command)
-        effect = plants.gain_times(plant, plant.order, t, x, limited.tau - command.tau)
+        effect = plants.gain_times(model, model.order, t, x, limited.tau - command.tau)
         auxiliary_rate = AuxiliaryState(rate, shift.rate + effect)
         return limited._replace(auxiliary=state.auxiliary), auxiliary_rate
 
@@ -236,7 +236,7 @@ def within_effort(law: TrackingLaw, robot: Robot, *, edge: str = "hard") -> Trac
     Raises:
       ValueError: as `Saturated`.
     """
-    effort = robot.effort if is_robot(robot) else None
+    effort = robot.effort if has_mass_matrix(robot) else None
     if effort is None or (checks.is_concrete(effort) and not np.isfinite(effort).any()):
         return law
     limit = jnp.where(jnp.isfinite(effort), effort, UNLIMITED)

@@ -62,7 +62,9 @@ class Decay(Part):
         return None
 
     def deadline(self) -> jax.Array | None:
-        """The time by which V has decayed to what the gain until then implies, (n,) [s]."""
+        """Time from which z <= z(0) exp(-k T) (2c/T)^gain holds, as `PrescribedTime` states, (n,)
+        [s]; None without.
+        """
         return None
 
 

@@ -14,11 +14,11 @@ from typing import Any, Self
 
 import jax
 
-from iblf_jax.core import families
+from iblf_jax.core import checks, families
 from iblf_jax.core.families import attribute, is_default
 from iblf_jax.core.pytree import Leaf, component
 from iblf_jax.core.time import Timed
-from iblf_jax.world.plants import Plant, robot_inside
+from iblf_jax.world.plants import Plant
 from iblf_jax.world.robots import Robot
 
 State = Any
@@ -191,18 +191,18 @@ class ObserverOfRobot(Observer):
 
     def init(self, x: jax.Array, model: Plant) -> State:
         """State of the observer."""
-        return self.observer.init(x[0], x[1], robot_inside(model))
+        return self.observer.init(x[0], x[1], checks.given(model.robot))
 
     def estimate(self, t: jax.Array, x: jax.Array, model: Plant, state: State) -> jax.Array:
         """f_hat, (n,) [N m]."""
-        return self.observer.estimate(t, x[0], x[1], robot_inside(model), state)
+        return self.observer.estimate(t, x[0], x[1], checks.given(model.robot), state)
 
     def derivative(
         self, t: jax.Array, x: jax.Array, u: jax.Array, model: Plant, state: State
     ) -> State:
         """Rate of the observer's state under the torque on the joints."""
         q, dq, tau = x[0], x[1], _torque_on_joints(model, x, u)
-        return self.observer.derivative(t, q, dq, tau, robot_inside(model), state)
+        return self.observer.derivative(t, q, dq, tau, checks.given(model.robot), state)
 
     def advance(
         self,
@@ -215,14 +215,12 @@ class ObserverOfRobot(Observer):
     ) -> State | None:
         """The observer's state a period later under the torque on the joints."""
         q, dq, tau = x[0], x[1], _torque_on_joints(model, x, u)
-        return self.observer.advance(t, q, dq, tau, robot_inside(model), state, period)
+        return self.observer.advance(t, q, dq, tau, checks.given(model.robot), state, period)
 
 
 def _torque_on_joints(model: Plant, x: jax.Array, u: jax.Array) -> jax.Array:
     """The torque on the joints of the robot inside a plant, (n,) [N m]."""
-    torque = model.joint_torque(x, u)
-    assert torque is not None
-    return torque
+    return checks.given(model.joint_torque(x, u))
 
 
 def contract_of(observer: object) -> type[Observer] | type[RobotObserver]:

@@ -66,11 +66,9 @@ class ExtendedState(RobotObserver):
     @property
     def _gains(self) -> tuple[jax.Array, jax.Array]:
         """l1 [1/s] and l2 [1/s^2], (n,)."""
-        return (
-            (self.l1, self.l2)
-            if self.bandwidth is None
-            else (2.0 * self.bandwidth, self.bandwidth**2)
-        )
+        if self.bandwidth is None:
+            return self.l1, self.l2
+        return 2.0 * self.bandwidth, self.bandwidth**2
 
     def init(self, q: jax.Array, dq: jax.Array, model: Robot) -> ExtendedStateValues:
         """The measured momentum, and no estimate yet."""
@@ -145,14 +143,12 @@ class ExtendedState(RobotObserver):
 def _even_cosh(square: jax.Array) -> jax.Array:
     """Cosh of a root, real or not, by its square."""
     root = jnp.sqrt(jnp.maximum(jnp.abs(square), 1e-12))
-    return jnp.where(
-        jnp.abs(square) < 1e-12, 1.0, jnp.where(square > 0, jnp.cosh(root), jnp.cos(root))
-    )
+    cosh = jnp.where(square > 0, jnp.cosh(root), jnp.cos(root))
+    return jnp.where(jnp.abs(square) < 1e-12, 1.0, cosh)
 
 
 def _even_sinh(square: jax.Array) -> jax.Array:
     """Sinh of a root divided by it, real or not, by its square."""
     root = jnp.sqrt(jnp.maximum(jnp.abs(square), 1e-12))
-    return jnp.where(
-        jnp.abs(square) < 1e-12, 1.0, jnp.where(square > 0, jnp.sinh(root), jnp.sin(root)) / root
-    )
+    sinh = jnp.where(square > 0, jnp.sinh(root), jnp.sin(root))
+    return jnp.where(jnp.abs(square) < 1e-12, 1.0, sinh / root)

@@ -26,13 +26,13 @@ if not TYPE_CHECKING:  # with it, a type checker would accept every name
 
 MEMBERS = {"ideal": Ideal, "encoder": Encoder, "levels": Levels}
 """Every sensor by the name that a scenario file gives it."""
-LEVELS = {"direct": Direct, "unmeasured": Unmeasured}
+LEVEL_SENSORS = {"direct": Direct, "unmeasured": Unmeasured}
 """Every sensor of one level by the name that a scenario file gives it."""
 VELOCITIES = {"measured": Measured, "filtered_difference": FilteredDifference, "tracking": Tracking}
 """Every velocity estimate by the name that a scenario file gives it."""
 
 __all__ = [
-    "LEVELS",
+    "LEVEL_SENSORS",
     "MEMBERS",
     "VELOCITIES",
     "AnySensor",

@@ -75,9 +75,10 @@ class Encoder(RobotSensor):
         self, q: jax.Array, dq: jax.Array, normal: jax.Array, period: jax.Array, state: State
     ) -> tuple[Measurement, State]:
         """The position in counts, and the velocity."""
-        noisy = q + self.offset if self.noise is None else q + self.offset + self.noise * normal[0]
-        y = self._read(noisy)
-        v, state = self.velocity.estimate(
-            y, dq, normal[int(self.noise is not None) :], period, state
-        )
+        position = q + self.offset
+        if self.noise is not None:
+            position = position + self.noise * normal[0]
+            normal = normal[1:]
+        y = self._read(position)
+        v, state = self.velocity.estimate(y, dq, normal, period, state)
         return Measurement(y, v), state

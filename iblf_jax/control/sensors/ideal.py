@@ -12,7 +12,7 @@ from iblf_jax.core.pytree import component
 
 @component
 class Ideal(RobotSensor):
-    """Q and q' as they are.  Source: none; the baseline."""
+    """Position q and velocity q' as they are.  Source: none; the baseline."""
 
     draws: ClassVar[int] = 0
 

@@ -44,8 +44,8 @@ class Levels(Sensor):
     `Levels((Encoder(...), Direct(noise=0.01)))`.
 
     Args:
-      parts: any of `iblf_jax.sensors.MEMBERS` or `iblf_jax.sensors.LEVELS`; None for a level that
-        is not measured.
+      parts: any of `iblf_jax.sensors.MEMBERS` or `iblf_jax.sensors.LEVEL_SENSORS`; None for a level
+        that is not measured.
 
     Source: none; the construction is common.
     """
@@ -54,18 +54,17 @@ class Levels(Sensor):
 
     def check(self) -> None:
         """Raises ValueError for a part that is no sensor; replaces None by `Unmeasured()`."""
-        name, remedy = "Levels.parts", "iblf_jax.sensors.MEMBERS and LEVELS have them."
+        name, remedy = "Levels.parts", "iblf_jax.sensors.MEMBERS and LEVEL_SENSORS have them."
         if not isinstance(self.parts, tuple | list) or not self.parts:
             raise checks.fail(name, self.parts, "a tuple of sensors", remedy)
         parts = tuple(Unmeasured() if part is None else part for part in self.parts)
         for i, part in enumerate(parts):
-            is_of_level = has_members(part, "levels") and part.levels == 1
             if contract_of(part) is Sensor:
                 expected = "a sensor of one or two levels"
                 raise checks.fail(f"{name}[{i}]", type(part).__name__, expected, remedy)
-            checks.conforms(
-                f"{name}[{i}]", part, LevelSensor if is_of_level else RobotSensor, remedy
-            )
+            is_of_level = has_members(part, "levels") and part.levels == 1
+            base = LevelSensor if is_of_level else RobotSensor
+            checks.conforms(f"{name}[{i}]", part, base, remedy)
         object.__setattr__(self, "parts", parts)
 
     def spans(self) -> Iterator[Span]:

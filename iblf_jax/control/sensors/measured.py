@@ -13,7 +13,7 @@ from iblf_jax.core.units import VELOCITY
 
 @component
 class Measured(Velocity):
-    """V = q' + noise w,   w standard normal.
+    """The velocity v = q' + noise w,   w standard normal.
 
     Args:
       noise: standard deviation, () or (n,) [rad/s], >= 0; 0 if not given.

@@ -31,7 +31,6 @@ from iblf_jax.world.plants._base import level_names as level_names
 from iblf_jax.world.plants._base import level_rate as level_rate
 from iblf_jax.world.plants._base import nominal_of as nominal_of
 from iblf_jax.world.plants._base import order_of as order_of
-from iblf_jax.world.plants._base import robot_inside as robot_inside
 from iblf_jax.world.plants._base import robot_of as robot_of
 from iblf_jax.world.plants._base import speed_limit as speed_limit
 from iblf_jax.world.plants._base import state_of_levels as state_of_levels

@@ -28,7 +28,7 @@ from iblf_jax.core.status import VELOCITY_LIMIT
 from iblf_jax.core.units import ByLevel, Unit, per_second, product
 from iblf_jax.kernels import jaxprs
 from iblf_jax.world.robots import Dynamics, Robot, joint_names
-from iblf_jax.world.robots._base import is_robot
+from iblf_jax.world.robots._base import has_mass_matrix
 
 Units = str | tuple[str, ...]
 """The unit of a level: one for all its components, or one for each."""
@@ -296,7 +296,7 @@ def order_of(part: Any) -> int:
 
 def nominal_of(part: Any) -> Any:
     """The plant that laws know: the part itself, or the plant inside one with modes."""
-    if is_chain(part) or is_robot(part):
+    if is_chain(part) or has_mass_matrix(part):
         return part.nominal
     return part
 
@@ -319,18 +319,10 @@ def robot_of(part: Any) -> Any:
     return part
 
 
-def robot_inside(plant: Plant) -> Robot:
-    """The robot inside a plant, for what a scenario has only with one: regions, and observers of
-    robots.
-    """
-    assert plant.robot is not None
-    return plant.robot
-
-
 def declared_joints(part: Any) -> tuple[str, ...]:
     """The names that a robot, or the robot inside a plant, gives its joints; () without names."""
     robot = robot_of(part)
-    return tuple(robot.joints) if is_robot(robot) else ()
+    return tuple(robot.joints) if has_mass_matrix(robot) else ()
 
 
 def level_rate(

@@ -100,9 +100,8 @@ class Rigid(Plant):
 
 @component
 class RobotPlant(Rigid):
-    """M0(q) q" + C0(q, q') q' + G0(q) = tau + f: a robot in the closed loop.
-
-    Its uncertain term is the torque f.  It is no part of a scenario, which has the robot itself.
+    """A `Rigid` whose uncertain term is the torque f, (n,), instead of rates, (2, n).  The loop
+    wraps robots in it.
 
     Args:
       robot: any of `iblf_jax.robots`.

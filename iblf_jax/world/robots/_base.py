@@ -164,7 +164,7 @@ class Robot(Dynamics):
         return coriolis + gravity + matvec(self.mass_matrix(q), acceleration)
 
 
-def is_robot(part: object) -> TypeGuard[Robot]:
+def has_mass_matrix(part: object) -> TypeGuard[Robot]:
     """Whether an object has a mass matrix.  A class without the base class is adopted."""
     if isinstance(part, type) or not has_members(part, "n", "mass_matrix"):
         return False
@@ -173,7 +173,7 @@ def is_robot(part: object) -> TypeGuard[Robot]:
 
 
 def _check_robot(robot: Any) -> None:
-    if not is_robot(robot):
+    if not has_mass_matrix(robot):
         checks.offers("robot", robot, ("n", "mass_matrix"), "a robot, as iblf_jax.robots.Robot")
 
 
@@ -240,7 +240,7 @@ def coriolis_from_mass_matrix(mass_matrix, q: jax.Array, v: jax.Array, u: jax.Ar
 def joint_names(robot: Robot, n: int) -> tuple[str, ...]:
     """Names of the n joints of a robot: its `joints`, else "joint 0", "joint 1", ..."""
     n = checks.positive_integer("n", n, least=0, most=checks.MAX_JOINTS)
-    if is_robot(robot) and len(robot.joints) == n:
+    if has_mass_matrix(robot) and len(robot.joints) == n:
         return tuple(map(str, robot.joints))
     return tuple(f"joint {i}" for i in range(n))
 
