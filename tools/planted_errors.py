@@ -189,6 +189,7 @@ def stages(graph: Graph, fault: Fault) -> list[list[str]]:
 def failures(copy: Path, tests: Sequence[str], marks: str | None) -> list[str]:
     """The tests that fail in a copy of the repository, up to the first; empty if none does."""
     command = [sys.executable, "-m", "pytest", "-x", "-rfE", "--tb=no", "-p", "no:cacheprovider"]
+    command += ["--dist", "load"]  # in the order of the files
     if marks is not None:
         command += ["-m", marks]
     done = subprocess.run(
