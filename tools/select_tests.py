@@ -420,7 +420,7 @@ class Reader(ast.NodeVisitor):
     def visit_JoinedStr(self, node: ast.JoinedStr) -> None:
         """A text with values; as a name of a module it leads to all that it may name."""
         inserted = [x for x in node.values if not isinstance(x, ast.Constant)]
-        texts = ["" if x in inserted else x.value for x in node.values]  # type: ignore[attr-defined]
+        texts = ["" if x in inserted else x.value for x in node.values]
         self.text("".join(texts))
         for part in inserted:
             self.visit(part)
