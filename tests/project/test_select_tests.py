@@ -1,0 +1,254 @@
+"""Which tests a change selects (`tools/select_tests.py`), in a small package and in this one."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from conftest import ROOT
+
+sys.path.insert(0, str(ROOT / "tools"))
+import select_tests
+from select_tests import Graph, selected
+
+FILES = {
+    "iblf_jax/__init__.py": """
+        from iblf_jax.first_use import on_first_use
+        from iblf_jax.world import robots as robots
+        TABLE = {"tune": ("iblf_jax.tuning", "tune"), "proofs": ("iblf_jax.proofs", None)}
+        __getattr__ = on_first_use(__name__, TABLE)
+        """,
+    "iblf_jax/first_use.py": """
+        import importlib
+        def on_first_use(package, table):
+            return lambda name: importlib.import_module(table[name][0])
+        """,
+    "iblf_jax/world/__init__.py": "",
+    "iblf_jax/world/robots.py": """
+        from iblf_jax.presentation import present
+        from iblf_jax.world.links import LENGTH
+        class Arm:
+            def plot(self):
+                return present("arm figure")
+            def length(self):
+                return LENGTH
+        def load(): ...
+        """,
+    "iblf_jax/world/links.py": "LENGTH = 1.0",
+    "iblf_jax/presentation.py": """
+        import importlib
+        TABLE = {"arm figure": ("iblf_jax.plotting", "arm"), "page": ("iblf_jax.proofs", "page")}
+        def present(name):
+            module, function = TABLE[name]
+            return getattr(importlib.import_module(module), function)()
+        """,
+    "iblf_jax/plotting.py": "def arm(): ...",
+    "iblf_jax/tuning/__init__.py": "from iblf_jax.tuning.search import tune as tune",
+    "iblf_jax/tuning/search.py": """
+        def tune():
+            from iblf_jax.tuning.starts import first
+            return first()
+        """,
+    "iblf_jax/tuning/starts.py": "def first(): ...",
+    "iblf_jax/tuning/c/tune.h": "",
+    "iblf_jax/proofs.py": "def page(): ...",
+    "iblf_jax/files.py": """
+        import importlib
+        COMMANDS = ("starts",)
+        def command(name):
+            return importlib.import_module(f"iblf_jax.tuning.{name}")
+        """,
+    "iblf_jax/registry.py": """
+        from iblf_jax.world.links import LENGTH
+        register(LENGTH)
+        NAMES = ()
+        """,
+    "iblf_jax/core/checks.py": "",
+    "tests/conftest.py": """
+        import iblf_jax as ij
+        def tuned():
+            return ij.tune()
+        def scene():
+            return "scene.txt"
+        """,
+    "tests/cases.py": """
+        import iblf_jax as ij
+        CASES = [ij.tune]
+        WORDS = []
+        """,
+    "tests/data/arm.urdf": "",
+    "tests/scene.txt": "",
+    "docs/page.md": "",
+    "README.md": "",
+    "LICENSE": "",
+}
+TESTS = {
+    "robot": "import iblf_jax as ij\ndef test(): ij.robots.load()",
+    "length": "from iblf_jax.world.robots import Arm\ndef test(): Arm().length()",
+    "plot": "import iblf_jax as ij\ndef test(): ij.robots.Arm().plot()",
+    "tune": "import iblf_jax as ij\ndef test(): ij.tune()",
+    "submodule": "import iblf_jax.tuning\ndef test(): iblf_jax.tuning.tune()",
+    "fixture": "def test(tuned): ...",
+    "helper": "from cases import CASES\ndef test(): CASES",
+    "words": "from cases import WORDS\ndef test(): WORDS",
+    "proof": "import iblf_jax as ij\ndef test(): ij.proofs.page()",
+    "all_names": "import iblf_jax as ij\ndef test(): [getattr(ij, x) for x in dir(ij)]",
+    "script": "CODE = 'import iblf_jax as ij\\nij.tune()'\ndef test(): run(CODE)",
+    "command": "def test(): run('python', '-m', 'iblf_jax', 'tune')",
+    "by_name": "from iblf_jax.files import command\ndef test(): command('starts')",
+    "registered": "from iblf_jax.registry import NAMES\ndef test(): NAMES",
+    "data": "def test(): open('data/arm.urdf')",
+    "pages": "def test(): ROOT.glob('*.md')",
+    "site": "def test(): ROOT / 'docs' / 'page.md'",
+    "run_helper": "def test(): run('cases.py')",
+}
+
+
+@pytest.fixture(scope="module")
+def graph(tmp_path_factory) -> Graph:
+    """The small package."""
+    root = tmp_path_factory.mktemp("repository")
+    tests = {f"tests/folder/test_{name}.py": text for name, text in TESTS.items()}
+    for name, text in (FILES | tests).items():
+        path = root / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(select_tests.textwrap.dedent(text))
+    return Graph(root)
+
+
+def names(graph: Graph, *changed: str) -> set[str] | None:
+    """The tests that a change selects; None for all."""
+    found = selected(graph, changed)
+    return None if found == ["tests"] else {Path(x).stem.removeprefix("test_") for x in found}
+
+
+USE_ALL = {"all_names", "command", "site"}
+"""Tests that use the whole package."""
+TUNE = {"tune", "submodule", "fixture", "helper", "script", "run_helper"} | USE_ALL
+
+
+@pytest.mark.parametrize(
+    ("changed", "tests"),
+    [
+        ("iblf_jax/world/robots.py", {"robot", "length", "plot"} | USE_ALL),
+        ("iblf_jax/world/links.py", {"length", "registered"} | USE_ALL),
+        ("iblf_jax/plotting.py", {"plot", "command", "site"}),
+        ("iblf_jax/tuning/search.py", {"by_name"} | TUNE),
+        ("iblf_jax/tuning/__init__.py", TUNE),
+        ("iblf_jax/tuning/starts.py", {"by_name"} | TUNE),
+        ("iblf_jax/proofs.py", {"proof"} | USE_ALL),
+        ("iblf_jax/tuning/c/tune.h", {"by_name"} | TUNE),
+        ("tests/cases.py", {"helper", "words", "run_helper"}),
+        ("tests/data/arm.urdf", {"data"}),
+        ("tests/folder/test_tune.py", {"tune"}),
+        ("tests/folder/test_that_was_removed.py", set()),
+        ("docs/page.md", {"pages", "site"}),
+        ("docs/another/page.txt", {"site"}),
+        ("README.md", {"pages"}),
+        ("tests/scene.txt", set(TESTS)),
+    ],
+)
+def test_a_file_selects_the_tests_that_reach_it(graph, changed, tests):
+    assert names(graph, changed) == tests
+
+
+@pytest.mark.parametrize(
+    "changed",
+    ["LICENSE", "iblf_jax/core/checks.py", "tests/conftest.py", "pyproject.toml", ".ci/run", "new"],
+)
+def test_what_all_depend_on_or_nobody_knows_selects_all(graph, changed):
+    assert names(graph, "tests/folder/test_tune.py", changed) is None
+
+
+def test_a_change_of_several_files_selects_the_tests_of_each(graph):
+    assert names(graph, "tests/data/arm.urdf", "README.md") == {"data", "pages"}
+
+
+def test_what_is_used_directly_is_nearer(graph):
+    reaching = graph.reaching("iblf_jax/tuning/search.py")
+    assert reaching["tests/folder/test_tune.py"] < reaching["tests/folder/test_fixture.py"]
+
+
+# --- where a change begins ------------------------------------------------------------------------
+
+
+@pytest.fixture
+def repository(tmp_path, monkeypatch) -> Path:
+    """A repository with two commits on main, and two more on a branch, which is checked out."""
+    for name in [x for x in os.environ if x.startswith("GIT_")]:
+        monkeypatch.delenv(name)
+    monkeypatch.setattr(select_tests, "ROOT", tmp_path)
+    run(tmp_path, "init", "--quiet", "--initial-branch=main")
+    for name in ("a", "b"):
+        commit(tmp_path, name)
+    run(tmp_path, "checkout", "--quiet", "-b", "branch")
+    for name in ("c", "d"):
+        commit(tmp_path, name)
+    return tmp_path
+
+
+def run(folder: Path, *arguments: str) -> None:
+    identity = ("-c", "user.name=A", "-c", "user.email=a@b.c")
+    subprocess.run(["git", *identity, *arguments], cwd=folder, check=True, capture_output=True)
+
+
+def commit(folder: Path, name: str) -> None:
+    (folder / name).write_text(name)
+    run(folder, "add", name)
+    run(folder, "commit", "--quiet", "-m", name)
+
+
+def changed() -> list[str] | None:
+    """The files of the change."""
+    base = select_tests.base_of_change()
+    return None if base is None else select_tests.changed_files(base)
+
+
+def test_a_branch_changes_what_it_adds_to_main(repository):
+    (repository / "new").write_text("")
+    (repository / "a").write_text("another")
+    assert changed() == ["a", "c", "d", "new"]
+
+
+def test_a_merge_changes_what_it_adds_to_main(repository):
+    run(repository, "checkout", "--quiet", "main")
+    run(repository, "merge", "--quiet", "--no-ff", "branch")
+    assert changed() == ["c", "d"]
+
+
+def test_on_main_nobody_knows_where_the_change_begins(repository):
+    run(repository, "checkout", "--quiet", "main")
+    assert changed() is None
+
+
+def test_a_base_that_does_not_exist_is_not_known(repository):
+    assert select_tests.changed_files("0" * 40) is None
+
+
+def test_a_removed_file_is_changed(repository):
+    (repository / "b").unlink()
+    assert changed() == ["b", "c", "d"]
+
+
+# --- this repository ------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_changes_of_this_package():
+    """A barrier reaches what is about laws, a proof what is about proofs."""
+    graph = Graph()
+    proofs = names(graph, "iblf_jax/proofs/arms.py")
+    assert proofs >= {"arm_proofs", "attacks", "prove", "cli", "results", "site", "field"}
+    assert not proofs & {"arm", "barriers", "decays", "lowering_math", "references"}
+    assert len(proofs) < len(graph.tests) / 2
+    barriers = names(graph, "iblf_jax/control/barriers/tan.py")
+    assert barriers >= {"barriers", "barriers_systems", "contracts", "testing", "costs"}
+    assert names(graph, "iblf_jax/deployment/ros2/templates/setup.cfg") >= {"ros_package"}
+    assert names(graph, "tests/data/costs.json") >= {"costs"}
+    assert names(graph, "tests/independent_chains.py") >= {"strict_feedback", "chains"}
+    for data in (ROOT / "tests" / "data").iterdir():
+        assert names(graph, data.relative_to(ROOT).as_posix()), data
+    assert names(graph, "iblf_jax/kernels/c/interval.h") is None
