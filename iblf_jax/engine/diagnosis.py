@@ -520,6 +520,6 @@ def _infeasible(result: Rollout, steps: int) -> ValueError:
         float(q_d[sample, joint]),
         f"a value inside the bounds ({float(lower[sample, joint]):.6g},"
         f" {float(upper[sample, joint]):.6g}) at {where}",
-        f"{remedy} A law that keeps the bounds whatever the reference is has has_slack = True, and"
-        " its Command a slack.",
+        f"{remedy} A law that keeps the bounds whatever the reference is states has_slack = True,"
+        " and its Command has a slack.",
     )
