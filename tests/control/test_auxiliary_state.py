@@ -158,7 +158,7 @@ def test_the_rate_of_V_of_a_chain_with_bounds_of_every_level(coupled, rng):
         state = LoopState(np.asarray(x), AuxiliaryState((), aux), ())
         proof = terms(coupled, jnp.asarray(t), jax.tree.map(jnp.asarray, state))
         claim = proof.claims["levels"]
-        left = proof.dV + claim.dissipation - claim.growth
+        left = proof.dV + claim.dissipation - claim.disturbance_gain
         assert not proof.excluded
         np.testing.assert_allclose(left, 0.0, atol=1e-12 * proof.size)
 
