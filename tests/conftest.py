@@ -15,7 +15,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 os.environ.setdefault("MPLBACKEND", "Agg")
-# On a machine with a GPU, too.  `JAX_PLATFORMS=cuda,cpu` runs test_lowering_gpu.py on it.
+# On a machine with a GPU, too.  `JAX_PLATFORMS=cuda,cpu` runs test_cuda.py on it.
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 # In the environment, for notebooks, benchmarks and commands too, which are processes of their own.
 # Few programs are met twice, and to keep what is compiled takes longer (15 to 25 % of a test file's

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_lowering import DT, PRESET, STANDARD, carry_of, evaluate, numbers
+from test_from_jaxpr import DT, PRESET, STANDARD, carry_of, evaluate, numbers
 
 import iblf_jax as ij
 from iblf_jax.core.status import Status

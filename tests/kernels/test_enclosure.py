@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import mpmath
 import numpy as np
 import pytest
-from test_lowering_backends import needs_compiler
+from test_cpu import needs_compiler
 
 from iblf_jax.kernels import enclosure, toolchain
 from iblf_jax.kernels.enclosure import enclose

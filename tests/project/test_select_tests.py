@@ -242,13 +242,13 @@ def test_changes_of_this_package():
     graph = Graph()
     proofs = names(graph, "iblf_jax/proofs/arms.py")
     assert proofs >= {"arm_proofs", "attacks", "prove", "cli", "results", "site", "field"}
-    assert not proofs & {"arm", "barriers", "decays", "lowering_math", "references"}
+    assert not proofs & {"arm", "decays"}
     assert len(proofs) < len(graph.tests) / 2
     barriers = names(graph, "iblf_jax/control/barriers/tan.py")
-    assert barriers >= {"barriers", "barriers_systems", "contracts", "testing", "costs"}
+    assert barriers >= {"decays", "laws"}
     assert names(graph, "iblf_jax/deployment/ros2/templates/setup.cfg") >= {"ros_package"}
     assert names(graph, "tests/data/costs.json") >= {"costs"}
-    assert names(graph, "tests/independent_chains.py") >= {"strict_feedback", "chains"}
+    assert names(graph, "tests/independent_chains.py") >= {"strict_feedback", "decays"}
     for data in (ROOT / "tests" / "data").iterdir():
         assert names(graph, data.relative_to(ROOT).as_posix()), data
     assert names(graph, "iblf_jax/kernels/c/interval.h") is None

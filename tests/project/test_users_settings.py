@@ -22,14 +22,14 @@ AGAIN = {
         "simulation/test_paper.py::test_all_four_variants_at_one_millisecond[integral-printed]",
         "simulation/test_paper.py::test_what_the_paper_shows",
     ],
-    "shapes": ["engine/test_engine.py::test_every_shape_is_the_same_run[euler-None]"],
+    "shapes": ["engine/test_loops.py::test_every_loop_makes_the_same_run[euler-None]"],
     "runs": [
         "core/test_transforms.py::test_a_failing_run_leaves_the_others_bit_identical",
         "core/test_transforms.py::test_the_same_run_twice_is_bit_identical",
         "studies/test_monte_carlo.py::test_chunk_changes_nothing[1]",
         "studies/test_monte_carlo.py::test_number_of_runs_changes_no_run[257]",
         "studies/test_monte_carlo.py::test_replay_is_bit_identical_and_has_the_trajectory",
-        "kernels/test_lowering_math.py::test_native_functions[float64]",
+        "kernels/test_operations.py::test_native_functions[float64]",
     ],
 }
 """Name -> tests."""

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_lowering_backends import needs_compiler
+from test_cpu import needs_compiler
 
 from iblf_jax.kernels import interval_kernel
 from iblf_jax.kernels.toolchain import ToolchainError

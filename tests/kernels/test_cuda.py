@@ -1,7 +1,7 @@
 """The gpu backend: the kernel on a GPU or, without one, its logic on a CPU; its source through
 NVRTC; and what happens without a device.
 
-    JAX_PLATFORMS=cuda,cpu python -m pytest tests/kernels/test_lowering_gpu.py
+    JAX_PLATFORMS=cuda,cpu python -m pytest tests/kernels/test_cuda.py
 
 runs on a GPU what elsewhere runs on the CPU.
 """
@@ -20,8 +20,8 @@ import loops_of_plants
 import numpy as np
 import pytest
 from fallback import with_fallback
-from test_lowering import DT, MASS, MEMBERS, STANDARD, carry_of, evaluate, with_member
-from test_lowering_backends import TOLERANCE, assert_same, draws, needs_compiler
+from test_cpu import TOLERANCE, assert_same, draws, needs_compiler
+from test_from_jaxpr import DT, MASS, MEMBERS, STANDARD, carry_of, evaluate, with_member
 
 import iblf_jax as ij
 from iblf_jax.core.caches import CACHE

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.special
-from test_lowering_backends import needs_compiler
+from test_cpu import needs_compiler
 
 from iblf_jax.engine import native
 from iblf_jax.kernels import emit_c, toolchain
