@@ -91,7 +91,7 @@ def page(script: Path) -> list[Path]:
         shown = [PRECISION, "", *executed]
     if script.name == "example.py":
         contents = entry.load(script.parent)
-        made = entry.reproduction(defined)
+        made = entry.REPRODUCTIONS[script.parent] = entry.reproduction(defined)
         (MADE / f"{name}.json").write_text(entry_tables.computed(made), encoding="utf-8")
         before = entry_tables.before_the_script(contents, made)
         after = entry_tables.after_the_script(contents) + _scenario_file(script.parent)

@@ -64,21 +64,26 @@ class Times:
         worker = os.environ.get("PYTEST_XDIST_WORKER", "alone")
         self.file = (folder / f"{worker}.jsonl").open("w", buffering=1)
         self.spent: collections.Counter[str] = collections.Counter()
-        self.ended: list[tuple[float, float]] = []
+        self.open: list[list[float]] = []
         self.started = False
-        jax.monitoring.register_event_duration_secs_listener(self.on_event)
+        jax.monitoring.register_scalar_listener(self.on_begin)
+        jax.monitoring.register_event_duration_secs_listener(self.on_end)
         self.watch_processes()
 
-    def on_event(self, event: str, duration: float, **_: Any) -> None:
-        """Counts what an event of JAX took without the events inside it, which end first."""
-        if (cause := EVENTS.get(event)) is None:
+    def on_begin(self, event: str, *_: Any, **__: Any) -> None:
+        """Notes the processor time at which an event of JAX begins, and that of events inside."""
+        if event in EVENTS:
+            self.open.append([time.process_time(), 0.0])
+
+    def on_end(self, event: str, *_: Any, **__: Any) -> None:
+        """Counts the processor time of an event without that of the events inside it."""
+        if (cause := EVENTS.get(event)) is None or not self.open:
             return
-        start = time.monotonic() - duration
-        inner = 0.0
-        while self.ended and self.ended[-1][0] >= start:
-            inner += self.ended.pop()[1]
-        self.ended.append((start, duration))
-        self.spent[cause] += duration - inner
+        begin, inner = self.open.pop()
+        whole = time.process_time() - begin
+        self.spent[cause] += whole - inner
+        if self.open:
+            self.open[-1][1] += whole
 
     def watch_processes(self) -> None:
         """Counts the processor time of a process when it is waited for."""
@@ -101,7 +106,7 @@ class Times:
             self.write(STARTS, processor_s())
         before = processor_s()
         self.spent.clear()
-        self.ended.clear()
+        self.open.clear()
         try:
             return (yield)
         finally:

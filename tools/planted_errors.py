@@ -65,8 +65,8 @@ FAULTS = (
     Fault(
         "a gain of an observer without its factor 2",
         "control/observers/extended_state.py",
-        "(2.0 * self.bandwidth, self.bandwidth**2)",
-        "(self.bandwidth, self.bandwidth**2)",
+        "return 2.0 * self.bandwidth, self.bandwidth**2",
+        "return self.bandwidth, self.bandwidth**2",
     ),
     Fault(
         "the derivative of a bound with the other sign",

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import functools
 import io
 import math
 import re
@@ -289,23 +288,30 @@ def _value(kind: Any, value: Any, field: dataclasses.Field, place: str, faults: 
     return value
 
 
-@functools.cache
+REPRODUCTIONS: dict[Path, Reproduction] = {}
+"""Folder -> what its `example.py` defined when it was run in this process."""
+
+
 def execute(folder: Path) -> Reproduction:
     """Runs the `example.py` of a folder, once a process.
 
     Raises:
       EntryError: a name is missing.
     """
+    if folder in REPRODUCTIONS:
+        return REPRODUCTIONS[folder]
     before = set(pyplot.get_fignums())
     try:
         with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
             # Runs that leave their bounds are part of some examples.
             warnings.simplefilter("ignore")
-            return reproduction(runpy.run_path(str(folder / "example.py")))
+            made = reproduction(runpy.run_path(str(folder / "example.py")))
     finally:
         # A figure that is closed can still be saved and drawn.
         for number in set(pyplot.get_fignums()) - before:
             pyplot.close(number)
+    REPRODUCTIONS[folder] = made
+    return made
 
 
 def reproduction(names: dict[str, Any]) -> Reproduction:

@@ -35,6 +35,7 @@ Sources: (J.1) M. A. Aizerman, F. R. Gantmacher, Quart. J. Mech. Appl. Math. 11 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -137,6 +138,7 @@ class Progress(NamedTuple):
     """Whether every crossing was found within about a step, () bool."""
 
 
+@partial(jax.jit, inline=True)  # so that it is traced once for all that is made of it
 def surfaces(scenario: Scenario, t: jax.Array, state: LoopState) -> jax.Array | None:
     """The switching functions of the scenario's law at a state, (m,), or None if its command does
     not jump.

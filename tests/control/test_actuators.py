@@ -210,15 +210,14 @@ def command(pieces, t):
 def test_delay_of_whole_steps_has_the_order_of_the_integrator():
     expected = delayed_end(4e-3)
 
-    def error(dt, method):
+    def error(dt):
         scenario = with_actuator(ij.actuators.Delay(4e-3))
-        run = ij.simulate(scenario, duration=DURATION, dt=dt, method=method)
+        run = ij.simulate(scenario, duration=DURATION, dt=dt)
         return np.max(np.abs(end_of(run) - expected))
 
-    coarse, fine = error(2e-3, "rk4"), error(1e-3, "rk4")
+    coarse, fine = error(2e-3), error(1e-3)
     assert fine < 1e-7
     assert 13.0 < coarse / fine < 20.0
-    assert error(1e-3, "heun") < 1e-4
 
 
 @pytest.mark.release
@@ -271,38 +270,23 @@ def test_growth_under_a_delay_is_that_of_the_characteristic_root(product):
 
 @pytest.mark.slow
 def test_derivative_by_the_delay_and_by_the_time_of_a_fault():
-    def end(values):
+    def end(values, dt=1e-3, history=5):
         scenario = with_actuator(
-            ij.actuators.Delay(values[0], history=5), ij.actuators.Fault(RHO, BIAS, values[1])
+            ij.actuators.Delay(values[0], history=history),
+            ij.actuators.Fault(RHO, BIAS, values[1]),
         )
-        return ij.simulate(scenario, duration=0.05, dt=1e-3).q[-1]
+        return ij.simulate(scenario, duration=0.05, dt=dt).q[-1]
 
-    values = jnp.asarray([4e-3, 0.0203])
-    slopes = np.asarray(jax.jacfwd(end)(values))
-    ahead = end(values + jnp.asarray([0.0, 1e-5])) - end(values - jnp.asarray([0.0, 1e-5]))
-    np.testing.assert_allclose(slopes[:, 1], ahead / 2e-5, rtol=1e-5)
-
-    def end_of_fine(delay):
-        scenario = with_actuator(
-            ij.actuators.Delay(delay, history=43), ij.actuators.Fault(RHO, BIAS, values[1])
-        )
-        return np.asarray(ij.simulate(scenario, duration=0.05, dt=1e-4).q[-1])
-
-    by_delay = (end_of_fine(4.1e-3) - end_of_fine(3.9e-3)) / 2e-4
-    np.testing.assert_allclose(slopes[:, 0], by_delay, rtol=2e-2)
-
-
-@pytest.mark.slow
-def test_derivative_by_a_delay_of_one_step():
-    """The first command arrives at the end of the step in which the law computed it."""
-
-    def end(delay, dt=1e-3, history=2):
-        scenario = with_actuator(ij.actuators.Delay(delay, history=history))
-        return ij.simulate(scenario, duration=0.02, dt=dt).q[-1]
-
-    slope = np.asarray(jax.jacfwd(end)(1e-3))
-    ahead, behind = (np.asarray(end(1e-3 + sign * 5e-5, 5e-5, 21)) for sign in (1, -1))
-    np.testing.assert_allclose(slope, (ahead - behind) / 1e-4, rtol=3e-2)
+    # Under a delay of one step, the first command arrives at the end of the step in which the law
+    # computed it.
+    h, time = jnp.asarray([0.0, 1e-5]), 0.0203
+    for delay in (4e-3, 1e-3):
+        values = jnp.asarray([delay, time])
+        slopes = np.asarray(jax.jacfwd(end)(values))
+        by_time = (end(values + h) - end(values - h)) / 2e-5
+        np.testing.assert_allclose(slopes[:, 1], by_time, rtol=1e-5)
+        ahead, behind = (end([delay + sign * 1e-4, time], 1e-4, 43) for sign in (1, -1))
+        np.testing.assert_allclose(slopes[:, 0], (ahead - behind) / 2e-4, rtol=3e-2)
 
 
 def test_a_long_run_in_float32_has_the_delay_of_a_short_one():
@@ -348,22 +332,6 @@ def test_delays_beyond_the_history_or_below_a_step_are_flagged(delays):
             dt=1e-3,
         )
     assert np.all(np.asarray(study.status) & int(Status.NOT_FINITE))
-
-
-@pytest.mark.slow
-def test_falsify_finds_a_loss_of_effectiveness_that_leaves_the_bounds():
-    scenario = with_actuator(ij.actuators.Fault(effectiveness=1.0, time=0.1))
-    attack = ij.falsify(
-        scenario,
-        {"actuator.effectiveness": ij.value(ij.uniform(0.0, 1.0))},
-        duration=0.5,
-        dt=2e-3,
-        starts=4,
-        iterations=3,
-        progress=False,
-    )
-    assert attack.margin < 0
-    assert np.min(attack.values["actuator.effectiveness"]) < 0.5
 
 
 # --- what is refused, and what is reported --------------------------------------------------------

@@ -7,18 +7,13 @@ of them.
 
 from __future__ import annotations
 
-import jax
-import numpy as np
 import pytest
-from members import FAMILIES, ROBOTS
+from members import FAMILIES
 
 import iblf_jax as ij
-from iblf_jax.testing import robots
-from iblf_jax.testing._contract import Findings
 
 LONG = {"arm"}
-"""Takes a minute to compile: the default run holds it to a part of its contract, in a test of its
-own."""
+"""Compiles for ten seconds."""
 BEFORE_A_RELEASE = {
     "barrier_backstepping_mixed",
     "adaptive_parameters_levels",
@@ -50,18 +45,6 @@ def cases():
 @pytest.mark.parametrize(("check", "member"), list(cases()))
 def test_member_fits_its_contract(check, member):
     check(member)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", LONG)
-def test_a_long_robot_has_the_shapes_and_the_physics_of_its_contract(name, rng):
-    robot, findings = ROBOTS[name], Findings(ROBOTS[name], "Robot")
-    q, v, u = rng.uniform(-2, 2, (3, robot.n))
-    robots._shapes(findings, robot, q)
-    findings.stop_if_any()
-    numbers = jax.jit(robots._identities)(robot, q, v, u)
-    robots._physics(findings, {name: np.asarray(x)[None] for name, x in numbers.items()})
-    findings.stop_if_any()
 
 
 @pytest.mark.parametrize("family", FAMILIES)

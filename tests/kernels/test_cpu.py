@@ -30,16 +30,7 @@ from iblf_jax.simulation.metrics import as_folds, standard
 from iblf_jax.simulation.scenario import canonical
 from iblf_jax.tuning.quantities import Peak, Quantities, TimeIntegral
 
-
-def _has_compiler() -> bool:
-    try:
-        toolchain.compiler()
-    except ToolchainError:
-        return False
-    return True
-
-
-needs_compiler = pytest.mark.skipif(not _has_compiler(), reason="no C++ compiler")
+needs_compiler = pytest.mark.skipif(native.unavailable() is not None, reason="no C++ compiler")
 TOLERANCE = {"float64": 1e-10, "float32": 1e-4}
 COMPILED = {}
 
@@ -51,7 +42,7 @@ def batch(dtype="float64", backend="native", steps=400, values=None, record_ever
     varied = {k: jnp.asarray(v, dtype) for k, v in (values or draws(5)).items()}
     key = (dtype, backend, steps, record_every)
     if key not in COMPILED:
-        run = RunRequest(steps, "rk4", record_every, backend=backend)
+        run = RunRequest(steps, "heun", record_every, backend=backend)
         COMPILED[key] = jax.jit(lambda s, v, f, dt: execute.run_batch(s, v, f, dt, run))
     return jax.tree.map(np.asarray, COMPILED[key](scenario, varied, folds, jnp.asarray(dt, dtype)))
 
@@ -156,7 +147,9 @@ def test_native_records_what_simulate_records():
     scenario = ij.presets.zhang_yan_2024()
     for i in range(2):
         changed = ij.with_parameters(scenario, {k: v[i] for k, v in draws(5).items()})
-        run = ij.simulate(changed, duration=steps * 1e-3, dt=1e-3, record_every=every)
+        run = ij.simulate(
+            changed, duration=steps * 1e-3, dt=1e-3, method="heun", record_every=every
+        )
         for name in ALWAYS:
             np.testing.assert_allclose(
                 arrays[name][i], getattr(run, name), rtol=1e-9, atol=1e-9, err_msg=name
@@ -246,8 +239,9 @@ def test_one_run_and_threads():
 
 @pytest.mark.slow
 @needs_compiler
-@pytest.mark.parametrize("runs", [1, 3, 64, 65, 200])
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize(
+    ("runs", "dtype"), [(1, "float32"), (64, "float64"), (65, "float32"), (200, "float64")]
+)
 def test_leaves_become_rows_and_leaves_again(runs, dtype):
     """As by JAX's own operations, for every type and shape that a carry may have."""
     rng, leaves = np.random.default_rng(runs), []
@@ -292,8 +286,9 @@ def forget_kernels():
 
 @pytest.mark.slow
 @needs_compiler
-@pytest.mark.parametrize("record_every", [None, 100])
-@pytest.mark.parametrize("parts", ["functions", "calls", "both"])
+@pytest.mark.parametrize(
+    ("parts", "record_every"), [("functions", 100), ("calls", None), ("both", 100)]
+)
 def test_a_long_step_is_cut_into_functions(monkeypatch, parts, record_every):
     """Cut into pieces of fifty operations, or with its stages as calls, the numbers stay: the
     places of some products with sums differ."""
@@ -314,41 +309,47 @@ def test_a_long_step_is_cut_into_functions(monkeypatch, parts, record_every):
     assert_same(cut._replace(fastest_mode=whole.fastest_mode), whole, 1e-12)
 
 
-@pytest.mark.slow
-@needs_compiler
-@pytest.mark.parametrize("written_out", [thresholds.LOWERING_LIMITS.written_out, 10])
-def test_forward_sensitivities(monkeypatch, written_out):
-    limits = thresholds.LOWERING_LIMITS._replace(written_out=written_out)
-    monkeypatch.setattr(thresholds, "LOWERING_LIMITS", limits)
-    scenario, dt = canonical(ij.presets.zhang_yan_2024()), jnp.asarray(1e-3)
-    directions = {"controller.K2": np.eye(3, 2), "observer.kf": np.eye(3, 2, -1)}
-    varied = {k: jnp.asarray(v) for k, v in draws(3).items()}
+DIRECTIONS = {"controller.K2": np.eye(3, 2), "observer.kf": np.eye(3, 2, -1)}
 
-    folds = (
-        *standard()[:1],
-        *as_folds((Quantities((TimeIntegral(), TimeIntegral("torque"), Peak(10.0))),), jnp.float64),
+
+def pushed(backend):
+    """A batch of the paper's runs with three tangents: outcome, tangents, and what the folds of a
+    loss give."""
+    scenario, dt = canonical(ij.presets.zhang_yan_2024()), jnp.asarray(1e-3)
+    varied = {k: jnp.asarray(v) for k, v in draws(3).items()}
+    losses = Quantities((TimeIntegral(), TimeIntegral("torque"), Peak(10.0)))
+    folds = (*standard()[:1], *as_folds((losses,), jnp.float64))
+    request = RunRequest(60, "euler", backend=backend)
+    return jax.jit(lambda s, v: execute.run_batch_jvp(s, v, DIRECTIONS, folds, dt, request))(
+        scenario, varied
     )
 
-    def pushed(backend):
-        request = RunRequest(60, "euler", backend=backend)
-        return jax.jit(lambda s, v: execute.run_batch_jvp(s, v, directions, folds, dt, request))(
-            scenario, varied
-        )
 
-    reference, expected, exact = pushed("vmap")
-    for by_columns in (False, True):
-        with monkeypatch.context() as patch:
-            if by_columns:
-                executor = registry.EXECUTORS["native"]
-                limits = executor.limits._replace(derivative_nodes=0)
-                patch.setitem(registry.EXECUTORS, "native", executor._replace(limits=limits))
-                patch.setattr(execute, "run_with_tangents", None)
-            outcome, tangents, products = pushed("auto" if by_columns else "native")
-        assert_same(jax.tree.map(np.asarray, tangents), jax.tree.map(np.asarray, expected), 1e-10)
-        assert_same(jax.tree.map(np.asarray, outcome), jax.tree.map(np.asarray, reference), 1e-10)
-        assert tangents["rmse"].shape == (3, 3, 2)
-        assert_same(products, exact, 1e-10)
-        assert [x.shape for x in products] == [(3, 3, 3)] * 2
+@pytest.fixture(scope="module")
+def pushed_by_vmap():
+    return pushed("vmap")
+
+
+@pytest.mark.slow
+@needs_compiler
+@pytest.mark.parametrize(
+    ("written_out", "by_columns"), [(thresholds.LOWERING_LIMITS.written_out, False), (10, True)]
+)
+def test_forward_sensitivities(monkeypatch, pushed_by_vmap, written_out, by_columns):
+    limits = thresholds.LOWERING_LIMITS._replace(written_out=written_out)
+    monkeypatch.setattr(thresholds, "LOWERING_LIMITS", limits)
+    if by_columns:
+        executor = registry.EXECUTORS["native"]
+        limits = executor.limits._replace(derivative_nodes=0)
+        monkeypatch.setitem(registry.EXECUTORS, "native", executor._replace(limits=limits))
+        monkeypatch.setattr(execute, "run_with_tangents", None)
+    outcome, tangents, products = pushed("auto" if by_columns else "native")
+    reference, expected, exact = pushed_by_vmap
+    assert_same(jax.tree.map(np.asarray, tangents), jax.tree.map(np.asarray, expected), 1e-10)
+    assert_same(jax.tree.map(np.asarray, outcome), jax.tree.map(np.asarray, reference), 1e-10)
+    assert tangents["rmse"].shape == (3, 3, 2)
+    assert_same(products, exact, 1e-10)
+    assert [x.shape for x in products] == [(3, 3, 3)] * 2
 
 
 def test_without_a_compiler_it_runs_on_vmap_with_one_warning(monkeypatch):

@@ -12,6 +12,7 @@ import re
 import shutil
 import subprocess
 import warnings
+from functools import cache
 
 import gpu_on_cpu
 import jax
@@ -21,7 +22,7 @@ import numpy as np
 import pytest
 from fallback import with_fallback
 from test_cpu import TOLERANCE, assert_same, draws, needs_compiler
-from test_from_jaxpr import DT, MASS, MEMBERS, STANDARD, carry_of, evaluate, with_member
+from test_from_jaxpr import DT, MASS, MEMBERS, STANDARD, arrays_of, carry_of, stepped, with_member
 
 import iblf_jax as ij
 from iblf_jax.core.caches import CACHE
@@ -34,12 +35,10 @@ from iblf_jax.engine.time_step import TimeStep
 from iblf_jax.kernels import nvrtc
 from iblf_jax.kernels.emit_c import CUDA, source
 from iblf_jax.kernels.layout import Layout
-from iblf_jax.kernels.packed import Packed, Shapes, pack
-from iblf_jax.kernels.passes import written_out
+from iblf_jax.kernels.packed import Packed
 from iblf_jax.kernels.program import Builder, finished
 from iblf_jax.kernels.toolchain import ToolchainError
 from iblf_jax.simulation.metrics import standard
-from iblf_jax.simulation.paths import get
 from iblf_jax.simulation.scenario import canonical
 
 
@@ -66,39 +65,18 @@ def step_of(scenario, varied, folds=STANDARD, method="euler", dtype="float64"):
     inputs = Inputs(scenario, folds, *jnp.asarray([DT, 1e3], dtype))
     of, carry = Batch.of(inputs, varied), carry_of(inputs, varied, method)
     program, _ = program_of(TimeStep(method), of, carry)
-    shared = jnp.concatenate([jnp.ravel(x) for x in of.leaves.shared])
-    lane = pack(of.leaves.per_run, Shapes.of(of.leaves.per_run, 1), dtype, of.runs).floats
-    flat = jax.tree.leaves(carry)
-    return program, shared, lane, pack(flat, Shapes.of(flat, 1), dtype, of.runs)
+    return program, *arrays_of(of, carry, dtype)
 
 
-def stepped(program, shared, lane, carry, steps: int) -> np.ndarray:
-    """The carry of one run after some steps, by NumPy, node by node."""
-    layout, values = Layout.of(program), np.zeros(len(program.kinds), object)
-    values[layout.floats], values[layout.ints] = (
-        list(np.asarray(carry.floats)),
-        list(np.asarray(carry.ints)),
-    )
-    for i in range(steps):
-        values = evaluate(
-            written_out(program), np.asarray(shared), np.asarray(lane), list(values), i
-        )
-        values = [np.broadcast_to(v, np.shape(carry.floats)[1:]) for v in values]
-    return np.asarray(values, float)
-
-
-@pytest.mark.slow
-@needs_compiler
+@pytest.mark.skipif(not ON_A_GPU, reason="test_from_jaxpr runs one of each family")
 @pytest.mark.parametrize(("family", "name"), MEMBERS, ids=[f"{f}-{n}" for f, n in MEMBERS])
-def test_the_kernel_of_every_member_does_what_its_program_says(family, name):
+def test_on_a_gpu_the_kernel_of_every_member_does_what_its_program_says(family, name):
     mass = MASS.get(name, "plant.mass[1]")
     varied = {"initial.q": [[0.8, 0.8], [0.81, 0.79], [0.5, 0.6]], mass: [0.9, 0.7, 0.8]}
     program, shared, lane, carry = step_of(
         with_member(family, name, getattr(ij, family).MEMBERS[name]), varied
     )
-    (floats, ints), _ = run_program(
-        program, shared, lane, carry, 5, None, **({} if ON_A_GPU else {"flags": ("-O1",)})
-    )
+    (floats, ints), _ = run_program(program, shared, lane, carry, 5, None)
     layout, expected = Layout.of(program), stepped(program, shared, lane, carry, 5)
     np.testing.assert_allclose(floats, expected[layout.floats], rtol=1e-10, atol=1e-10)
     np.testing.assert_array_equal(ints, expected[layout.ints])
@@ -119,14 +97,20 @@ def runs_here(monkeypatch):
         gpu_for_this_platform(monkeypatch, run=gpu_on_cpu.run, unavailable=lambda: None)
 
 
+@cache
+def batch_of(dtype, backend, steps, record_every):
+    """Runs of the paper's scenario, as a function of the scenario and of what varies."""
+    folds = jax.tree.map(lambda x: jnp.asarray(x, dtype), standard())
+    dt, run = jnp.asarray(DT, dtype), RunRequest(steps, "heun", record_every, backend=backend)
+    return jax.jit(lambda s, v: execute.run_batch(s, v, folds, dt, run))
+
+
 def outcome(dtype, backend, values, steps=200, record_every=None):
     """The outcome of some runs of the paper's scenario."""
     scenario = canonical(ij.astype(ij.presets.zhang_yan_2024(), dtype))
-    folds = jax.tree.map(lambda x: jnp.asarray(x, dtype), standard())
-    varied, dt = {k: jnp.asarray(v, dtype) for k, v in values.items()}, jnp.asarray(DT, dtype)
-    run = RunRequest(steps, "rk4", record_every, backend=backend)
-    compiled = jax.jit(lambda s, v: execute.run_batch(s, v, folds, dt, run))
-    return jax.tree.map(np.asarray, compiled(scenario, varied))
+    varied = {k: jnp.asarray(v, dtype) for k, v in values.items()}
+    runs = batch_of(dtype, backend, steps, record_every)
+    return jax.tree.map(np.asarray, runs(scenario, varied))
 
 
 def spoiled(runs):
@@ -168,9 +152,8 @@ def test_runs_that_fail_have_the_reference_s_status_and_touch_no_other(runs_here
 
 @pytest.mark.slow
 @needs_compiler
-@pytest.mark.parametrize("written_out", [thresholds.LOWERING_LIMITS.written_out, 10])
-def test_records_agree_with_the_reference(runs_here, monkeypatch, written_out):
-    limits = thresholds.LOWERING_LIMITS._replace(written_out=written_out)
+def test_records_of_a_step_with_calls_agree_with_the_reference(runs_here, monkeypatch):
+    limits = thresholds.LOWERING_LIMITS._replace(written_out=10)
     monkeypatch.setattr(thresholds, "LOWERING_LIMITS", limits)
     found, expected = (outcome("float64", backend, draws(3), 150, 7) for backend in ("gpu", "vmap"))
     assert_same(found, expected, 1e-9)
@@ -178,71 +161,57 @@ def test_records_agree_with_the_reference(runs_here, monkeypatch, written_out):
 
 @needs_compiler
 @pytest.mark.slow
-@pytest.mark.parametrize("sampled", [False, True])
-def test_one_run_is_the_run(runs_here, paper, sampled):
-    """A law that is sampled and delayed too, with the noise of its sensor: its branches are calls
-    in the kernel."""
-    if sampled:
-        sensor = ij.sensors.Encoder(
-            counts=65536, noise=1e-5, velocity=ij.sensors.FilteredDifference(cutoff=700.0)
-        )
-        soft = ij.with_parameters(paper, {"controller.K2": 4.0, "observer.kf": 4.0})
-        paper = ij.with_parts(
-            soft,
-            sampling=ij.Sampling(2e-3, delay=1.3e-3),
-            sensor=sensor,
-            actuator=ij.actuators.Motor(bandwidth=600.0),
-        )
-    timing = {"duration": 0.06, "dt": 4e-4, "record_every": 10, "seed": 3}
-    one, other = (ij.simulate(paper, **timing, backend=backend) for backend in ("gpu", "vmap"))
+def test_one_run_is_the_run(runs_here, paper):
+    """A law that is sampled and delayed, with the noise of its sensor: its branches are calls in
+    the kernel."""
+    sensor = ij.sensors.Encoder(
+        counts=65536, noise=1e-5, velocity=ij.sensors.FilteredDifference(cutoff=700.0)
+    )
+    soft = ij.with_parameters(paper, {"controller.K2": 4.0, "observer.kf": 4.0})
+    scenario = ij.with_parts(
+        soft,
+        sampling=ij.Sampling(2e-3, delay=1.3e-3),
+        sensor=sensor,
+        actuator=ij.actuators.Motor(bandwidth=600.0),
+    )
+    timing = {"duration": 0.06, "dt": 4e-4, "method": "heun", "record_every": 10, "seed": 3}
+    one, other = (ij.simulate(scenario, **timing, backend=backend) for backend in ("gpu", "vmap"))
     np.testing.assert_allclose(one.tau, other.tau, rtol=0, atol=1e-9)
 
 
 @needs_compiler
 @pytest.mark.slow
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
-def test_every_run_has_its_own_jump(runs_here, paper, dtype):
+def test_every_run_has_its_own_jump(runs_here, paper):
     """The steps of a sampled loop are divided where each run's disturbance jumps."""
     soft = ij.with_parameters(paper, {"controller.K2": 4.0, "observer.kf": 4.0})
     late = ij.disturbances.Step(size=[20.0, 5.0], time=0.1)
     scenario = canonical(
-        ij.astype(
-            ij.with_parts(soft, sampling=ij.Sampling(1e-2, delay=3.7e-3), disturbance=late), dtype
-        )
+        ij.with_parts(soft, sampling=ij.Sampling(1e-2, delay=3.7e-3), disturbance=late)
     )
-    folds = jax.tree.map(lambda x: jnp.asarray(x, dtype), standard())
-    varied, dt = (
-        {"disturbance.time": jnp.asarray([0.1, 0.0537, 0.1234, 0.9], dtype)},
-        jnp.asarray(1e-2, dtype),
-    )
+    varied = {"disturbance.time": jnp.asarray([0.1, 0.0537, 0.1234, 0.9])}
 
     def metrics(backend):
-        request = RunRequest(20, backend=backend)
-        run = jax.jit(lambda v: execute.run_batch(scenario, v, folds, dt, request))
+        request, dt = RunRequest(20, "euler", backend=backend), jnp.asarray(1e-2)
+        run = jax.jit(lambda v: execute.run_batch(scenario, v, standard(), dt, request))
         return run(varied).metrics
 
     found, expected = metrics("gpu"), metrics("vmap")
-    rtol = {"float64": 1e-9, "float32": 2e-3}[dtype]
     for name in ("rmse", "effort", "torque_variation", "estimate_rmse"):
-        np.testing.assert_allclose(found[name], expected[name], rtol=rtol, err_msg=name)
+        np.testing.assert_allclose(found[name], expected[name], rtol=1e-9, err_msg=name)
 
 
 @pytest.mark.slow
 @needs_compiler
-@pytest.mark.parametrize(
-    "case", ["user class", pytest.param("flexible joint", marks=pytest.mark.slow)]
-)
-def test_a_plant_of_higher_order_agrees_with_the_reference(case, runs_here):
-    """Orders 3 and 4, each run with its own start and its own plant."""
-    leaf = {"user class": "plant.D", "flexible joint": "plant.stiffness"}[case]
-    scenario = canonical(loops_of_plants.CASES[case]())
-    start, plant = scenario.initial.q, get(scenario, leaf)
+def test_a_plant_of_higher_order_agrees_with_the_reference(runs_here):
+    """Order 4, each run with its own start and its own plant."""
+    scenario = canonical(loops_of_plants.CASES["flexible joint"]())
+    start, stiffness = scenario.initial.q, scenario.plant.stiffness
     shares = jnp.asarray([-0.1, -0.05, 0.0, 0.05, 0.1])[:, None]
-    varied = {"initial.q": start + 0.2 * shares, leaf: plant * (1.0 + shares)}
+    varied = {"initial.q": start + 0.2 * shares, "plant.stiffness": stiffness * (1.0 + shares)}
     dt = jnp.asarray(DT)
 
     def batch(backend):
-        request = RunRequest(100, "rk4", backend=backend)
+        request = RunRequest(100, "heun", backend=backend)
         run = jax.jit(lambda v: execute.run_batch(scenario, v, standard(), dt, request))
         return run(varied)
 

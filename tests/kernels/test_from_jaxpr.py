@@ -7,6 +7,7 @@ import dataclasses
 import warnings
 from functools import partial
 
+import gpu_on_cpu
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,13 +16,14 @@ from arm_cases import random_arm
 
 import iblf_jax as ij
 from iblf_jax.core.caches import CACHE
-from iblf_jax.engine import RunRequest, compile, execute, thresholds
+from iblf_jax.engine import RunRequest, compile, execute, native, thresholds
 from iblf_jax.engine.batch import Batch, carry_shapes
 from iblf_jax.engine.carry import Inputs, StepOptions, initial_carry
 from iblf_jax.engine.loops import program_of
 from iblf_jax.engine.time_step import TimeStep
 from iblf_jax.kernels import passes, program
 from iblf_jax.kernels.from_jaxpr import closed
+from iblf_jax.kernels.layout import Layout
 from iblf_jax.kernels.operations import OPERATIONS
 from iblf_jax.kernels.packed import Shapes, pack
 from iblf_jax.kernels.passes import written_out
@@ -139,6 +141,19 @@ MEMBERS = [
     for name in sorted(getattr(getattr(ij, family), "MEMBERS", {}))
     if name not in OF_OTHER_PLANTS
 ]
+KERNELS = {
+    ("barriers", "integral"),
+    ("bounds", "funnel"),
+    ("controllers", "adaptive_rbf"),
+    ("decays", "finite_time"),
+    ("disturbances", "sum"),
+    ("observers", "extended_state"),
+    ("references", "waypoint_spline"),
+    ("robots", "arm"),
+}
+"""One member of each family, whose kernel for GPUs runs here on a CPU.  `test_operations` runs
+each operation of such kernels, `test_programs_of_members` the kernels of all members for CPUs, and
+`test_cuda`, on a GPU, those for GPUs."""
 MASS = {"with_motors": "plant.robot.mass[1]"}
 """Where the mass is that varies, if not at "plant.mass[1]"."""
 
@@ -188,17 +203,48 @@ def numbers(leaves) -> list:
     return [x for leaf in leaves for x in np.asarray(leaf).ravel()]
 
 
+def arrays_of(batch, carry, dtype="float64"):
+    """The arrays of shared leaves, of per-run leaves and of the carry that a kernel takes."""
+    flat, leaves = jax.tree.leaves(carry), batch.leaves
+
+    @jax.jit
+    def packed(shared, per_run, flat):
+        joined = jnp.concatenate([jnp.ravel(x) for x in shared])
+        lanes = pack(per_run, Shapes.of(per_run, 1), dtype, batch.runs).floats
+        return joined, lanes, pack(flat, Shapes.of(flat, 1), dtype, batch.runs)
+
+    return packed(leaves.shared, leaves.per_run, flat)
+
+
+def stepped(program, shared, lane, carry, steps: int) -> np.ndarray:
+    """The carry of one run after some steps, by NumPy, node by node."""
+    layout, values = Layout.of(program), np.zeros(len(program.kinds), object)
+    values[layout.floats], values[layout.ints] = (
+        list(np.asarray(carry.floats)),
+        list(np.asarray(carry.ints)),
+    )
+    for i in range(steps):
+        values = evaluate(
+            written_out(program), np.asarray(shared), np.asarray(lane), list(values), i
+        )
+        values = [np.broadcast_to(v, np.shape(carry.floats)[1:]) for v in values]
+    return np.asarray(values, float)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("family", "name"), MEMBERS, ids=[f"{f}-{n}" for f, n in MEMBERS])
-def test_every_member_lowers_and_its_program_is_its_step(family, name, monkeypatch):
+def test_every_member_lowers_and_its_program_and_its_kernel_do_what_its_step_does(
+    family, name, monkeypatch
+):
     scenario = canonical(with_member(family, name, getattr(ij, family).MEMBERS[name]))
     dt, index = jnp.asarray(DT), jnp.int32(3)
     mass = MASS.get(name, "plant.mass[1]")
-    varied = {"initial.q": jnp.asarray([[0.8, 0.8]]), mass: jnp.asarray([0.9])}
+    starts = jnp.asarray([[0.8, 0.8], [0.81, 0.79], [0.5, 0.6]])
+    varied = {"initial.q": starts, mass: jnp.asarray([0.9, 0.7, 0.8])}
     whole, step = Inputs(scenario, STANDARD, dt, jnp.asarray(10.0)), TimeStep("heun")
     run, carries = Batch.of(whole, varied), carry_of(whole, varied, "heun")
-    carry = jax.tree.map(lambda x: x[0], carries)
-    inputs = run.leaves.unflatten(run.leaves.shared, [x[0] for x in run.leaves.per_run])
+    carry = jax.tree.map(lambda x: np.asarray(x)[0], carries)
+    inputs = run.leaves.unflatten(run.leaves.shared, [np.asarray(x)[0] for x in run.leaves.per_run])
     p, _ = program_of(step, run, carries)
     expected = numbers(
         jax.tree.leaves(
@@ -221,6 +267,13 @@ def test_every_member_lowers_and_its_program_is_its_step(family, name, monkeypat
         np.testing.assert_allclose(
             np.asarray(found, float), np.asarray(expected, float), rtol=1e-11, atol=1e-12
         )
+    if (family, name) not in KERNELS or native.unavailable():
+        return
+    arrays, layout = arrays_of(run, carries), Layout.of(called)
+    (floats, ints), _ = gpu_on_cpu.run(called, *arrays, 5, None)
+    after = stepped(called, *arrays, 5)
+    np.testing.assert_allclose(floats, after[layout.floats], rtol=1e-10, atol=1e-10)
+    np.testing.assert_array_equal(ints, after[layout.ints])
 
 
 def lowered_function(f, *arrays):

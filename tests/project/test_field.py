@@ -25,6 +25,7 @@ import check
 import entry
 import entry_tables
 import field
+import gallery
 import measure
 import task_laws
 import withdrawn
@@ -48,12 +49,19 @@ def test_the_format_of_an_entry(name):
     assert not check._faults_of_script(folder / "example.py")
 
 
-@pytest.mark.slow
+@pytest.mark.site
+@pytest.mark.usefixtures("optimised_kernels")
 @pytest.mark.parametrize("name", NAMES)
-def test_an_entry_is_correct(name):
+def test_an_entry_makes_its_page_and_is_correct(name):
     """Among others: every published number is reached, every claim holds, and the program that is
-    written without the package gives the same motion."""
-    assert check.faults_of(entry.ENTRIES / name) == []
+    written without the package gives the same motion.  The script runs once, for the page."""
+    folder = entry.ENTRIES / name
+    pictures = gallery.page(folder / "example.py")
+    assert pictures and all(path.stat().st_size > 1000 for path in pictures)
+    assert gallery.is_made(folder / "example.py")
+    assert check.faults_of(folder) == []
+    if name in FURTHER:
+        FURTHER[name](entry.execute(folder).runs)
 
 
 def test_scenario_files_name_their_command():
@@ -88,10 +96,6 @@ def test_independent_programs_exist():
 
 
 # ---------------------------------------------------------------------------- further statements
-
-
-def runs_of(name):
-    return entry.execute(entry.ENTRIES / name).runs
 
 
 def dimanidis(runs):
@@ -198,12 +202,6 @@ FURTHER = {
     "zhang_yan_2024": zhang_yan,
 }
 """Entry -> what its page states beyond the published numbers and claims."""
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", FURTHER)
-def test_an_entry_does_what_its_page_states(name):
-    FURTHER[name](runs_of(name))
 
 
 # ---------------------------------------------------------------------------- the checker

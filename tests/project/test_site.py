@@ -64,8 +64,9 @@ def test_there_are_examples():
 
 @pytest.mark.site
 @pytest.mark.usefixtures("optimised_kernels")
-@pytest.mark.parametrize("script", gallery.PAGES, ids=gallery.page_name)
+@pytest.mark.parametrize("script", gallery.SCRIPTS, ids=gallery.page_name)
 def test_a_script_of_the_gallery_makes_its_page(script):
+    """`test_field` makes the pages of the entries of the benchmark of the field."""
     pictures = gallery.page(script)
     assert pictures and all(path.stat().st_size > 1000 for path in pictures)
     assert gallery.is_made(script)

@@ -112,7 +112,7 @@ cases = {
     "law as printed": printed_law,
     "law and arm as printed": ij.with_parts(printed_law, plant=printed_arm),
 }
-runs = {name: ij.simulate(case, duration=5.0, dt=2e-4) for name, case in cases.items()}
+runs = {k: ij.simulate(x, duration=5.0, dt=2e-4, backend="vmap") for k, x in cases.items()}
 figure, axes = plt.subplots(1, 3, figsize=(11, 3.2), layout="constrained")
 for name, run in runs.items():
     axes[0].semilogy(run.t, np.linalg.norm(run.e1, axis=1), label=name)
