@@ -25,7 +25,7 @@ from iblf_jax.core.pytree import Leaf, component, is_absent, leaf
 from iblf_jax.engine import LOWERING_LIMITS
 from iblf_jax.kernels import Program, Shapes, compile_step, written_out
 from iblf_jax.simulation.closed_loop import discrete_observer, law_update, plant_input
-from iblf_jax.simulation.levels import start_levels, steady_input
+from iblf_jax.simulation.levels import start_levels
 from iblf_jax.simulation.sampling import SentCommand, nothing_sent
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.world import plants
@@ -143,11 +143,22 @@ def start(scenario: Scenario, inputs: SampleInputs) -> tuple[LawState, jax.Array
     filtered = tuple(
         velocity.init(x[row - 1], x[row], period) for row, velocity in velocity_filters(scenario)
     )
-    balance = steady_input(scenario, x[0])
+    balance = _input_at_rest(scenario, x[0])
     sent: SentCommand | tuple[()] = ()
     if scenario.sampling.trigger is not None:  # type: ignore[union-attr]
         sent = nothing_sent(balance)
     return LawState(controller, observer, filtered, sent), balance
+
+
+def _input_at_rest(scenario: Scenario, q: jax.Array) -> jax.Array:
+    """The input that keeps the model at rest at q, (n,); 0 for a model that states none."""
+    balance = scenario.loop.model.steady_input(q)
+    if balance is None:
+        return jnp.zeros_like(q)
+    law = scenario.controller
+    if isinstance(law, controllers.WithDrive):
+        return law.drive.voltage(balance / law.drive.torque_constant, jnp.zeros_like(q))
+    return balance  # type: ignore[no-any-return]
 
 
 def sample(scenario: Scenario, inputs: SampleInputs, state: LawState) -> tuple[LawState, Outputs]:

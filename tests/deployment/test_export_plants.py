@@ -167,7 +167,7 @@ def test_mujoco_refuses_process_noise():
 
 
 def test_the_input_at_the_start_is_that_of_the_loop():
-    """Of a drive under a law of robots it is the voltage that holds the plant, and no torque."""
+    """Of a drive under a law of robots it is the voltage that holds the robot, and no torque."""
     paper = ij.presets.zhang_yan_2024()
     drive = ij.plants.ElectricDrive(
         paper.plant,

@@ -112,7 +112,8 @@ def test_the_compensation_bounds_what_a_held_command_adds(rng):
             return command._replace(input_slope=self.z), ()
 
     law = controllers.EventCompensated(Given(v, z), delta, m_bar, epsilon)
-    u = np.asarray(law.command(0.0, jnp.zeros((2, 2)), 0.0, None, ())[0].tau)
+    context = ij.presets.zhang_yan_2024().context
+    u = np.asarray(law.command(0.0, jnp.zeros((2, 2)), jnp.zeros(2), context, ())[0].tau)
     np.testing.assert_allclose(u, other.compensated(z, v, delta, m_bar, epsilon), rtol=1e-12)
     a, b = rng.uniform(-1, 1, (2, *size))
     held = (u - b * m) / (1 + a * delta)
