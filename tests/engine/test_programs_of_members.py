@@ -18,7 +18,7 @@ from scenarios_of_members import scenarios
 from iblf_jax.engine import native
 
 TESTS = Path(__file__).parents[1]
-ALIKE = [f"barrier {x}" for x in ("tan", "mapping", "prescribed_performance", "state", "log_p3")]
+ALIKE = [f"barrier {x}" for x in ("tan", "mapping", "state")]
 """Members whose programs differ in nothing but their operations."""
 
 pytestmark = pytest.mark.skipif(native.unavailable() is not None, reason="no C++ compiler")
