@@ -182,7 +182,8 @@ def zhang_yan(runs):
     assert all(run.status == 0 for run in runs.values())
     evidence = entry.execute(entry.ENTRIES / "zhang_yan_2024").evidence
     assert evidence["printed"] > 1.02 * evidence["start"]
-    assert evidence["corrected"] <= evidence["start"]
+    # Both start at the same state; the compiler rounds the two programs differently.
+    assert evidence["corrected"] <= evidence["start"] * (1 + 1e-12)
     assert evidence["with_term"] < 1e-6 < 1e-3 < evidence["without_term"]
     assert evidence["equal_gains"] > evidence["equal_effort"] > 1.0
     assert evidence["weight_two"] < 1e-12

@@ -59,7 +59,7 @@ class ElasticFilter:
     wrong: ij.Leaf = ij.leaf("1", shape="scalar", default=0.0)
     sign: ij.Leaf = ij.leaf("1", shape="scalar", default=1.0)
     filtered: bool = ij.static(default=True)
-    receives_x, filters, uses_observer, gains = True, True, False, ()
+    receives_x, has_slack, uses_observer, gains = True, True, False, ()
 
     def init(self, x, context):
         """The law has no state."""
