@@ -79,7 +79,8 @@ def _contents(result: object) -> Content:
 
 def _described(result: object) -> list[str]:
     """The lines of a result without the name of its class, which is in the title."""
-    lines = [line for line in _contents(result) if isinstance(line, str)]
+    texts = [text for text in _contents(result) if isinstance(text, str)]
+    lines = "\n".join(texts).split("\n")
     match = re.fullmatch(rf"{type(result).__name__}(?:\((.*)\)| of (.*)|: (.*))", lines[0])
     if match:
         lines[0] = next(filter(None, match.groups()))

@@ -40,18 +40,15 @@ COMPILERS = ("quick_compiler", "c++", "g++", "clang++")
 STARTS = "(start of a worker)"
 
 
-def processor_s() -> float:
-    """Seconds of this process and of those that it started and that have ended."""
-    return sum(
-        usage.ru_utime + usage.ru_stime
-        for usage in map(resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
-    )
-
-
 def children_s() -> float:
     """Seconds of the processes that this one started and that have ended."""
     usage = resource.getrusage(resource.RUSAGE_CHILDREN)
     return usage.ru_utime + usage.ru_stime
+
+
+def processor_s() -> float:
+    """Seconds of this process and of those that it started and that have ended."""
+    return time.process_time() + children_s()
 
 
 class Times:

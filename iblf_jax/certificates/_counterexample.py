@@ -64,7 +64,7 @@ class Counterexample(Result):
 
     def _content(self) -> Content:
         drawn = [f"  {path}: {value}" for path, value in self.parameters.items()]
-        return [f"Counterexample(growth {self.growth:+.4g})", *"\n".join(drawn).splitlines()]
+        return [f"Counterexample(growth {self.growth:+.4g})", *drawn]
 
 
 class ClaimOnStates(NamedTuple):

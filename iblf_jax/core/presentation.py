@@ -53,7 +53,7 @@ def present(name: str, result: object, *args: Any, **options: Any) -> Any:
 
 
 Content: TypeAlias = Sequence[str | Table]
-"""A result as lines and tables, in the order in which it prints."""
+"""A result as texts, of a line or several, and tables, in the order in which it prints."""
 
 
 class Result:
@@ -66,7 +66,7 @@ class Result:
     __slots__ = ()
 
     def _content(self) -> Content:
-        """Its lines and tables, of which this class makes the text, and `reports` the HTML."""
+        """Its texts and tables, of which this class makes the text, and `reports` the HTML."""
         raise NotImplementedError(f"{type(self).__name__} states no content")
 
     def __repr__(self) -> str:

@@ -157,7 +157,7 @@ def _input_at_rest(scenario: Scenario, q: jax.Array) -> jax.Array:
         return jnp.zeros_like(q)
     law = scenario.controller
     if isinstance(law, controllers.WithDrive):
-        return law.drive.voltage(balance / law.drive.torque_constant, jnp.zeros_like(q))
+        return law.voltage(balance, jnp.zeros_like(q))
     return balance  # type: ignore[no-any-return]
 
 

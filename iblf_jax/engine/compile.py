@@ -97,10 +97,7 @@ def first_that_works(
     names = (*execution.backends, "vmap")
     for name, following in itertools.pairwise(names):
         try:
-            try:
-                return attempt(registry.EXECUTORS[name])
-            except StoppedError:
-                return attempt(registry.EXECUTORS[name])
+            return _attempted(attempt, registry.EXECUTORS[name])
         except StoppedError:
             raise
         except ToolchainError as error:
@@ -110,6 +107,14 @@ def first_that_works(
                 _warn_once(plan.scan_warning(reason))
             break
     return by_scan()
+
+
+def _attempted(attempt: Callable[[Executor], T], executor: Executor) -> T:
+    """The value of an attempt, of a second one if the compiler was stopped in the first."""
+    try:
+        return attempt(executor)
+    except StoppedError:
+        return attempt(executor)
 
 
 def inputs_of(
@@ -133,7 +138,7 @@ def inputs_of(
 def operations(inputs: Inputs) -> int:
     """Operations of one evaluation of the closed loop."""
     zero = jnp.zeros_like(inputs.dt)
-    arguments = (inputs.scenario, zero, initial_state(inputs.scenario), zero)
+    arguments = (inputs.scenario, zero, initial_state(inputs.scenario))
     return jaxprs.count_executed_operations(jax.make_jaxpr(evaluate)(*arguments))
 
 

@@ -41,7 +41,6 @@ from typing import Any, NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.controllers import Law
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.simulation.closed_loop import LoopState
 from iblf_jax.simulation.integrators import StepResult, stage_states, tableau
@@ -147,7 +146,7 @@ def surfaces(scenario: Scenario, t: jax.Array, state: LoopState) -> jax.Array | 
     x = state.x[: loop.model.order]
     # Switching functions of laws of robots do not depend on the estimate.
     d_hat = jnp.zeros(loop.model.estimate_shape, x.dtype)
-    if isinstance(unwrapped(scenario.controller), Law):
+    if unwrapped(scenario.controller).receives_x:
         d_hat = loop.observer.estimate(t, x, loop.model, state.observer)
     return loop.law.switching(t, x, d_hat, scenario.context, state.controller)
 

@@ -279,7 +279,8 @@ class _LawOutput(NamedTuple):
 
 def _continuous_law(scenario: Scenario, t: jax.Array, state: LoopState) -> _LawOutput:
     """What the law gives for a measurement of the state that the observer completes."""
-    loop, x, observer = scenario.loop, state.x, scenario.loop.observer
+    loop, x = scenario.loop, state.x
+    observer = loop.observer
     x_model = x[: loop.model.order]
     law_estimate = observer.estimate(t, x_model, loop.model, state.observer)
     measurement = measurement_of(x)

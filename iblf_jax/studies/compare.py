@@ -25,7 +25,6 @@ from iblf_jax.control.controllers import (
     KEEPERS,
     LAWS,
     BarrierBackstepping,
-    Law,
     Saturated,
     TrackingLaw,
     law_by_name,
@@ -210,7 +209,7 @@ def _with_law(scenario: Scenario, law: str | TrackingLaw) -> Scenario:
         if not all(part.uses_observer for part in layers(law)):
             observer = NoObserver()
     model: Any = scenario.model
-    if isinstance(law, str) or not isinstance(unwrapped(law), Law):
+    if isinstance(law, str) or not unwrapped(law).receives_x:
         known = plants.as_plant(model)
         limit = known.rigid()
         robot = known.robot if limit is None else limit

@@ -68,9 +68,12 @@ class OneRun(Result):
     samples: dict[str, Any]
 
     def _content(self) -> Content:
-        lines = [f"OneRun({self.index}; status: {describe(self.status)})"]
         drawn = [f"  {path}: {np.asarray(x)}" for path, x in self.samples.items()]
-        return [*lines, *"\n".join(drawn).splitlines(), *repr(self.metrics).splitlines()]
+        return [
+            f"OneRun({self.index}; status: {describe(self.status)})",
+            *drawn,
+            repr(self.metrics),
+        ]
 
 
 @jax.tree_util.register_dataclass

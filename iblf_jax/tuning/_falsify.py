@@ -115,7 +115,7 @@ class WorstCase(Result):
             f"  status: {describe(self.status, status_words(self.scenario))}",
         ]
         for path, x in self.values.items():
-            lines += f"  {path}: {np.array2string(np.asarray(x), precision=5)}".splitlines()
+            lines.append(f"  {path}: {np.array2string(np.asarray(x), precision=5)}")
         return lines
 
 

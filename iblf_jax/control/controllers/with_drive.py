@@ -60,5 +60,8 @@ class WithDrive(Wrapping):
     ) -> tuple[Command, State]:
         """The wrapped law's command with the voltage as its input."""
         command, rate = self.inner.command(t, x, d_hat, context, state)
-        current = command.tau / self.drive.torque_constant
-        return command._replace(input=self.drive.voltage(current, x[1])), rate
+        return command._replace(input=self.voltage(command.tau, x[1])), rate
+
+    def voltage(self, tau: jax.Array, dq: jax.Array) -> jax.Array:
+        """R tau/Kt + Kb q', (n,) [V]."""
+        return self.drive.voltage(tau / self.drive.torque_constant, dq)
