@@ -14,7 +14,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.certificates.lines import Role
 from iblf_jax.core import checks
 from iblf_jax.files.values import NONE, Words
 from iblf_jax.simulation.scenario import Scenario
@@ -158,6 +157,9 @@ def fields_of_line(stored: dict[str, Any]) -> dict[str, Any]:
     """The fields of a stored line of a certificate.  Its name said what it is in earlier versions,
     which named two of its fields otherwise.
     """
+    # Imported here, as scenarios are read without certificates.
+    from iblf_jax.certificates.lines import Role
+
     if "role" in stored:
         return stored
     former = {"counts": "enters_verdict", "first": "first_broken"}

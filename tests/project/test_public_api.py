@@ -83,7 +83,10 @@ HEAVY = (
     "mujoco",
     "IPython",
     "hypothesis",
+    *("iblf_jax.certificates", "iblf_jax.identification", "iblf_jax.proofs", "iblf_jax.tuning"),
+    *("iblf_jax.cli", "iblf_jax.deployment", "iblf_jax.plotting", "iblf_jax.studies.study"),
 )
+"""Modules that `import iblf_jax` leaves for their first use."""
 
 
 def public(module) -> dict[str, object]:
