@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 
 import jax
@@ -17,11 +18,18 @@ def wait_until_ready(outputs: object) -> None:
 
     `jax.block_until_ready` raises KeyboardInterrupt only after the arrays are complete.  This
     function raises it immediately.  XLA continues its computation, which does no harm
-    (`core.process_end`).
+    (`core.process_end`).  Python interrupts the main thread only, so that other threads block:
+    queries take processor time from the computation.
     """
+    arrays = [
+        leaf
+        for leaf in jax.tree.leaves(outputs)
+        if isinstance(leaf, jax.Array) and not isinstance(leaf, jax.core.Tracer)
+    ]
+    if threading.current_thread() is not threading.main_thread():
+        jax.block_until_ready(arrays)
+        return
     begin = time.monotonic()
-    for array in jax.tree.leaves(outputs):
-        if not isinstance(array, jax.Array) or isinstance(array, jax.core.Tracer):
-            continue  # a traced array is not being computed
+    for array in arrays:
         while not array.is_ready():  # type: ignore[attr-defined]
             time.sleep(min(RELATIVE_PAUSE * (time.monotonic() - begin), LONGEST_PAUSE))

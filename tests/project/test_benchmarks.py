@@ -20,9 +20,9 @@ another start."""
 BEFORE_A_RELEASE = {"armour.py", "constraints.py", "tuning.py"}
 """Their quick sizes compile for a quarter of a minute."""
 
-NO_BENCHMARK = {"comparison.py", "withdrawn.py"}
-"""One compares the results of the others, and `test_release.py` tests it; one names the results
-that were removed."""
+NO_BENCHMARK = {"comparison.py", "losses.py", "withdrawn.py"}
+"""One compares the results of the others, and `test_release.py` tests it; one compares commits, and
+`test_losses.py` tests it; one names the results that were removed."""
 NEEDED = {"ros2.py": ("mujoco", "rclpy")}
 """Benchmark -> libraries that not every environment has."""
 

@@ -25,6 +25,7 @@ child runs, or succeeds."""
 
 NEWEST = "tools/newest_python"
 TESTS_OF_NEWEST = f"{NEWEST} python -m pytest -m not release and not site and (not slow or members)"
+LOSSES = ".venv-test/bin/python benchmarks/losses.py --quick --fail 15"
 SITE = ".venv-test/bin/python docs/build.py"
 LINT = ".venv-test/bin/ruff check ."
 TESTS_OF_ROS = ".venv-ros/bin/python -m pytest -n 2 --dist loadfile " + " ".join(
@@ -73,12 +74,12 @@ def test_every_step_is_called(folder):
     done = ci(folder)
     assert done.returncode == 0, done.stdout
     calls = (folder / "calls").read_text().splitlines()
-    for call in (NEWEST, TESTS_OF_NEWEST, SITE, LINT, INSTALLATION_OF_ROS, TESTS_OF_ROS):
+    for call in (NEWEST, LOSSES, TESTS_OF_NEWEST, SITE, LINT, INSTALLATION_OF_ROS, TESTS_OF_ROS):
         assert call in [line.strip() for line in calls]
 
 
 @pytest.mark.parametrize(
-    "step", [f"{NEWEST} ", TESTS_OF_NEWEST, SITE, LINT, INSTALLATION_OF_ROS, TESTS_OF_ROS]
+    "step", [f"{NEWEST} ", LOSSES, TESTS_OF_NEWEST, SITE, LINT, INSTALLATION_OF_ROS, TESTS_OF_ROS]
 )
 def test_a_step_that_fails_is_shown(folder, step):
     (folder / "ready").unlink()

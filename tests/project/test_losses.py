@@ -1,0 +1,91 @@
+"""`benchmarks/losses.py` names what lost, and measures again before it does."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+
+import pytest
+from conftest import ROOT
+
+BEFORE, AFTER = "before", "after"
+
+
+@pytest.fixture
+def losses(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    return importlib.import_module("losses")
+
+
+@pytest.fixture
+def numbers(losses, monkeypatch):
+    """Gives the turns of each tree in place of processes; the last number stays."""
+
+    def given(**turns: list[float]) -> dict[str, int]:
+        taken = dict.fromkeys(turns, 0)
+
+        def measured(tree, measure):
+            k = min(taken[tree], len(turns[tree]) - 1)
+            taken[tree] += 1
+            return [turns[tree][k]] * len(measure.rows)
+
+        monkeypatch.setattr(losses, "measured", measured)
+        return taken
+
+    return given
+
+
+@pytest.mark.parametrize(
+    ("after", "turns", "change"),
+    [([1.0], 2, 0.0), ([1.5, 1.02], 2, 2.0), ([1.5, 1.5, 1.5, 1.0], 4, 0.0), ([1.2], 6, 20.0)],
+)
+def test_the_smallest_number_counts_and_a_loss_is_measured_again(
+    losses, numbers, after, turns, change
+):
+    taken = numbers(before=[1.1, 1.0], after=after)
+    (row,) = losses.table((BEFORE, AFTER), [losses.Measure(("a [s]",), "")])
+    assert row == ["a [s]", 1.0, pytest.approx(1 + change / 100), pytest.approx(change)]
+    assert taken == {BEFORE: turns, AFTER: turns}
+
+
+def test_counts_are_exact_and_measured_once(losses, numbers):
+    taken = numbers(before=[100], after=[120])
+    measure = losses.Measure(("operations of a step",), "", rounds=1)
+    losses.table((BEFORE, AFTER), [measure])
+    assert taken == {BEFORE: 1, AFTER: 1}
+
+
+def test_losses_of_more_than_5_percent_are_named_and_large_ones_fail(losses):
+    rows = [["a", 1.0, 1.04, 4.0], ["b", 1.0, 1.1, 10.0], ["c", 1.0, 0.5, -50.0]]
+    assert losses.verdict(rows[:1], 0.15) == ("no row lost more than 5 %", False)
+    assert losses.verdict(rows, 0.15) == ("lost: b +10 %", False)
+    assert losses.verdict(rows, 0.08) == ("lost: b +10 %", True)
+
+
+def test_a_process_imports_the_package_of_its_tree(losses, tmp_path):
+    (tmp_path / "iblf_jax").mkdir()
+    (tmp_path / "iblf_jax" / "__init__.py").write_text("value = 7")
+    code = "import iblf_jax\nfound = [iblf_jax.value, seconds(lambda: None)]"
+    found = losses.measured(tmp_path, losses.Measure(("value", "seconds"), code))
+    assert found[0] == 7
+    assert 0 <= found[1] < 1
+
+
+def test_a_commit_that_cannot_run_a_row_says_why(losses, tmp_path):
+    with pytest.raises(SystemExit, match="cannot run 'a': ModuleNotFoundError"):
+        losses.measured(tmp_path, losses.Measure(("a",), "import there_is_no_such_module"))
+
+
+def test_the_working_tree_is_compared_with_the_baseline(losses, capsys, monkeypatch):
+    if not losses.is_known(losses.BASELINE.read_text().split()[0]):
+        pytest.skip("this copy of the files has no history")
+    monkeypatch.setattr(losses, "MEASURES", [losses.Measure(("a",), "found = [1.0]")])
+    monkeypatch.setattr(sys, "argv", ["losses.py", "--fail", "15"])
+    assert losses.main() == 0
+    assert "Working tree against" in capsys.readouterr().out
+
+
+def test_a_commit_that_is_not_there_is_named(losses, capsys, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["losses.py", "0" * 40])
+    assert losses.main() == 0
+    assert "0000 is not in this clone" in capsys.readouterr().out
