@@ -508,98 +508,49 @@ def test_anything_in_the_place_of_any_argument(entry, paper, no_runs, tmp_path, 
     assert depth_left(500)  # a deep list that reached JAX would have spoilt the interpreter's count
 
 
+FINE = {
+    "robot": members.TWO_LINK,
+    "mass_matrix": members.TWO_LINK.mass_matrix,
+    "reference": members.REFERENCES["sinusoid"],
+    "objective": GOAL,
+    "guard": 1e-3,
+    "tube": None,
+    **dict.fromkeys(("q", "dq", "v", "u", "acceleration"), (0.1, 0.2)),
+}
+"""Arguments that several functions require; the tube is made in the test."""
 PARTS = {
-    "at_time": (robots.at_time, {"robot": members.TWO_LINK, "t": 0.0}, ("robot",)),
-    "friction_torque": (
-        robots.friction_torque,
-        {"robot": members.TWO_LINK, "dq": [0.1, 0.2]},
-        ("dq",),
-    ),
-    "coriolis_from_mass_matrix": (
-        robots.coriolis_from_mass_matrix,
-        {
-            "mass_matrix": members.TWO_LINK.mass_matrix,
-            "q": [0.1, 0.2],
-            "v": [0.1, 0.2],
-            "u": [0.1, 0.2],
-        },
-        ("q", "v", "u"),
-    ),
-    "mass_matrix_rate": (
-        robots.mass_matrix_rate,
-        {"robot": members.TWO_LINK, "q": [0.1, 0.2], "dq": [0.1, 0.2]},
-        ("robot", "q", "dq"),
-    ),
-    "energy_gradient": (
-        robots.energy_gradient,
-        {"robot": members.TWO_LINK, "q": [0.1, 0.2], "v": [0.1, 0.2]},
-        ("robot", "q", "v"),
-    ),
-    "momentum": (
-        robots.momentum,
-        {"robot": members.TWO_LINK, "q": [0.1, 0.2], "v": [0.1, 0.2]},
-        ("robot", "q", "v"),
-    ),
-    "inverse_dynamics": (
-        robots.inverse_dynamics,
-        {
-            "robot": members.TWO_LINK,
-            "q": [0.1, 0.2],
-            "v": [0.1, 0.2],
-            "u": [0.1, 0.2],
-            "acceleration": [0.1, 0.2],
-        },
-        ("robot", "q", "v", "u", "acceleration"),
-    ),
+    "at_time": (robots.at_time, {"t": 0.0}, ("robot",)),
+    "friction_torque": (robots.friction_torque, {}, ("dq",)),
+    "coriolis_from_mass_matrix": (robots.coriolis_from_mass_matrix, {}, ("q", "v", "u")),
+    "mass_matrix_rate": (robots.mass_matrix_rate, {}, ("robot", "q", "dq")),
+    "energy_gradient": (robots.energy_gradient, {}, ("robot", "q", "v")),
+    "momentum": (robots.momentum, {}, ("robot", "q", "v")),
+    "inverse_dynamics": (robots.inverse_dynamics, {}, ("robot", "q", "v", "u", "acceleration")),
     "from_energy": (robots.from_energy, {"cls": None}, ("cls",)),
-    "joint_names": (robots.joint_names, {"robot": members.TWO_LINK, "n": 2}, ("n",)),
+    "joint_names": (robots.joint_names, {"n": 2}, ("n",)),
     "tube_at": (
         bounds.tube_at,
-        {
-            "reference": members.REFERENCES["sinusoid"],
-            "bounds": bounds.Bounds(bounds.Constant(-2.0), bounds.Constant(2.0)),
-            "t": 0.1,
-        },
+        {"bounds": bounds.Bounds(bounds.Constant(-2.0), bounds.Constant(2.0)), "t": 0.1},
         ("reference", "bounds", "t", "acceleration"),
     ),
     "positive_width": (bounds.positive_width, {"k": 1.0}, ("k",)),
-    "guarded_error": (
-        barriers.guarded_error,
-        {"tube": None, "q": [0.1, 0.2], "guard": 1e-3},
-        ("tube", "q", "guard"),
-    ),
-    "guard_is_active": (
-        barriers.guard_is_active,
-        {"tube": None, "q": [0.1, 0.2], "guard": 1e-3},
-        ("tube", "q", "guard"),
-    ),
+    "guarded_error": (barriers.guarded_error, {}, ("tube", "q", "guard")),
+    "guard_is_active": (barriers.guard_is_active, {}, ("tube", "q", "guard")),
     "splines": (
         ij.references.WaypointSpline,
         {"times": (0.0, 1.0), "waypoints": [[0.0], [1.0]]},
         ("times", "waypoints"),
     ),
-    "objectives.complete": (
-        ij.objectives.complete,
-        {"objective": GOAL, "start": [1.0]},
-        ("objective", "start"),
-    ),
-    "objectives.sharper": (
-        ij.objectives.sharper,
-        {"objective": GOAL, "factor": 2.0},
-        ("objective",),
-    ),
+    "objectives.complete": (ij.objectives.complete, {"start": [1.0]}, ("objective", "start")),
+    "objectives.sharper": (ij.objectives.sharper, {"factor": 2.0}, ("objective",)),
     "objectives.metric": (
         ij.objectives.metric,
         {"fold": metrics.Tracking(), "name": "rmse"},
         ("fold", "name"),
     ),
     "check_law": (ij.testing.check_law, {"law": members.LAWS["pd_gravity"]}, ("law", "scenario")),
-    "check_robot": (ij.testing.check_robot, {"robot": members.TWO_LINK}, ("robot", "q")),
-    "check_reference": (
-        ij.testing.check_reference,
-        {"reference": members.REFERENCES["sinusoid"]},
-        ("reference", "n", "duration"),
-    ),
+    "check_robot": (ij.testing.check_robot, {}, ("robot", "q")),
+    "check_reference": (ij.testing.check_reference, {}, ("reference", "n", "duration")),
     "check_side": (
         ij.testing.check_side,
         {"side": bounds.Constant(1.0)},
@@ -615,14 +566,10 @@ PARTS = {
         {"observer": members.OBSERVERS["printed"]},
         ("observer", "model"),
     ),
-    "check_objective": (
-        ij.testing.check_objective,
-        {"objective": GOAL},
-        ("objective", "scenario", "duration"),
-    ),
+    "check_objective": (ij.testing.check_objective, {}, ("objective", "scenario", "duration")),
 }
-"""Functions that parts are made of and looked at with: arguments that are fine, and those that
-anything is put in the place of."""
+"""Functions that parts are made of and looked at with: other arguments that are fine, and those
+that anything is put in the place of."""
 
 
 @pytest.mark.parametrize("part", PARTS)
@@ -633,6 +580,9 @@ def test_anything_in_the_place_of_the_arguments_of_a_part(part, paper, monkeypat
     for checker in ("_contract", "laws", "metrics", "observers", "robots", "world", "objectives"):
         monkeypatch.setattr(f"iblf_jax.testing.{checker}.shape_of", entered)
     function, arguments, names = PARTS[part]
+    parameters = inspect.signature(function).parameters.values()
+    required = [x.name for x in parameters if x.default is x.empty]
+    arguments = {name: FINE[name] for name in required if name in FINE} | arguments
     if "tube" in arguments:
         arguments = {**arguments, "tube": bounds.tube_at(paper.reference, paper.bounds[0], 0.1)}
     refused = set()
