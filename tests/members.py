@@ -430,3 +430,10 @@ FAMILIES = {
     "fold": (FOLDS, {cls.__name__: cls for cls in metrics.MEMBERS.values()}, ij.testing.check_fold),
 }
 """Family -> (instances by name, the package's registry, the checker)."""
+
+
+def further(instances: dict[str, Any]) -> set[str]:
+    """The names of instances whose class has another one before them: the default tests leave them
+    to the slow ones."""
+    classes = [type(member) for member in instances.values()]
+    return {name for i, name in enumerate(instances) if classes[i] in classes[:i]}

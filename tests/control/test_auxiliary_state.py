@@ -26,7 +26,7 @@ PAPER = ij.presets.zhang_yan_2024(variant="corrected")
 LIMIT = np.array([9.0, 3.0])
 K = 6.0
 SATURATED = controllers.Saturated(PAPER.controller, limit=LIMIT, auxiliary=K)
-LIMITED = canonical(ij.with_parts(PAPER, controller=SATURATED))
+LIMITED = ij.with_parts(PAPER, controller=SATURATED)
 LAWS = {
     "two_barriers": two_barriers(),
     "dynamic_surface": controllers.DynamicSurface(k1=2.0, K2=20.0, filter=0.02),

@@ -226,7 +226,13 @@ def test_a_law_links_without_a_c_library(law):
     assert missing.returncode != 0 and "memcpy" in missing.stderr
 
 
-@pytest.mark.parametrize("name", members.LAWS)
+FURTHER = members.further(members.LAWS)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(x, marks=[pytest.mark.slow] if x in FURTHER else []) for x in members.LAWS],
+)
 def test_every_law_needs_only_memory_and_mathematics(name, sampled, tmp_path):
     speeds = ij.Bounds(ij.bounds.Constant(-2.0), ij.bounds.Constant(2.5))
     bounds = (sampled.bounds[0], speeds)

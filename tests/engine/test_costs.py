@@ -20,6 +20,7 @@ import sys
 import tempfile
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 os.environ.setdefault("JAX_ENABLE_X64", "1")
 
@@ -185,6 +186,15 @@ def test_what_a_first_call_compiles(call):
     )
 
 
+def as_text(table: dict[str, Any]) -> str:
+    """The table as JSON, with a line for each scenario and call."""
+    rows = []
+    for name in ("a step", "a first call"):
+        lines = [f"  {json.dumps(key)}: {json.dumps(x)}" for key, x in table[name].items()]
+        rows.append(f" {json.dumps(name)}: {{\n" + ",\n".join(lines) + "\n }")
+    return "{\n" + ",\n".join([f' "jax": {json.dumps(table["jax"])}', *rows]) + "\n}\n"
+
+
 if __name__ == "__main__":
     if len(sys.argv) > 1:
         print(json.dumps(count_of(sys.argv[1])))
@@ -194,4 +204,4 @@ if __name__ == "__main__":
             "a step": {x: step_counts(x) for x in SCENARIOS},
             "a first call": {x: in_a_fresh_process(x) for x in CALLS},
         }
-        FILE.write_text(json.dumps(table, indent=1) + "\n")
+        FILE.write_text(as_text(table))

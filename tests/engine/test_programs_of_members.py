@@ -13,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scenarios_of_members import scenarios
 
 from iblf_jax.engine import native
 
@@ -68,6 +67,8 @@ def test_laws_that_are_alike_have_their_own_programs(tmp_path):
 def test_every_member_has_its_own_program(tmp_path_factory, part):
     """In four parts, with one folder in common if one process runs them; by Euler's method, whose
     programs are compiled in a third of the time, where the loop admits it."""
+    from scenarios_of_members import scenarios  # it computes
+
     folder = tmp_path_factory.getbasetemp() / "cache of members"
     names = sorted(scenarios())
     random.Random(1).shuffle(names)

@@ -6,6 +6,7 @@ from __future__ import annotations
 import ast
 import contextlib
 import dataclasses
+import inspect
 import itertools
 import re
 import subprocess
@@ -14,6 +15,7 @@ import warnings
 from decimal import Decimal
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -464,96 +466,88 @@ def test_every_parameter_can_be_written_back_by_its_path(paper):
 WEAK = ij.presets.zhang_yan_2024()
 DRAWN = {"plant.mass": ij.factor(ij.uniform(0.9, 1.1))}
 TRACKING = ij.objectives.tracking()
+SOLVERS = (
+    *(ij.tuning.SQP, ij.tuning.LBFGS, ij.tuning.Adam, ij.tuning.Optax),
+    *(ij.tuning.SLSQP, ij.tuning.DifferentialEvolution),
+)
+REQUIRED = inspect.Parameter.empty
 INTERVAL = {"plant.mass": ij.factor(ij.interval(0.9, 1.1))}
 GAINS = {"controller.K2": (1.0, 20.0)}
 NO_FOLDER = "/proc" if Path("/proc/self").exists() else "/dev/null"
 """A folder in which nobody can make a file."""
 
 GOOD = {
-    "simulate": lambda **x: ij.simulate(**({"scenario": WEAK, **SHORT} | x)),
-    "compare": lambda **x: ij.compare(**({"scenario": WEAK, "laws": ["integral"], **SHORT} | x)),
-    "certify": lambda **x: ij.certify(**({"scenario": WEAK, **SHORT} | x)),
-    "monte_carlo": lambda **x: ij.monte_carlo(
-        **({"scenario": WEAK, "perturbations": DRAWN, "runs": 2, **SHORT} | x)
+    "simulate": (ij.simulate, {}),
+    "compare": (ij.compare, {"laws": ["integral"]}),
+    "certify": (ij.certify, SHORT),
+    "monte_carlo": (ij.monte_carlo, {"perturbations": DRAWN, "runs": 2}),
+    "sweep": (ij.sweep, {"grid": {"controller.K2": [10.0, 20.0]}}),
+    "LocalExecutor": (lambda **x: ij.studies.LocalExecutor(**x).checked(), {}),
+    "StoreOptions": (lambda **x: ij.studies.StoreOptions("never.zarr", **x).checked(), {}),
+    "sensitivity": (ij.sensitivity, {"perturbations": DRAWN, "points": 2}),
+    "tune": (ij.tune, {"parameters": ["controller.K2"], "objective": TRACKING}),
+    **{solver.__name__: (solver, {}) for solver in SOLVERS},
+    "Effort": (ij.tuning.Effort, {}),
+    "Report": (ij.tuning.Report, {}),
+    "falsify": (ij.falsify, {"perturbations": DRAWN}),
+    "pareto": (
+        ij.pareto,
+        {"parameters": ["controller.K2"], "objectives": (TRACKING, ij.objectives.effort())},
     ),
-    "sweep": lambda **x: ij.sweep(
-        **({"scenario": WEAK, "grid": {"controller.K2": [10.0, 20.0]}, **SHORT} | x)
+    "identify": (ij.identify, {"log": {}, "paths": ["plant.mass"]}),
+    "excitation": (ij.excitation, {"paths": ["plant.mass"]}),
+    "export": (ij.export, {"folder": "never", "period": 1e-3}),
+    "export-loop": (ij.export, {"folder": "never", "target": "wasm"}),
+    "cosimulate": (ij.cosimulate, {"plant": "never.xml", "period": 1e-3, "duration": 0.01}),
+    "explain": (ij.explain, {}),
+    "explore": (ij.explore, {}),
+    "report": (ij.report, {"result": WEAK, "path": "never.html"}),
+    "recommended_dt": (ij.recommended_dt, {}),
+    "recommended_period": (ij.recommended_period, {}),
+    "load": (robots.load, {"path": "never.urdf"}),
+    "Sampling": (ij.Sampling, {"period": 1e-3}),
+    "tunable": (ij.tunable, {"path": "controller.K2", "low": 1.0, "high": 2.0}),
+    "factor": (ij.factor, {"distribution": ij.uniform(0.9, 1.1)}),
+    "prove": (ij.prove, {"level": 0.1, "parameters": {}}),
+    "largest_level": (ij.largest_level, {"parameters": {}, "between": (1.0, 2.0)}),
+    "largest_parameters": (
+        ij.largest_parameters,
+        {"level": 0.1, "parameters": INTERVAL, "between": (0.5, 1.0)},
     ),
-    "LocalExecutor": lambda **x: GOOD["monte_carlo"](executor=ij.studies.LocalExecutor(**x)),
-    "StoreOptions": lambda **x: GOOD["sweep"](store=ij.studies.StoreOptions("never.zarr", **x)),
-    "sensitivity": lambda **x: ij.sensitivity(
-        **({"scenario": WEAK, "perturbations": DRAWN, "points": 2, **SHORT} | x)
+    "gains_for_guarantee": (
+        ij.gains_for_guarantee,
+        {"level": 0.1, "parameters": {}, "gains": GAINS},
     ),
-    "tune": lambda **x: ij.tune(
-        **({"scenario": WEAK, "parameters": ["controller.K2"], "objective": TRACKING, **SHORT} | x)
-    ),
-    "SQP": lambda **x: ij.tuning.SQP(**x),
-    "Effort": lambda **x: ij.tuning.Effort(**x),
-    "LBFGS": lambda **x: ij.tuning.LBFGS(**x),
-    "Adam": lambda **x: ij.tuning.Adam(**x),
-    "Optax": lambda **x: ij.tuning.Optax(**x),
-    "SLSQP": lambda **x: ij.tuning.SLSQP(**x),
-    "DifferentialEvolution": lambda **x: ij.tuning.DifferentialEvolution(**x),
-    "Report": lambda **x: ij.tuning.Report(**x),
-    "falsify": lambda **x: ij.falsify(**({"scenario": WEAK, "perturbations": DRAWN, **SHORT} | x)),
-    "pareto": lambda **x: ij.pareto(
-        **(
-            {
-                "scenario": WEAK,
-                "parameters": ["controller.K2"],
-                "objectives": (TRACKING, ij.objectives.effort()),
-                **SHORT,
-            }
-            | x
-        )
-    ),
-    "identify": lambda **x: ij.identify(
-        **({"scenario": WEAK, "log": {}, "paths": ["plant.mass"]} | x)
-    ),
-    "excitation": lambda **x: ij.excitation(**({"scenario": WEAK, "paths": ["plant.mass"]} | x)),
-    "export": lambda **x: ij.export(**({"scenario": WEAK, "folder": "never", "period": 1e-3} | x)),
-    "export-loop": lambda **x: ij.export(
-        **({"scenario": WEAK, "folder": "never", "target": "wasm"} | x)
-    ),
-    "cosimulate": lambda **x: ij.cosimulate(
-        **({"scenario": WEAK, "plant": "never.xml", "period": 1e-3, "duration": 0.01} | x)
-    ),
-    "explain": lambda **x: ij.explain(**({"scenario": WEAK} | x)),
-    "explore": lambda **x: ij.explore(**({"scenario": WEAK} | x)),
-    "report": lambda **x: ij.report(**({"result": WEAK, "path": "never.html"} | x)),
-    "recommended_dt": lambda **x: ij.recommended_dt(**({"scenario": WEAK} | x)),
-    "recommended_period": lambda **x: ij.recommended_period(**({"scenario": WEAK} | x)),
-    "load": lambda **x: robots.load(**({"path": "never.urdf"} | x)),
-    "Sampling": lambda **x: ij.Sampling(**({"period": 1e-3} | x)),
-    "tunable": lambda **x: ij.tunable(**({"path": "controller.K2", "low": 1.0, "high": 2.0} | x)),
-    "factor": lambda **x: ij.factor(**({"distribution": ij.uniform(0.9, 1.1)} | x)),
-    "with_parts": lambda **x: ij.with_parts(WEAK, **x),
-    "prove": lambda **x: ij.prove(**({"scenario": WEAK, "level": 0.1, "parameters": {}} | x)),
-    "largest_level": lambda **x: ij.largest_level(
-        **({"scenario": WEAK, "parameters": {}, "between": (1.0, 2.0)} | x)
-    ),
-    "largest_parameters": lambda **x: ij.largest_parameters(
-        **({"scenario": WEAK, "level": 0.1, "parameters": INTERVAL, "between": (0.5, 1.0)} | x)
-    ),
-    "gains_for_guarantee": lambda **x: ij.gains_for_guarantee(
-        **({"scenario": WEAK, "level": 0.1, "parameters": {}, "gains": GAINS} | x)
-    ),
-    "failure_probability": lambda **x: ij.failure_probability(
-        **({"scenario": WEAK, "perturbations": DRAWN, **SHORT} | x)
-    ),
-    "tune_file": lambda **x: ij.tune_file(**x),
-    "plotting.identification": lambda **x: ij.plotting.identification(**x),
-    "plotting.tuning": lambda **x: ij.plotting.tuning(**x),
-    "plotting.paths": lambda **x: ij.plotting.paths(**x),
-    "plotting.pareto": lambda **x: ij.plotting.pareto(**x),
-    "Delay": lambda **x: ij.actuators.Delay(**({"delay": 1e-3} | x)),
-    "AdaptiveRBF": lambda **x: controllers.AdaptiveRBF(**({"k1": 2.0, "K2": 20.0} | x)),
-    "AdaptiveNetwork": lambda **x: controllers.AdaptiveNetwork(**({"k1": 2.0, "K2": 20.0} | x)),
-    "Log": lambda **x: barriers.Log(**x),
-    "Leader": lambda **x: references.Leader(**({"motion": WEAK.reference, "weights": (1.0,)} | x)),
-    "save_scenario": lambda **x: ij.save_scenario(**({"scenario": WEAK, "path": "never.toml"} | x)),
+    "failure_probability": (ij.failure_probability, {"perturbations": DRAWN}),
+    "tune_file": (ij.tune_file, {}),
+    "plotting.identification": (ij.plotting.identification, {}),
+    "plotting.tuning": (ij.plotting.tuning, {}),
+    "plotting.paths": (ij.plotting.paths, {}),
+    "plotting.pareto": (ij.plotting.pareto, {}),
+    "Delay": (ij.actuators.Delay, {"delay": 1e-3}),
+    "AdaptiveRBF": (controllers.AdaptiveRBF, {"k1": 2.0, "K2": 20.0}),
+    "AdaptiveNetwork": (controllers.AdaptiveNetwork, {"k1": 2.0, "K2": 20.0}),
+    "Log": (barriers.Log, {}),
+    "Leader": (references.Leader, {"motion": WEAK.reference, "weights": (1.0,)}),
+    "save_scenario": (ij.save_scenario, {"path": "never.toml"}),
 }
-"""Function -> a call of it that is fine, but for what a case replaces."""
+"""Function, and arguments that are fine besides the scenario and the duration."""
+
+
+def defaults_of(name: str) -> dict[str, Any]:
+    """Argument of a function -> its default; REQUIRED if it has none."""
+    parameters = inspect.signature(GOOD[name][0]).parameters.values()
+    return {x.name: x.default for x in parameters if x.kind != x.VAR_KEYWORD}
+
+
+def call(name: str, /, **changed: Any) -> Any:
+    """Calls a function with arguments that are fine, except for what is changed."""
+    function, arguments = GOOD[name]
+    defaults = defaults_of(name)
+    fine = {"scenario": WEAK, "duration": SHORT["duration"]}
+    needed = {key: x for key, x in fine.items() if defaults.get(key, WEAK) is REQUIRED}
+    return function(**(needed | arguments | changed))
+
 
 NO_WORDS = (None, [], {}, 3, b"rk4", ["rk4"], np.asarray(["rk4", "x"]), "nope", True, float("nan"))
 NO_TIMES = (
@@ -581,18 +575,36 @@ NO_FLAGS = ("yes", 1, 0.0, [], np.ones(2))
 NO_PATHS = (3, "a\0b", b"x", [], {}, 1.5, True, "n" * 300, f"new/{'m' * 270}/x", "/dev/null/x")
 LONG_NAME = "a" * 300
 
+BY_NAME = {
+    "scenario": (NO_SCENARIOS, ["a Scenario", "ij.presets"]),
+    "seed": (NO_SEEDS, ["whole number"]),
+    "method": (NO_WORDS, ["'rk4'"]),
+    "backend": (NO_WORDS, ["'auto'"]),
+    "mode": (NO_WORDS, ["'forward'"]),
+    "tolerance": ((None, "x", -1.0, float("nan"), 1.5, 1e300), ["from 0 to 1"]),
+    "dt": ((None, "x", [], True, 0.0, -1.0, float("nan"), np.inf, 1j, np.ones(2)), []),
+    **dict.fromkeys(("duration", "period", "window"), (NO_TIMES, [])),
+    **dict.fromkeys(("record_every", "iterations", "patience"), (NO_COUNTS, ["whole number"])),
+    **dict.fromkeys(("runs", "points", "replicates"), (NO_COUNTS, [])),
+    **dict.fromkeys(("throw", "equal_effort", "resample", "repair"), (NO_FLAGS, ["True or False"])),
+}
+"""Argument of whatever function: values that are refused, and words of the message besides the
+argument's name.  None is fine where it is the default."""
+LATE = {"cosimulate", "prove", "gains_for_guarantee", "plotting.tuning", "plotting.paths"}
+"""Functions that check other arguments first."""
+
 REFUSED = {
-    # function and argument: values, words of the message besides the argument's name
     **{
-        f"{function} scenario": (NO_SCENARIOS, ["a Scenario", "ij.presets"])
-        for function in (
-            *("simulate", "compare", "certify", "monte_carlo", "sweep", "sensitivity", "tune"),
-            *("falsify", "failure_probability", "pareto", "identify", "excitation", "export"),
-            *("cosimulate", "explain", "recommended_dt", "recommended_period"),
-            *("prove", "largest_level", "largest_parameters", "gains_for_guarantee"),
-            "save_scenario",
+        f"{function} {name}": (
+            [x for x in BY_NAME[name][0] if x is not None or default is not None],
+            BY_NAME[name][1],
         )
+        for function in GOOD
+        for name, default in defaults_of(function).items()
+        if name in BY_NAME and (name == "scenario" or function not in LATE)
     },
+    # Arguments of one function, and those of the names above that differ.
+    "falsify starts": (NO_COUNTS, []),
     "explore scenario": (NO_SCENARIOS, []),
     "plotting.identification known": ((None, 3, WEAK), ["ij.identify"]),
     "plotting.tuning result": ((None, 3, WEAK), ["ij.tune"]),
@@ -604,90 +616,44 @@ REFUSED = {
     "AdaptiveNetwork nodes": (NO_SIZES, ["whole number"]),
     "Log p": ((*NO_SIZES, 101), ["<= 100"]),
     "Leader components": (NO_SIZES, ["whole number"]),
-    "simulate backend": (NO_WORDS, ["'auto'"]),
-    "simulate method": (NO_WORDS, ["'rk4'"]),
-    "simulate record_every": (NO_COUNTS, ["whole number"]),
-    "simulate seed": (NO_SEEDS, ["whole number"]),
-    "simulate throw": (NO_FLAGS, ["True or False"]),
-    "compare equal_effort": (NO_FLAGS, ["True or False"]),
     "compare laws": ((None, [], {}, 3, "nope", ["nope"]), []),
-    "compare record_every": (NO_COUNTS, ["whole number"]),
-    "certify method": (NO_WORDS, ["'rk4'"]),
-    "monte_carlo backend": (NO_WORDS, ["'auto'", "'native'"]),
     "LocalExecutor chunk": (NO_COUNTS[1:], ["whole number"]),
     "LocalExecutor memory": ((None, "x", [], 0, -1, 5e-324, 1e300, 10**30, np.inf), ["bytes"]),
-    "monte_carlo runs": (NO_COUNTS, ["whole number"]),
-    "monte_carlo seed": (NO_SEEDS, ["whole number"]),
-    "sweep backend": (NO_WORDS, ["'auto'"]),
     "StoreOptions unit": (NO_COUNTS[1:], ["whole number"]),
     "StoreOptions writer": (NO_WORDS, ["'client'", "'worker'"]),
     "StoreOptions shared": ((None, "yes", 1, []), ["True or False"]),
     "sweep store": (NO_PATHS[:7], ["path of a folder"]),
-    "sensitivity backend": (NO_WORDS, ["'auto'"]),
     "sensitivity output": ((None, [], 3, "nope", "", LONG_NAME), []),
     "tune objective": (
         (None, [], "rmse", "x", 3, {}, ij.objectives.tracking),
         ["ij.objectives.tracking() + 0.1 * ij.objectives.effort()"],
     ),
     "tune parameters": ((None, [], {}, "controller.K2", [None], [3], [["controller.K2"]]), []),
-    "tune backend": (NO_WORDS, ["'auto'"]),
-    "Report seed": (NO_SEEDS[1:], ["whole number"]),
-    "SQP patience": (NO_COUNTS, ["whole number"]),
-    "Effort iterations": (NO_COUNTS, ["whole number"]),
     "tune effort": ((None, "x", "", 3, [], ij.tuning.Effort), ["'thorough'"]),
-    "SQP tolerance": ((None, "x", -1.0, float("nan"), 1.5, 1e300, 10**30), ["from 0 to 1"]),
     "Adam learning_rate": ((None, "x", 0.0, -1.0, float("nan"), 5e-324, 1e300, 10**30), ["number"]),
     "tune checkpoint": ((*NO_PATHS, f"{NO_FOLDER}/state.npz"), []),
-    "LBFGS mode": (NO_WORDS, ["'forward'"]),
     "tune solver": (("nope", "", LONG_NAME, 3, [], ij.tuning.SQP), ["'sqp'"]),
     "tune report": ((3, [], "x", ij.tuning.Report), ["ij.tuning.Report"]),
     "tune risk": (NO_WORDS, ["'cvar'"]),
     "Adam batch": (NO_COUNTS[1:], ["whole number"]),
     "Optax optimiser": (("lion", 3, [], {}), ["optax.GradientTransformation"]),
-    "Adam resample": (NO_FLAGS, ["True or False"]),
-    "SLSQP tolerance": ((None, "x", -1.0, float("nan"), 1.5, 1e300), ["from 0 to 1"]),
     "DifferentialEvolution population": (NO_COUNTS, ["whole number"]),
-    "DifferentialEvolution seed": (NO_SEEDS, ["whole number"]),
     "DifferentialEvolution reach": ((None, "x", 0.0, -1.0, float("nan")), ["positive number"]),
-    "falsify starts": (NO_COUNTS, []),
-    "falsify iterations": (NO_COUNTS, ["whole number"]),
-    "falsify seed": (NO_SEEDS, ["whole number"]),
-    "falsify backend": (NO_WORDS, ["'auto'"]),
-    "pareto points": (NO_COUNTS, []),
-    "pareto tolerance": ((None, "x", -1.0, float("nan"), 1.5, 1e300), ["from 0 to 1"]),
-    "identify window": (NO_TIMES, []),
-    "identify iterations": (NO_COUNTS, ["whole number"]),
     "identify delay": (([], "x", np.ones(2), float("nan"), 1e300), []),
     "identify loss": (NO_WORDS, ["'huber'"]),
-    "excitation duration": (NO_TIMES, []),
     "excitation waypoints": (NO_COUNTS[1:], ["whole number"]),
-    "excitation iterations": (NO_COUNTS, ["whole number"]),
     "export folder": ((None, *NO_PATHS, "/dev/null", f"{NO_FOLDER}/new/folder"), ["folder"]),
     "export name": ((LONG_NAME, "b" * 64, "", "1a", "a b", "int", 3, []), ["C identifier"]),
-    "export period": (NO_TIMES[1:], []),
-    "export dt": (NO_TIMES, []),
-    "export method": (NO_WORDS, ["'rk4'"]),
-    "export seed": (NO_SEEDS, ["whole number"]),
     "export target": (NO_WORDS, ["'wasm'"]),
-    "export-loop dt": (NO_TIMES, []),
-    "export-loop method": (NO_WORDS, ["'rk4'"]),
     "export-loop folder": ((None, *NO_PATHS), ["folder"]),
-    "cosimulate period": (NO_TIMES[1:], []),
     "cosimulate plant": ((None, 3, [], "", "a\0b", LONG_NAME), []),
     "cosimulate integrator": (NO_WORDS[1:], ["'RK4'"]),
-    "explain method": (NO_WORDS, ["'rk4'"]),
-    "explore method": (NO_WORDS, ["'rk4'"]),
     "report path": ((None, *NO_PATHS, f"{NO_FOLDER}/page.html"), []),
     "report title": ((3, [], True), []),
-    "recommended_dt duration": (NO_TIMES, []),
-    "recommended_dt method": (NO_WORDS, ["'rk4'"]),
-    "recommended_dt seed": (NO_SEEDS, ["whole number"]),
     "recommended_dt perturbations": ((0, "", [], False, 3, "x", np.ones(2)), ["mapping"]),
-    "recommended_period duration": (NO_TIMES, []),
     "recommended_period radius": ((None, "x", 0.0, -1.0, float("nan"), 5e-324, 1e300), ["number"]),
     "recommended_period margin": ((None, "x", 0.5, float("nan"), 1e300, 10**30), ["number"]),
     "load path": ((None, 3, [], "a\0b", LONG_NAME), []),
-    "load repair": (NO_FLAGS, ["True or False"]),
     "Sampling period": ((1e300, 5e-324, 0.0, -1.0, "x", None), []),
     "Sampling delay": ((1e300, 5e-324, -1.0, "x", 1e6), []),
     "tunable low": (([], float("nan"), "x"), []),
@@ -708,7 +674,7 @@ def test_arguments_of_every_function(case, tmp_path, monkeypatch):
     values, words = REFUSED[case]
     for value in values:
         with pytest.raises(ValueError, match=r"(?s)\w+.*: got .*, expected .+") as caught:
-            GOOD[function](**{argument: value})
+            call(function, **{argument: value})
         message = str(caught.value)
         named = message.split(": got")[0]
         assert argument in named, (value, message)

@@ -136,16 +136,9 @@ TABLE = {"gain": 1.0, "array": np.array([1.0, 2.0])}
 """Numbers that a function reads from elsewhere."""
 
 
-@pytest.mark.parametrize(
-    "function",
-    [
-        lambda v: TABLE["gain"] * v,
-        lambda v: jnp.sum(jnp.asarray(TABLE["array"])) * v,
-        jax.jit(lambda v: jnp.outer(jnp.asarray(TABLE["array"]), v)[1]),
-        lambda v: jax.lax.fori_loop(0, 2, lambda i, x: x * jnp.asarray(TABLE["array"])[1], v),
-    ],
-)
-def test_a_function_whose_numbers_changed_has_another_program(function, monkeypatch):
+def test_a_function_whose_numbers_changed_has_another_program(monkeypatch):
+    function = jax.jit(lambda v: TABLE["gain"] * jnp.outer(jnp.asarray(TABLE["array"]), v)[1])
+
     def bound():
         jax.clear_caches()
         return arm_problem(pendulum(disturbance=Torque(function)), {}, duration=2.0).bound
@@ -153,7 +146,6 @@ def test_a_function_whose_numbers_changed_has_another_program(function, monkeypa
     before = bound()
     assert bound() == before
     monkeypatch.setitem(TABLE, "gain", 5.0)
-    monkeypatch.setitem(TABLE, "array", np.array([1.0, 3.0]))
     assert bound() != before
 
 
@@ -165,6 +157,10 @@ def by_table(x):
 @pytest.mark.parametrize(
     "function",
     [
+        lambda v: TABLE["gain"] * v,
+        lambda v: jnp.sum(jnp.asarray(TABLE["array"])) * v,
+        jax.jit(lambda v: jnp.outer(jnp.asarray(TABLE["array"]), v)[1]),
+        lambda v: jax.lax.fori_loop(0, 2, lambda i, x: x * jnp.asarray(TABLE["array"])[1], v),
         lambda v: v * jax.lax.scan(lambda c, _: (by_table(c), None), jnp.ones(()), None, 3)[0],
         lambda v: v * jax.lax.while_loop(lambda c: c < 9.0, by_table, jnp.ones(())),
         lambda v: TABLE["gain"] * v * without_slope(jnp.ones(())),

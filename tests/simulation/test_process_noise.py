@@ -123,7 +123,13 @@ def ends(noise, method, ratio):
         steps = jnp.arange(FINE_STEPS // ratio)
         return jax.lax.scan(advance, initial_state(scenario), steps)[0].dq[0]
 
-    return np.asarray(jax.jit(jax.vmap(run))(KEYS))
+    return np.asarray(jax.jit(jax.vmap(run))(keys()))
+
+
+def keys():
+    """The keys of the noise of all runs."""
+    key = jax.random.PRNGKey(0)
+    return jax.vmap(lambda i: noise_key(key, i))(jnp.arange(RUNS)).astype(float)
 
 
 def fine_increments(noise):
@@ -131,10 +137,7 @@ def fine_increments(noise):
     of_key = jax.vmap(
         lambda key, k: brownian_increment(scenario, key, k, jnp.asarray(FINE))[0, 0], (None, 0)
     )
-    return np.asarray(jax.jit(jax.vmap(of_key, (0, None)))(KEYS, jnp.arange(FINE_STEPS)))
-
-
-KEYS = jax.vmap(lambda i: noise_key(jax.random.PRNGKey(0), i))(jnp.arange(RUNS)).astype(float)
+    return np.asarray(jax.jit(jax.vmap(of_key, (0, None)))(keys(), jnp.arange(FINE_STEPS)))
 
 
 def additive_end(dW):
