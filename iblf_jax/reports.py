@@ -136,19 +136,12 @@ def _scenario(scenario: Scenario) -> Shown:
     names = ", ".join(plants.component_names(plant))
     words = [f"{plants.counted_components(plant, scenario.n)}: {names}"]
     if plant.notation.levels:
-        words.append(_levels_in_words(plant))
+        level_names = [*plant.notation.levels, plants.input_name(plant)]
+        units = [as_text(unit) for unit in plants.units_of(plant)]
+        texts = [f"{name} [{unit}]" for name, unit in zip(level_names, units, strict=True)]
+        words.append(f"{plant.order} levels: {', '.join(texts[:-1])}; input: {texts[-1]}")
     content = {"Parts": _parts_of(scenario), "Parameters": leaves}
     return Shown("Scenario", words, content, figures, scenario)
-
-
-def _levels_in_words(plant: Any) -> str:
-    """The levels and the input of a plant in strict-feedback form, with their units."""
-    names = [*plant.notation.levels, plants.input_name(plant)]
-    texts = [
-        f"{name} [{as_text(unit)}]"
-        for name, unit in zip(names, plants.units_of(plant), strict=True)
-    ]
-    return f"{plant.order} levels: {', '.join(texts[:-1])}; input: {texts[-1]}"
 
 
 NUMBERED = tuple(f"violation_{what}" for what in ("joint", "region", "level", "component"))

@@ -67,7 +67,11 @@ class VerifiedCache:
             image, digest = entry[:-DIGEST_SIZE], entry[-DIGEST_SIZE:]
             if digest == entry_digest(key, image):
                 return image
-        _remove(path)
+        with contextlib.suppress(OSError):
+            if stat.S_ISDIR(path.lstat().st_mode):
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                path.unlink()  # of a link, the link itself
         return None
 
     def put(self, key: str, value: bytes) -> None:
@@ -78,15 +82,6 @@ class VerifiedCache:
 def entry_digest(key: str, image: bytes) -> bytes:
     """The digest at the end of an entry, of its name and its content."""
     return hashlib.sha256(key.encode() + b"\0" + image).digest()
-
-
-def _remove(path: Path) -> None:
-    """Removes a file or a folder; of a link, the link itself."""
-    with contextlib.suppress(OSError):
-        if stat.S_ISDIR(path.lstat().st_mode):
-            shutil.rmtree(path, ignore_errors=True)
-        else:
-            path.unlink()
 
 
 def _verify_entries(folder: Path) -> None:

@@ -49,16 +49,10 @@ def warn(text: str, category: type[Warning] = UserWarning) -> None:
         if text in given:
             return
         given.add(text)
-    warnings.warn(text, category, stacklevel=_levels_to_the_user())
-
-
-def _levels_to_the_user() -> int:
-    """How many frames above `warn` the user's line is, as the argument `stacklevel` counts them.
-
-    If there is no such line, as in the command line, it is larger than the number of frames.
-    """
+    # How many frames above this one the user's line is, as the argument `stacklevel` counts them;
+    # more than there are if there is no such line, as in the command line.
     level = 1
-    frame: FrameType | None = sys._getframe(1)
+    frame: FrameType | None = sys._getframe()
     while frame is not None:
         package = str(frame.f_globals.get("__name__", "")).partition(".")[0]
         if package not in NOT_THE_USER:
@@ -68,7 +62,7 @@ def _levels_to_the_user() -> int:
         if "importlib" not in filename or "_bootstrap" not in filename:
             level += 1
         frame = frame.f_back
-    return level
+    warnings.warn(text, category, stacklevel=level)
 
 
 def each_warning_once(function: F) -> F:

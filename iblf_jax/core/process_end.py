@@ -36,17 +36,13 @@ def native_threads_run() -> bool:
     """Whether a thread that Python did not start is running; False where this is unknown."""
     known = {thread.native_id for thread in threading.enumerate()}
     for _ in range(CONFIRMATIONS):
-        if any(_is_running(task) for task in _tasks() if int(task.name) not in known):
+        tasks: list[Path] = []
+        with contextlib.suppress(OSError):
+            tasks = list(TASKS.iterdir())
+        if any(_is_running(task) for task in tasks if int(task.name) not in known):
             return True
         time.sleep(CONFIRMATION_INTERVAL)
     return False
-
-
-def _tasks() -> list[Path]:
-    try:
-        return list(TASKS.iterdir())
-    except OSError:
-        return []
 
 
 def _is_running(task: Path) -> bool:

@@ -114,8 +114,14 @@ def component(cls: type[T]) -> type[T]:
             value = values[field.name]
             if field.metadata.get("static"):
                 checks.structural(cls.__name__, field.name, value)
+                continue
+            # `is_module` comes first: it is False for lists that are nested without end.
+            holds_module = not is_leaf_field(field) and modules.is_module(value)
+            if holds_module and not modules.is_list_of_numbers(value):
+                value = modules.as_module(f"{cls.__name__}.{field.name}", value)
             else:
-                object.__setattr__(self, field.name, _as_leaf_or_module(cls, field, value))
+                value = checks.as_leaf(cls.__name__, field, value)
+            object.__setattr__(self, field.name, value)
         self.check()
         _note_modules(self)
 
@@ -133,15 +139,6 @@ def _keep_required(cls: type) -> None:
         is_field = "ClassVar" not in str(kind)
         if is_field and name not in vars(cls) and name not in inherited and hasattr(cls, name):
             setattr(cls, name, dataclasses.field())
-
-
-def _as_leaf_or_module(cls: type, field: dataclasses.Field, value: object) -> Any:
-    """A user's value of a field that is not static, converted and checked."""
-    # `is_module` comes first: it is False for lists that are nested without end.
-    holds_module = not is_leaf_field(field) and modules.is_module(value)
-    if not holds_module or modules.is_list_of_numbers(value):
-        return checks.as_leaf(cls.__name__, field, value)
-    return modules.as_module(f"{cls.__name__}.{field.name}", value)
 
 
 def _note_modules(part: Any) -> None:

@@ -319,10 +319,6 @@ def _exponential(x: Coefficients, value: jax.Array) -> Coefficients:
     return found
 
 
-def _exp(inputs: list[Coefficients], params: dict) -> Coefficients:
-    return _exponential(inputs[0], jnp.exp(inputs[0][0]))
-
-
 def _expm1(inputs: list[Coefficients], params: dict) -> Coefficients:
     found = _exponential(inputs[0], jnp.exp(inputs[0][0]))
     return [jnp.expm1(inputs[0][0]), *found[1:]]
@@ -333,11 +329,6 @@ def _logarithm(argument: Coefficients, value: jax.Array) -> Coefficients:
     one = [jnp.ones_like(argument[0]), *[None] * (len(argument) - 1)]
     rate = _divide([one, argument], {})
     return [value, *[_integrated(rate, argument, k) for k in range(1, len(argument))]]
-
-
-def _log1p(inputs: list[Coefficients], params: dict) -> Coefficients:
-    x = inputs[0]
-    return _logarithm([1.0 + x[0], *x[1:]], jnp.log1p(x[0]))
 
 
 def _sqrt(inputs: list[Coefficients], params: dict) -> Coefficients:
@@ -372,28 +363,13 @@ def _integer_power(inputs: list[Coefficients], params: dict) -> Coefficients:
     return [lax.integer_pow(inputs[0][0], exponent), *power[1:]]
 
 
-def _select(inputs: list[Coefficients], params: dict) -> Coefficients:
-    which, *cases = inputs
-    return _termwise(partial(lax.select_n, which[0]), cases)
-
-
-def _larger(inputs: list[Coefficients], params: dict) -> Coefficients:
+def _extreme(
+    value: Callable, is_first: Callable, inputs: list[Coefficients], params: dict
+) -> Coefficients:
+    """The larger or the smaller argument; the higher coefficients are those of the chosen one."""
     a, b = inputs
-    return [lax.max(a[0], b[0]), *_chosen(a[0] >= b[0], a, b)]
-
-
-def _smaller(inputs: list[Coefficients], params: dict) -> Coefficients:
-    a, b = inputs
-    return [lax.min(a[0], b[0]), *_chosen(a[0] <= b[0], a, b)]
-
-
-def _chosen(first: jax.Array, a: Coefficients, b: Coefficients) -> Coefficients:
-    """The higher coefficients of the first argument where it is chosen, else of the second."""
-
-    def choice(x, y):
-        return jnp.where(first, x, y)
-
-    return _termwise(choice, [a, b])[1:]
+    chosen = _termwise(partial(jnp.where, is_first(a[0], b[0])), inputs)
+    return [value(a[0], b[0]), *chosen[1:]]
 
 
 RULES: dict[Any, Callable[[list[Coefficients], dict], Coefficients]] = {
@@ -404,16 +380,18 @@ RULES: dict[Any, Callable[[list[Coefficients], dict], Coefficients]] = {
     lax.div_p: _divide,
     lax.sin_p: lambda inputs, params: _sine_and_cosine(inputs[0])[0],
     lax.cos_p: lambda inputs, params: _sine_and_cosine(inputs[0])[1],
-    lax.exp_p: _exp,
+    lax.exp_p: lambda inputs, _: _exponential(inputs[0], jnp.exp(inputs[0][0])),
     lax.expm1_p: _expm1,
     lax.log_p: lambda inputs, _: _logarithm(inputs[0], jnp.log(inputs[0][0])),
-    lax.log1p_p: _log1p,
+    lax.log1p_p: lambda inputs, _: _logarithm(
+        [1.0 + inputs[0][0], *inputs[0][1:]], jnp.log1p(inputs[0][0])
+    ),
     lax.sqrt_p: _sqrt,
     lax.square_p: lambda inputs, _: _product_of(inputs[0], inputs[0]),
     lax.integer_pow_p: _integer_power,
-    lax.select_n_p: _select,
-    lax.max_p: _larger,
-    lax.min_p: _smaller,
+    lax.select_n_p: lambda inputs, _: _termwise(partial(lax.select_n, inputs[0][0]), inputs[1:]),
+    lax.max_p: partial(_extreme, lax.max, lax.ge),
+    lax.min_p: partial(_extreme, lax.min, lax.le),
 }
 """Primitive -> the coefficients of its output from those of its inputs."""
 

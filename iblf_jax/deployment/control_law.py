@@ -143,22 +143,15 @@ def start(scenario: Scenario, inputs: SampleInputs) -> tuple[LawState, jax.Array
     filtered = tuple(
         velocity.init(x[row - 1], x[row], period) for row, velocity in velocity_filters(scenario)
     )
-    balance = _input_at_rest(scenario, x[0])
+    balance = loop.model.steady_input(x[0])
+    if balance is None:  # a model that states none
+        balance = jnp.zeros_like(x[0])
+    elif isinstance(scenario.controller, controllers.WithDrive):
+        balance = scenario.controller.voltage(balance, jnp.zeros_like(x[0]))
     sent: SentCommand | tuple[()] = ()
     if scenario.sampling.trigger is not None:  # type: ignore[union-attr]
         sent = nothing_sent(balance)
     return LawState(controller, observer, filtered, sent), balance
-
-
-def _input_at_rest(scenario: Scenario, q: jax.Array) -> jax.Array:
-    """The input that keeps the model at rest at q, (n,); 0 for a model that states none."""
-    balance = scenario.loop.model.steady_input(q)
-    if balance is None:
-        return jnp.zeros_like(q)
-    law = scenario.controller
-    if isinstance(law, controllers.WithDrive):
-        return law.voltage(balance, jnp.zeros_like(q))
-    return balance  # type: ignore[no-any-return]
 
 
 def sample(scenario: Scenario, inputs: SampleInputs, state: LawState) -> tuple[LawState, Outputs]:

@@ -250,6 +250,11 @@ def _law_values(law: Law, operations: Counter[str]) -> dict[str, Any]:
     """The values for the placeholders of the law's source and header."""
     state = law.programs.state_names
     entries = "".join(f"       [{k}] {comment(x)}\n" for k, x in enumerate(state))
+    model = law.scenario.loop.model
+    units = [comment(one_unit(x)) for x in plants.units_of(model)]
+    estimate = "estimate of the uncertain term [N m]"
+    if model.uncertain_levels:
+        estimate = "estimate of the uncertain terms"
     values = {
         "period_parameter": "sampling.period",
         "operations": describe_counts(operations),
@@ -258,7 +263,10 @@ def _law_values(law: Law, operations: Counter[str]) -> dict[str, Any]:
         "memory_count": len(state),
         "flags": len(FLAGS),
         "estimate_size": law.programs.estimate_size,
-        "output_meanings": _output_meanings(law.scenario),
+        "output_meanings": (
+            f"{comment(plants.input_name(model))} [{units[-1]}], {model.notation.alpha}"
+            f" [{units[1]}], {estimate}"
+        ),
         "keep_start": "",
         "keep_sample": "",
         **_input_values(law),
@@ -326,17 +334,6 @@ def title_of(scenario: Scenario) -> str:
     """A one-line description of the law."""
     law, observer = type(scenario.controller).__name__, type(scenario.observer).__name__
     return comment(f"The law {law} with the observer {observer}, for {scenario.n} joints")
-
-
-def _output_meanings(scenario: Scenario) -> str:
-    """The outputs of a law in words, with their units."""
-    model = scenario.loop.model
-    units = [comment(one_unit(x)) for x in plants.units_of(model)]
-    estimate = "estimate of the uncertain term [N m]"
-    if model.uncertain_levels:
-        estimate = "estimate of the uncertain terms"
-    name = comment(plants.input_name(model))
-    return f"{name} [{units[-1]}], {model.notation.alpha} [{units[1]}], {estimate}"
 
 
 def _input_values(law: Law) -> dict[str, str]:

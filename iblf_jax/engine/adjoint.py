@@ -231,8 +231,35 @@ class ReverseRun(NamedTuple):
     def backward(self, stored: Stored, cotangents: Cotangents) -> list[jax.Array]:
         """The gradient of every run by each leaf, (runs, ...)."""
         adjoint = self.batch.map_runs(self._end, stored.carry, cotangents.metrics)
-        before = self._all_segments(stored, adjoint, cotangents.records)
-        return self.batch.map_runs(self._start, before)
+        records = cotangents.records
+        form = Form.of(stored.carry)
+        recording = self.recording_program(form)
+        program = self.adjoint_program(form, adjoint, records)
+        run, steps, segment = self.runner(), self.request.instants, self.segment(form)
+
+        def of_segment(after: Packed, number: jax.Array | int, count: int) -> Packed:
+            first = number * segment
+            numbers = stored.carries[number]  # as a `RecordingStep` has recorded them
+            is_float = np.asarray([kind == "f" for kind in form.shapes.kinds()])
+            start = Packed(numbers[is_float], numbers[~is_float].astype(jnp.int32))
+            _, (series,) = run(recording, start, count, 1, first=first)
+            if records:
+                series = jnp.concatenate([series, self._of_records(records, first, count)], axis=1)
+            return run(program, after, count, None, first=steps - first - count, series=series)[0]
+
+        flat, treedef = jax.tree.flatten(adjoint)
+        shapes = Shapes.of(flat, 1)
+        packed = self.executor.pack(flat, shapes, self.batch.dtype, self.runs)
+        segments = checks.ceil_div(steps, segment)
+        packed = of_segment(packed, segments - 1, steps - (segments - 1) * segment)
+        packed, _ = jax.lax.scan(
+            lambda after, number: (of_segment(after, number, segment), None),
+            packed,
+            jnp.arange(segments - 1, dtype=jnp.int32),
+            reverse=True,
+        )
+        unpacked = self.executor.unpack(packed, shapes, self.runs)
+        return self.batch.map_runs(self._start, jax.tree.unflatten(treedef, unpacked))
 
     def start_build(self, metrics: Collection[str]) -> None:
         """Lowers both programs, and starts to compile the longer one in the background.
@@ -320,36 +347,6 @@ class ReverseRun(NamedTuple):
         _, pullback = jax.vjp(floats_at_start, self._parameters(inputs))
         (by_start,) = pullback(adjoint.cotangent)
         return jax.tree.map(jnp.add, adjoint.gradient, by_start)
-
-    def _all_segments(self, stored: Stored, adjoint: Adjoint, records: Mapping) -> Adjoint:
-        """The adjoint before the first step: the last segment comes first."""
-        form = Form.of(stored.carry)
-        recording = self.recording_program(form)
-        program = self.adjoint_program(form, adjoint, records)
-        run, steps, segment = self.runner(), self.request.instants, self.segment(form)
-
-        def of_segment(after: Packed, number: jax.Array | int, count: int) -> Packed:
-            first = number * segment
-            numbers = stored.carries[number]  # as a `RecordingStep` has recorded them
-            is_float = np.asarray([kind == "f" for kind in form.shapes.kinds()])
-            start = Packed(numbers[is_float], numbers[~is_float].astype(jnp.int32))
-            _, (series,) = run(recording, start, count, 1, first=first)
-            if records:
-                series = jnp.concatenate([series, self._of_records(records, first, count)], axis=1)
-            return run(program, after, count, None, first=steps - first - count, series=series)[0]
-
-        flat, treedef = jax.tree.flatten(adjoint)
-        shapes = Shapes.of(flat, 1)
-        packed = self.executor.pack(flat, shapes, self.batch.dtype, self.runs)
-        segments = checks.ceil_div(steps, segment)
-        packed = of_segment(packed, segments - 1, steps - (segments - 1) * segment)
-        packed, _ = jax.lax.scan(
-            lambda after, number: (of_segment(after, number, segment), None),
-            packed,
-            jnp.arange(segments - 1, dtype=jnp.int32),
-            reverse=True,
-        )
-        return jax.tree.unflatten(treedef, self.executor.unpack(packed, shapes, self.runs))
 
     def _of_records(
         self, records: Mapping[int, jax.Array], first: jax.Array | int, count: int

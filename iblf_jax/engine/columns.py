@@ -161,13 +161,6 @@ def _with_directions(batch: Batch, added: list[list[jax.Array]]) -> Batch:
     return batch._replace(leaves=wide)
 
 
-def _units(shapes: list[tuple[int, ...]], dtype) -> list[jax.Array]:
-    """The tangents of leaves by each of their numbers in turn."""
-    sizes = [math.prod(shape) for shape in shapes]
-    parts = np.split(np.eye(sum(sizes), dtype=dtype), np.cumsum(sizes)[:-1], axis=1)
-    return [jnp.asarray(x.reshape(len(x), *shape)) for x, shape in zip(parts, shapes, strict=True)]
-
-
 def _stepped(
     run_steps: Stepper,
     batch: Batch,
@@ -227,7 +220,18 @@ def columns(
       metric that is a float (R, P, ...).
     """
     shapes = [jnp.shape(x) for x in jax.tree.leaves(batch.leaves.first.scenario)]
-    directions = [_units([shapes[place] for place in of_order], batch.dtype) for of_order in places]
+    directions = []
+    for of_order in places:  # the tangents of these leaves by each of their numbers in turn
+        own_shapes = [shapes[place] for place in of_order]
+        sizes = [math.prod(shape) for shape in own_shapes]
+        units = np.eye(sum(sizes), dtype=batch.dtype)
+        parts = np.split(units, np.cumsum(sizes)[:-1], axis=1)
+        directions.append(
+            [
+                jnp.asarray(part.reshape(len(part), *shape))
+                for part, shape in zip(parts, own_shapes, strict=True)
+            ]
+        )
     return _stepped(
         run_steps, batch, TangentStep(TimeStep.of(request), places), directions, request
     )

@@ -178,8 +178,12 @@ def _singular_gain(result: Rollout) -> str:
     model = scenario.loop.model
     if not model.loses_input:
         return ""
+    # The last recorded sample at which the state still moved and the input was finite.
+    moved = np.any(np.diff(np.asarray(result.x), axis=0) != 0, axis=(1, 2))
+    has_input = np.isfinite(np.asarray(result.tau)).all(axis=-1)
+    valid = np.flatnonzero(np.append(True, moved) & has_input)
+    at = int(valid[-1]) if valid.size else 0
     x, t = np.asarray(result.x)[:, : model.order], np.asarray(result.t)
-    at = _last_valid_sample(result)
     ahead = range(EXAMINED_AHEAD + 1)
     states = [x[0], *[x[at] + k * (x[at] - x[max(at - 1, 0)]) for k in ahead]]
     times = [t[0], *[t[at]] * len(ahead)]
@@ -195,16 +199,6 @@ def _singular_gain(result: Rollout) -> str:
         f" next to x = {state}, so that the law's input has no value: bound the levels so that they"
         " stay away from that state, or change the reference or the start."
     )
-
-
-def _last_valid_sample(result: Rollout) -> int:
-    """The index of the last recorded sample at which the state still moved and the input was
-    finite.
-    """
-    x, tau = np.asarray(result.x), np.asarray(result.tau)
-    moved = np.any(np.diff(x, axis=0) != 0, axis=(1, 2))
-    valid = np.flatnonzero(np.append(True, moved) & np.isfinite(tau).all(axis=-1))
-    return int(valid[-1]) if valid.size else 0
 
 
 def _smallest_gains(model: Any, t: Any, x: np.ndarray) -> np.ndarray:

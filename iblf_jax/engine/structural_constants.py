@@ -78,31 +78,23 @@ def _names(path: Sequence[Any]) -> tuple[str, ...]:
     return tuple(key.name if isinstance(key, jax.tree_util.GetAttrKey) else "" for key in path)
 
 
-def _geometry_fields(scenario: Scenario) -> dict[tuple[str, ...], tuple[str, ...]]:
-    """The names of the geometry fields of the robots of a scenario, by the paths of the robots.
-
-    A robot is the plant or the model itself, or the field `robot` of either.
-    """
-    found: dict[tuple[str, ...], tuple[str, ...]] = {}
-    for name, part in {"plant": scenario.plant, "model": scenario.model}.items():
-        robot = plants.as_plant(part).robot
-        if isinstance(robot, Robot):
-            path = (name,) if robot is part else (name, "robot")
-            found[path] = _field_names(robot.geometry_fields)
-    return found
-
-
 def robot_constants(scenario: Scenario) -> StructuralConstants | None:
     """The structural constants of a scenario's robots, also of those inside a plant in
     strict-feedback form; None if the robots are traced or declare no geometry.
     """
-    robots = _geometry_fields(scenario)
+    # A robot is the plant or the model itself, or the field `robot` of either.
+    robots: dict[tuple[str, ...], tuple[str, ...]] = {}
+    for name, part in {"plant": scenario.plant, "model": scenario.model}.items():
+        found = plants.as_plant(part).robot
+        if isinstance(found, Robot):
+            path = (name,) if found is part else (name, "robot")
+            robots[path] = _field_names(found.geometry_fields)
     if not any(robots.values()) or not checks.is_concrete((scenario.plant, scenario.model)):
         return None
     numbers: list[Known | None] = []
     first_of_field: dict[str, tuple[int, np.ndarray]] = {}
-    for path, leaf in jax.tree_util.tree_flatten_with_path(scenario)[0]:
-        names = _names(path)
+    for keys, leaf in jax.tree_util.tree_flatten_with_path(scenario)[0]:
+        names = _names(keys)
         robot, field = names[:-1], names[-1]
         if field not in robots.get(robot, ()):
             numbers += [None] * int(np.size(leaf))

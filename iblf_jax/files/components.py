@@ -102,17 +102,16 @@ def families_of(hint: Any) -> list[Any]:
     options = [without_none(hint)[0]]
     if typing.get_origin(hint) is typing.Annotated:
         options = [hint.__origin__, *hint.__metadata__]
-    named = [_base_of(option) for option in options]
-    return [] if None in named else named
-
-
-def _base_of(option: object) -> Any:
-    """The base class of the family that a contract belongs to, such as that of laws for a
-    `RobotLaw`; None without one.
-    """
-    if not isinstance(option, type) or is_component_class(option):
-        return None
-    return next((base for base in option.__mro__ if base in FAMILIES), None)
+    found = []
+    for option in options:
+        if not isinstance(option, type) or is_component_class(option):
+            return []
+        # Such as the base class of laws for a `RobotLaw`.
+        bases = [base for base in option.__mro__ if base in FAMILIES]
+        if not bases:
+            return []
+        found.append(bases[0])
+    return found
 
 
 def members_of(hint: Any) -> tuple[str, dict[str, Any]]:

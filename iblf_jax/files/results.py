@@ -314,9 +314,11 @@ class _Writer:
     def object(self, value: Any, key: str) -> dict[str, Any]:
         """The node of an object of a class that a file can name."""
         cls = type(value)
-        member = _name_of_member(cls)
-        if member is not None:
-            return {"member": member, "fields": self.fields(field_values(value), key)}
+        for family in components.FAMILIES.values():
+            for member, known in family.members.items():
+                if known is cls:
+                    fields = self.fields(field_values(value), key)
+                    return {"member": f"{family.module}.{member}", "fields": fields}
         name = self.name_of(cls, key)
         stored = CONVERTERS[name].stored if name in CONVERTERS else _fields_of
         node = {"record": name, "fields": self.fields(stored(value), key)}
@@ -357,17 +359,6 @@ def _computed_names(cls: type) -> list[str]:
     members = [member for owner in owners for member in vars(owner).items()]
     names = [name for name, x in members if isinstance(x, cached_property)]
     return [name for name in names if (cls.__name__, name) not in MADE_AGAIN]
-
-
-def _name_of_member(cls: type) -> str | None:
-    """The family and the name of a class in a table of members, "metrics.settling"; None where it
-    is in none.
-    """
-    for family in components.FAMILIES.values():
-        for name, member in family.members.items():
-            if member is cls:
-                return f"{family.module}.{name}"
-    return None
 
 
 MADE_AGAIN = {("Proof", "problem")}

@@ -224,7 +224,16 @@ def _term(
     checks.one_of(f"{key}.kind", table.get("kind"), allowed)
     function = getattr(objectives, table["kind"])
     if function is objectives.metric and "fold" not in table:
-        table = table | {"fold": _fold_of(table.get("name", Words("nothing")), f"{key}.name")}
+        result = table.get("name", Words("nothing"))
+        owners = {
+            name: kind
+            for kind, fold in metrics.MEMBERS.items()
+            for name in getattr(fold, "units", ())
+        }
+        if not isinstance(result, str) or result not in owners:
+            remedy = did_you_mean(result, owners)
+            raise checks.fail(f"{key}.name", result, "the name of a metric", remedy)
+        table = table | {"fold": owners[result]}
     taken = inspect.signature(function).parameters
     known_keys(table, key, ("kind", *other_keys, *taken))
     for name, parameter in taken.items():
@@ -249,16 +258,6 @@ def _argument(name: str, value: object, key: str) -> Any:
     if isinstance(value, str):
         value = {"kind": value}
     return components.decode(value, metrics.Fold, key)
-
-
-def _fold_of(result: object, key: str) -> str:
-    """The metric that returns a result."""
-    owners = {
-        name: kind for kind, fold in metrics.MEMBERS.items() for name in getattr(fold, "units", ())
-    }
-    if not isinstance(result, str) or result not in owners:
-        raise checks.fail(key, result, "the name of a metric", did_you_mean(result, owners))
-    return owners[result]
 
 
 def _objective(data: dict[str, Any]) -> Objective:

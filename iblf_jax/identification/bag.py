@@ -171,22 +171,7 @@ def held_efforts(received: np.ndarray, efforts: np.ndarray) -> tuple[np.ndarray,
     """
     if not len(efforts) or not len(received):
         return np.zeros(len(received), int), np.zeros(len(received), bool)
-    answer = _answers(received, efforts)
-    is_answered = answer >= 0
-    index = np.maximum.accumulate(answer)
-    # Efforts before the first joint state are those of rows until the first answer.
-    before = np.searchsorted(efforts, received[0], side="left") - 1
-    index = np.maximum(index, before)
-    is_before_gap = np.append(np.diff(efforts) > longest_interval(efforts), True)
-    is_known = (index >= 0) & (is_answered | ~is_before_gap[index])
-    return np.maximum(index, 0), is_known
-
-
-def _answers(received: np.ndarray, efforts: np.ndarray) -> np.ndarray:
-    """The effort that answers each joint state, (N,) int; -1 without one.
-
-    It is the last one that was received from the joint state on until the next one.
-    """
+    # The last effort from a joint state on until the next one answers it; -1 where there is none.
     end, tolerance = np.inf, 0.0
     if len(received) > 1:
         interval = float(np.median(np.diff(received)))
@@ -200,7 +185,15 @@ def _answers(received: np.ndarray, efforts: np.ndarray) -> np.ndarray:
     for k in several.tolist():
         while order.last[k] > order.first[k] and order.repair(k):
             pass
-    return np.where(order.last >= order.first, order.last, -1)
+    answer = np.where(order.last >= order.first, order.last, -1)
+    is_answered = answer >= 0
+    index = np.maximum.accumulate(answer)
+    # Efforts before the first joint state are those of rows until the first answer.
+    before = np.searchsorted(efforts, received[0], side="left") - 1
+    index = np.maximum(index, before)
+    is_before_gap = np.append(np.diff(efforts) > longest_interval(efforts), True)
+    is_known = (index >= 0) & (is_answered | ~is_before_gap[index])
+    return np.maximum(index, 0), is_known
 
 
 class _Order(NamedTuple):

@@ -126,36 +126,29 @@ def _of_file(path: Path) -> dict[str, np.ndarray]:
 def _columns(path: Path) -> tuple[list[str], np.ndarray]:
     """The heading of a CSV file, and its rows of numbers, (N, columns)."""
     try:
-        return _heading_and_rows(path)
+        with open(path, newline="", encoding="utf-8-sig") as file:
+            # The heading that numpy.savetxt writes begins with "# ".
+            heading = [word.strip().removeprefix("# ") for word in next(csv.reader(file), [])]
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # a file without rows is reported below
+                return heading, np.genfromtxt(file, delimiter=",", ndmin=2)
     except UnicodeDecodeError as error:
         remedy = 'Save it as "CSV UTF-8": other encodings, such as UTF-16, are not read.'
         raise checks.fail(str(path), checks.Words(str(error)), "a text in UTF-8", remedy) from error
     except csv.Error as error:
         came = checks.Words(str(error))
         raise checks.fail(str(path), came, "a heading t, q[0], ..., tau[0], ...") from error
-
-
-def _heading_and_rows(path: Path) -> tuple[list[str], np.ndarray]:
-    with open(path, newline="", encoding="utf-8-sig") as file:
-        # The heading that numpy.savetxt writes begins with "# ".
-        heading = [word.strip().removeprefix("# ") for word in next(csv.reader(file), [])]
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # a file without rows is reported below
-                return heading, np.genfromtxt(file, delimiter=",", ndmin=2)
-        except UnicodeDecodeError:
-            raise
-        except ValueError as error:
-            text = str(error)
-            short = re.search(r"Line #(\d+) \(got (\d+) columns instead of (\d+)\)", text)
-            if short is None:
-                raise checks.fail(str(path), checks.Words(text), "rows of numbers") from error
-            raise checks.fail(
-                str(path),
-                checks.Words(f"{short[2]} columns in row {int(short[1]) - 1}"),
-                f"{short[3]}, as in the rows before",
-                "Leave this row out: gaps are allowed.",
-            ) from error
+    except ValueError as error:  # of genfromtxt
+        text = str(error)
+        short = re.search(r"Line #(\d+) \(got (\d+) columns instead of (\d+)\)", text)
+        if short is None:
+            raise checks.fail(str(path), checks.Words(text), "rows of numbers") from error
+        raise checks.fail(
+            str(path),
+            checks.Words(f"{short[2]} columns in row {int(short[1]) - 1}"),
+            f"{short[3]}, as in the rows before",
+            "Leave this row out: gaps are allowed.",
+        ) from error
 
 
 def _of_columns(heading: list[str], rows: np.ndarray, what: str) -> dict[str, np.ndarray]:

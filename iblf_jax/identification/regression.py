@@ -353,7 +353,13 @@ def _check_explained(
         dynamics = same
         if other.q is not motion.q:
             dynamics = inverse_dynamics_along(scenario, c, c.x, other)
-        share = _unexplained_by_regression(dynamics, other)
+        # After one step of the linear regression.
+        J = np.asarray(dynamics.by_x)
+        r = other.tau - np.asarray(dynamics.torque)
+        A = J.reshape(-1, J.shape[-1])
+        weight = np.tile(1.0 / (other.tau.std(axis=0) + 1e-9), len(r))
+        step = np.linalg.lstsq(A * weight[:, None], r.ravel() * weight, rcond=1e-6)[0]
+        share = _unexplained_share(r - J @ step, other.tau)
         if share < min(0.5 * best, 1.0 - BARELY_EXPLAINED):
             best, best_reading = share, reading
     if best_reading:
@@ -376,16 +382,6 @@ def _check_explained(
             "Check that the log is of this robot, its units and columns; or identify more"
             " parameters.",
         )
-
-
-def _unexplained_by_regression(dynamics: InverseDynamics, motion: SmoothedMotion) -> float:
-    """The unexplained share of the torques after one linear regression step."""
-    J = np.asarray(dynamics.by_x)
-    r = motion.tau - np.asarray(dynamics.torque)
-    A = J.reshape(-1, J.shape[-1])
-    weight = np.tile(1.0 / (motion.tau.std(axis=0) + 1e-9), len(r))
-    step = np.linalg.lstsq(A * weight[:, None], r.ravel() * weight, rcond=1e-6)[0]
-    return _unexplained_share(r - J @ step, motion.tau)
 
 
 def _alternative_readings(motion: SmoothedMotion) -> Iterator[tuple[str, SmoothedMotion]]:

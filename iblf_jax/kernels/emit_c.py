@@ -85,22 +85,18 @@ def expression(node: Node, args: list[str], kinds: list[str]) -> str:
     """The C of one operation; `args` are the C expressions of its arguments, of these kinds."""
     op = node.op
     if op == "convert":
-        return _conversion(kinds[0], node.kind, args[0])
+        source, target, arg = kinds[0], node.kind, args[0]
+        if source == "b" and target == "f":
+            return f"{arg} ? splat(1) : splat(0)"
+        if source == "b":
+            return f"{arg} & 1"
+        if target == "f":
+            return f"to_float({arg})"
+        return f"to_int({arg})"
     text = OPERATIONS[op].in_c(op, kinds[0], args)
     if text is not None:
         return text
     raise UnsupportedError(f"generated code has no {op} of kind {kinds}")
-
-
-def _conversion(source: str, target: str, arg: str) -> str:
-    """The C of a conversion from one kind to another."""
-    if source == "b" and target == "f":
-        return f"{arg} ? splat(1) : splat(0)"
-    if source == "b":
-        return f"{arg} & 1"
-    if target == "f":
-        return f"to_float({arg})"
-    return f"to_int({arg})"
 
 
 SEEN_BY_FUNCTION = (

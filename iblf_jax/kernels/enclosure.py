@@ -113,7 +113,23 @@ def compiled(function: Callable, dimension: int, shapes: tuple[tuple[int, ...], 
     nodes = lowered.program.nodes
     floats = [node.value for node in nodes if node.op == "const" and node.kind == "f"]
     literals = tuple({value.hex(): value for value in floats}.values())
-    source = _source(lowered.program, dimension, constants, literals, lowered.sizes[0])
+    emitter = _Emitter(lowered.program, constants, literals)
+    sizes = {
+        "DOUBLE": 1,
+        "COORDINATES": dimension,
+        "OUTPUTS": len(lowered.program.outputs),
+        "ALTERNATIVES": lowered.sizes[0],
+        "TABLE_SIZE": max(1, len(emitter.table)),
+    }
+    parts = [
+        *(f"#define {name} {value}" for name, value in sizes.items()),
+        header("vector.h"),
+        header("interval.h"),
+        emitter.shared_numbers(),
+        emitter.evaluation(),
+        header("boxes.h"),
+    ]
+    source = "\n".join(parts)
     return Compiled(*lowered, literals, source)
 
 
@@ -292,7 +308,13 @@ class _Emitter:
         if node.op == "div" and self.is_shared[node.args[1]] and not self.is_shared[i]:
             return f"i_multiple({listed})"
         if node.op == "pow" and self.is_shared[node.args[1]]:
-            return self._power(args, nodes[1])
+            exponent = nodes[1]
+            if exponent.op != "const" or not exponent.value.is_integer():
+                return f"i_pow({listed})"
+            if 0 < exponent.value <= LARGEST_POWER:
+                return f"i_power({args[0]}, {int(exponent.value)})"
+            reason = f"the power {exponent.value:g} is not available on intervals"
+            raise UnsupportedError(reason)
         if node.op == "is_finite":
             return f"t_is_finite({listed})"
         if node.op == "with_sign":
@@ -321,14 +343,6 @@ class _Emitter:
                 ]
                 return f"{function}({args[other]}, {args[one]})"
         return f"i_mul({', '.join(args)})"
-
-    def _power(self, args: Sequence[str], exponent: Node) -> str:
-        """A power whose exponent does not depend on the box."""
-        if exponent.op != "const" or not exponent.value.is_integer():
-            return f"i_pow({', '.join(args)})"
-        if not 0 < exponent.value <= LARGEST_POWER:
-            raise UnsupportedError(f"the power {exponent.value:g} is not available on intervals")
-        return f"i_power({args[0]}, {int(exponent.value)})"
 
 
 class _Memory:
@@ -376,33 +390,6 @@ def _type(node: Node) -> str:
     if node.kind == "i":
         raise UnsupportedError(f"the operation {node.op!r} on integers that depend on the box")
     return {"f": "interval", "b": "truth"}[node.kind]
-
-
-def _source(
-    program: Program,
-    dimension: int,
-    constants: int,
-    literals: tuple[float, ...],
-    alternatives: int,
-) -> str:
-    """The C++ source of a program on intervals."""
-    emitter = _Emitter(program, constants, literals)
-    sizes = {
-        "DOUBLE": 1,
-        "COORDINATES": dimension,
-        "OUTPUTS": len(program.outputs),
-        "ALTERNATIVES": alternatives,
-        "TABLE_SIZE": max(1, len(emitter.table)),
-    }
-    parts = [
-        *(f"#define {name} {value}" for name, value in sizes.items()),
-        header("vector.h"),
-        header("interval.h"),
-        emitter.shared_numbers(),
-        emitter.evaluation(),
-        header("boxes.h"),
-    ]
-    return "\n".join(parts)
 
 
 @CACHES.function(maxsize=64)
@@ -455,7 +442,10 @@ def _are_rounded(x: float, y: float, found: list[tuple[float, float]]) -> bool:
     a, b = Fraction(x), Fraction(y)
     exact = (a + b, a - b, a * b, a / b)
     for value, (low, high) in zip(exact, found[:4], strict=True):
-        if not _encloses(low, high, value):
+        is_nearest = low <= value <= high <= math.nextafter(low, math.inf)
+        if high == math.inf:
+            is_nearest = value > sys.float_info.max
+        if not is_nearest:
             return False
     root, sine, exponential = found[4:]
     if abs(x) < 10 and not (_is_close(sine, math.sin(x)) and _is_close(exponential, math.exp(x))):
@@ -470,13 +460,6 @@ def _is_close(bounds: tuple[float, float], value: float) -> bool:
     low, high = bounds
     margin = 1e-14 * max(1.0, abs(value))
     return value - margin <= low < high <= value + margin
-
-
-def _encloses(low: float, high: float, value: Any) -> bool:
-    """Whether the bounds are the nearest floating-point numbers on both sides of a fraction."""
-    if high == math.inf:
-        return value > sys.float_info.max
-    return low <= value <= high and high <= math.nextafter(low, math.inf)
 
 
 def pointer(array: np.ndarray) -> ctypes.c_void_p:

@@ -132,19 +132,13 @@ def _div(b: Builder, args, kind):
     value = b.value(y)
     if value == 1 or (b.sparse and b.value(x) == 0):
         return x
-    if kind == "f" and value and _has_exact_reciprocal(value):
-        return b.emit("mul", x, b.constant(1 / value, "f"), kind=kind)
+    if kind == "f" and value and math.isfinite(value):
+        mantissa, exponent = math.frexp(value)
+        if abs(mantissa) == 0.5 and abs(exponent) < 100:  # a power of two has an exact reciprocal
+            return b.emit("mul", x, b.constant(1 / value, "f"), kind=kind)
     if kind == "f" and b.nodes[x].op == "neg":
         return b.emit("neg", b.emit("div", b.nodes[x].args[0], y))
     return None
-
-
-def _has_exact_reciprocal(value: float) -> bool:
-    """Whether a number is a power of two of moderate size."""
-    if not math.isfinite(value):
-        return False
-    mantissa, exponent = math.frexp(value)
-    return abs(mantissa) == 0.5 and abs(exponent) < 100
 
 
 def _neg(b: Builder, args, kind):

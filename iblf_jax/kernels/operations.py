@@ -38,14 +38,6 @@ class Operation(NamedTuple):
         return self.c[kind].format(*args)
 
 
-def _reciprocal_root(x):
-    return 1 / np.sqrt(x)
-
-
-def _logistic(x):
-    return 1 / (1 + np.exp(-x))
-
-
 def _arithmetic(numpy: Callable, sign: str, cost: int = 1, **more: Any) -> Operation:
     return Operation(numpy, cost, dict.fromkeys("fi", f"{{}} {sign} {{}}"), **more)
 
@@ -76,7 +68,7 @@ OPERATIONS: dict[str, Operation] = {
     "ceil": Operation(np.ceil, 1),
     "round_even": Operation(np.rint, 1, primitives=()),
     "sqrt": Operation(np.sqrt, 8),
-    "rsqrt": Operation(_reciprocal_root, 16),
+    "rsqrt": Operation(lambda x: 1 / np.sqrt(x), 16),
     "cbrt": Operation(np.cbrt, None),
     "sin": Operation(np.sin, 18),
     "cos": Operation(np.cos, 18),
@@ -99,7 +91,7 @@ OPERATIONS: dict[str, Operation] = {
     "pow": Operation(np.power, None, primitives=()),
     "erf": Operation(np.vectorize(math.erf, otypes=[float]), None),
     "erfc": Operation(np.vectorize(math.erfc, otypes=[float]), None),
-    "logistic": Operation(_logistic, 30),
+    "logistic": Operation(lambda x: 1 / (1 + np.exp(-x)), 30),
     "is_finite": Operation(np.isfinite, 2),
     "eq": _comparison(np.equal, "==", of_flags="~({} ^ {})", commutes=True),
     "ne": _comparison(np.not_equal, "!=", of_flags="({} ^ {})", commutes=True),

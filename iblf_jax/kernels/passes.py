@@ -136,7 +136,12 @@ def scheduled(program: Program) -> Program:
 
 def _by_longest_chain(nodes: Sequence[Node], known: set[int]) -> list[int]:
     """The order of `scheduled` of all nodes that are not known (list scheduling)."""
-    cost = [_cost(node) for node in nodes]
+    cost = [0] * len(nodes)  # approximate number of instructions
+    for i, node in enumerate(nodes):
+        if node.op == "call":
+            cost[i] = node.value.size
+        elif node.op in OPERATIONS:
+            cost[i] = OPERATIONS[node.op].cost or LIBRARY
     delay = [max(2 * c, LATENCY) if c else 0 for c in cost]
     users: list[list[int]] = [[] for _ in nodes]
     missing = [0] * len(nodes)
@@ -175,12 +180,3 @@ LATENCY = 4
 """Cycles until the result of an instruction is available."""
 LIBRARY = 100
 """Instructions of a call of the C library, approximately."""
-
-
-def _cost(node: Node) -> int:
-    """Approximate number of instructions of a node; 0 for constants and inputs."""
-    if node.op == "call":
-        return node.value.size
-    if node.op not in OPERATIONS:
-        return 0
-    return OPERATIONS[node.op].cost or LIBRARY

@@ -28,10 +28,6 @@ def _elementwise(op: str) -> Callable:
     return lambda b, eqn, *operands: each(b, op, eqn, *operands)
 
 
-def _integer_pow(b: Builder, eqn, x: Ids) -> Ids:
-    return power(b, eqn, x, eqn.params["y"])
-
-
 def power(b: Builder, eqn, x: Ids, exponent: int) -> Ids:
     """x^exponent by squaring, for an integer exponent; on intervals, an odd power is one operation,
     which does not lose that its factors are equal.
@@ -79,10 +75,6 @@ def _select_n(b: Builder, eqn, which: Ids, *cases: Ids) -> Ids:
     return result
 
 
-def _clamp(b: Builder, eqn, low: Ids, x: Ids, high: Ids) -> Ids:
-    return each(b, "min", eqn, each(b, "max", eqn, x, low), high)
-
-
 def _convert(b: Builder, eqn, x: Ids) -> Ids:
     source, target = eqn.invars[0].aval.dtype, eqn.outvars[0].aval.dtype
     if kind_of(source) == kind_of(target):
@@ -96,10 +88,6 @@ def _round(b: Builder, eqn, x: Ids) -> Ids:
     if int(eqn.params["rounding_method"]) != 1:
         raise UnsupportedError("rounding half away from zero is not lowered; use jnp.round")
     return each(b, "round_even", eqn, x)
-
-
-def _stop(b: Builder, eqn, *operands: Ids):
-    return list(operands)
 
 
 def _neutral(op: str, kind: str):
@@ -205,10 +193,6 @@ def _dot(b: Builder, kind: str, u: list[int], v: list[int]) -> int:
     return reduce(lambda total, term: b.emit("add", total, term, kind=kind), terms)
 
 
-def _square(b: Builder, eqn, x: Ids) -> Ids:
-    return each(b, "mul", eqn, x, x)
-
-
 def _one_minus_square(b: Builder, eqn, x: Ids) -> Ids:
     """As (1 + x) (1 - x), which is exact where |x| is close to 1; on intervals as 1 - x^2, in which
     x occurs once.
@@ -248,17 +232,18 @@ def _primitives_of(op: str) -> tuple[str, ...]:
 RULES: dict[str, Callable] = {
     **{name: _elementwise(op) for op in OPERATIONS for name in _primitives_of(op)},
     **STRUCTURE,
-    "square": _square,
+    "square": lambda b, eqn, x: each(b, "mul", eqn, x, x),
     "pow": _pow,
-    "integer_pow": _integer_pow,
+    "integer_pow": lambda b, eqn, x: power(b, eqn, x, eqn.params["y"]),
     "round": _round,
     "select_n": _select_n,
-    "clamp": _clamp,
+    "clamp": lambda b, eqn, low, x, high: each(b, "min", eqn, each(b, "max", eqn, x, low), high),
     "convert_element_type": _convert,
     "one_minus_square": _one_minus_square,  # since jax 0.11
     "log2": _log2,  # since jax 0.11
     **dict.fromkeys(
-        ("stop_gradient", "optimization_barrier", "copy", "copy_p", "reduce_precision"), _stop
+        ("stop_gradient", "optimization_barrier", "copy", "copy_p", "reduce_precision"),
+        lambda b, eqn, *operands: list(operands),
     ),
     "reduce_sum": _reduce("add"),
     "reduce_prod": _reduce("mul"),

@@ -14,20 +14,12 @@ import numpy as np
 from iblf_jax.kernels.program import Builder, Ids, UnsupportedError, constants
 
 
-def _reshape(b: Builder, eqn, x: Ids, *_: Ids) -> Ids:
-    return x.reshape(eqn.outvars[0].aval.shape)
-
-
 def _broadcast_in_dim(b: Builder, eqn, x: Ids, *_: Ids) -> Ids:
     shape, dimensions = eqn.params["shape"], eqn.params["broadcast_dimensions"]
     spread = [1] * len(shape)
     for axis, place in enumerate(dimensions):
         spread[place] = x.shape[axis]
     return np.broadcast_to(x.reshape(spread), shape)
-
-
-def _transpose(b: Builder, eqn, x: Ids) -> Ids:
-    return np.transpose(x, eqn.params["permutation"])
 
 
 def _slice(b: Builder, eqn, x: Ids) -> Ids:
@@ -41,24 +33,8 @@ def _slice(b: Builder, eqn, x: Ids) -> Ids:
     ]
 
 
-def _concatenate(b: Builder, eqn, *operands: Ids) -> Ids:
-    return np.concatenate(operands, axis=eqn.params["dimension"])
-
-
-def _stack(b: Builder, eqn, *operands: Ids) -> Ids:
-    return np.stack(operands, axis=eqn.params.get("axis", eqn.params.get("dimension", 0)))
-
-
-def _unstack(b: Builder, eqn, x: Ids):
-    return list(np.moveaxis(x, eqn.params["axis"], 0))
-
-
 def _split(b: Builder, eqn, x: Ids):
     return np.split(x, np.cumsum(eqn.params["sizes"])[:-1], axis=eqn.params["axis"])
-
-
-def _rev(b: Builder, eqn, x: Ids) -> Ids:
-    return np.flip(x, eqn.params["dimensions"])
 
 
 def _pad(b: Builder, eqn, x: Ids, filler: Ids) -> Ids:
@@ -259,18 +235,24 @@ def _scatter(op: str | None) -> Callable:
 
 
 STRUCTURE: dict[str, Callable] = {
-    **dict.fromkeys(("reshape", "squeeze", "expand_dims"), _reshape),
+    **dict.fromkeys(
+        ("reshape", "squeeze", "expand_dims"),
+        lambda b, eqn, x, *_: x.reshape(eqn.outvars[0].aval.shape),
+    ),
     "broadcast_in_dim": _broadcast_in_dim,
-    "transpose": _transpose,
+    "transpose": lambda b, eqn, x: np.transpose(x, eqn.params["permutation"]),
     "slice": _slice,
-    "concatenate": _concatenate,
-    "stack": _stack,
+    "concatenate": lambda b, eqn, *xs: np.concatenate(xs, axis=eqn.params["dimension"]),
+    "stack": lambda b, eqn, *xs: np.stack(
+        xs, axis=eqn.params.get("axis", eqn.params.get("dimension", 0))
+    ),
     "split": _split,
-    "rev": _rev,
+    "rev": lambda b, eqn, x: np.flip(x, eqn.params["dimensions"]),
     "pad": _pad,
     "iota": _iota,
     **dict.fromkeys(("empty", "empty2"), _empty),  # of the transpose of a scan
-    "unstack": _unstack,  # since jax 0.11
+    # Since jax 0.11.
+    "unstack": lambda b, eqn, x: list(np.moveaxis(x, eqn.params["axis"], 0)),
     "gather": _gather,
     "dynamic_slice": _dynamic_slice,
     "dynamic_update_slice": _dynamic_update_slice,

@@ -109,8 +109,16 @@ def compiler() -> tuple[str, ...]:
       ToolchainError: there is none.
     """
     requested = os.environ.get("CXX")
-    if requested:
-        return _command_of(requested)
+    if requested:  # a program, or a program and its first arguments
+        path = shutil.which(requested)
+        if path:
+            return (path,)
+        with contextlib.suppress(ValueError):  # an open quotation mark
+            program, *arguments = shlex.split(requested) or [""]
+            path = shutil.which(program)
+            if path:
+                return (path, *arguments)
+        raise ToolchainError(f"there is no C++ compiler {requested!r} ($CXX)")
     for name in ("c++", "g++", "clang++"):
         path = shutil.which(name)
         if path:
@@ -121,19 +129,6 @@ def compiler() -> tuple[str, ...]:
         "there is no C++ compiler (c++, g++, clang++); install one, or `pip install"
         ' "iblf_jax[export]"`, which contains one'
     )
-
-
-def _command_of(requested: str) -> tuple[str, ...]:
-    """The command that $CXX names: a program, or a program and its first arguments."""
-    path = shutil.which(requested)
-    if path:
-        return (path,)
-    with contextlib.suppress(ValueError):  # an open quotation mark
-        program, *arguments = shlex.split(requested) or [""]
-        path = shutil.which(program)
-        if path:
-            return (path, *arguments)
-    raise ToolchainError(f"there is no C++ compiler {requested!r} ($CXX)")
 
 
 def has_ziglang() -> bool:
@@ -377,7 +372,20 @@ def cached_file(
     """
     path = cache_path(content, suffix)
     with _made_once(path.stem):
-        _make_if_missing(path.parent, path, make)
+        folder = path.parent
+        try:
+            if _checked(path) is None:
+                for left in folder.glob("tmp????????"):  # of version 0.1.0
+                    remove_abandoned(left, lockable=False)
+                with draft(folder, "kernel") as work:
+                    made = work / f"made{path.suffix}"
+                    make(made)
+                    image = _read(made)
+                    if not image:
+                        raise ToolchainError("the compiler left no file")
+                    _write(work, image, path)
+        except OSError as error:
+            raise ToolchainError(f"the cache {folder} cannot be used: {error}") from None
     return path, path.stem
 
 
@@ -416,23 +424,6 @@ def _made_once(key: str) -> Iterator[None]:
         if waiting:
             stop_own_compilers()
         raise
-
-
-def _make_if_missing(folder: Path, path: Path, make: Callable[[Path], object]) -> None:
-    """Makes a file of the cache unless an intact one exists."""
-    try:
-        if _checked(path) is None:
-            for left in folder.glob("tmp????????"):  # of version 0.1.0
-                remove_abandoned(left, lockable=False)
-            with draft(folder, "kernel") as work:
-                made = work / f"made{path.suffix}"
-                make(made)
-                image = _read(made)
-                if not image:
-                    raise ToolchainError("the compiler left no file")
-                _write(work, image, path)
-    except OSError as error:
-        raise ToolchainError(f"the cache {folder} cannot be used: {error}") from None
 
 
 def _write(folder: Path, image: bytes, path: Path) -> None:

@@ -144,7 +144,16 @@ def _rows_with_zoom(
         show(main, curves, row.quantity, row.joint, full)
         show(inset, curves, row.quantity, row.joint, start, tight=True)
         main.set_ylabel(row.label)
-        _outline(main, inset)
+        # A box in the main panel around the part that the inset shows.
+        left, right = inset.get_xlim()
+        low = max(inset.get_ylim()[0], main.get_ylim()[0])
+        high = min(inset.get_ylim()[1], main.get_ylim()[1])
+        colour = _style.blend(0.667)
+        box = (left, low, right - left, high - low)
+        main.indicate_inset(box, edgecolor=colour, alpha=1.0, linewidth=0.7)
+        inset.spines[["top", "right"]].set_visible(True)
+        for spine in inset.spines.values():
+            spine.set_color(colour)
         lines = [range_after(curves, row.quantity, row.joint, start[1])]
         if inset is table[0, 1]:
             lines.insert(0, zoom_reason(curves, rows, start[1]))
@@ -155,19 +164,6 @@ def _rows_with_zoom(
     _style.set_title(figure, title, curves, notes=notes)
     _style.legend_below(figure)
     return figure
-
-
-def _outline(main: Axes, inset: Axes) -> None:
-    """Draws a box in the main panel around the part that the inset shows."""
-    left, right = inset.get_xlim()
-    low = max(inset.get_ylim()[0], main.get_ylim()[0])
-    high = min(inset.get_ylim()[1], main.get_ylim()[1])
-    colour = _style.blend(0.667)
-    box = (left, low, right - left, high - low)
-    main.indicate_inset(box, edgecolor=colour, alpha=1.0, linewidth=0.7)
-    inset.spines[["top", "right"]].set_visible(True)
-    for spine in inset.spines.values():
-        spine.set_color(colour)
 
 
 def _every_joint(title: str, runs: Runs, field: str, zoom: float | None) -> Figure:

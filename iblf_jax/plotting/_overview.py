@@ -66,7 +66,12 @@ def overview(run: Rollout, *, title: str = "Overview of the run") -> Figure:
     checks.string("title", title, "a text")
     (curve,) = curves_of(run)
     rows = len(_style.row_sizes(run.n, COLUMNS))
-    levels = _shown_levels(curve)
+    plant = run.scenario.loop.plant
+    levels = [1]
+    for level in range(2, plant.order + 1):
+        follows_alpha = level > plant.reference_levels
+        if follows_alpha or curve.has_bounds(level) or curve.is_measured:
+            levels.append(level)
     disturbed = curve.disturbed_levels()
     heights = [2.0 * rows] * len(levels) + [4.4]
     if disturbed:
@@ -86,17 +91,6 @@ def overview(run: Rollout, *, title: str = "Overview of the run") -> Figure:
     _style.set_title(figure, title, [curve], always=True)
     _style.legend_below(figure, 8)
     return figure
-
-
-def _shown_levels(curve: Curve) -> list[int]:
-    """The levels that the first panels show, counted from 1."""
-    plant = curve.run.scenario.loop.plant
-    shown = [1]
-    for level in range(2, plant.order + 1):
-        follows_alpha = level > plant.reference_levels
-        if follows_alpha or curve.has_bounds(level) or curve.is_measured:
-            shown.append(level)
-    return shown
 
 
 def _level(figure: Figure, where: SubplotSpec, curve: Curve, level: int, window: Window) -> None:
@@ -150,7 +144,18 @@ def _together(figure: Figure, where: SubplotSpec, curve: Curve, window: Window) 
             if line.get_label() == symbol:
                 line.set(color=_style.blend(0.396), linewidth=2.4)
             line.set_label("_")
-    _lyapunov(figure.add_subplot(grid[1, 2]), curve, window)
+    axes = figure.add_subplot(grid[1, 2])
+    V = curve["V"]
+    positive = np.where(np.isfinite(V) & (V > 0), V, np.nan)
+    axes.plot(*thinned(curve.t[: len(V)], positive), color=_style.blend(0.733))
+    energy = scenario.loop.model.energy_of_errors
+    symbol = r"$\sum w_i V_i$" if is_default(energy, Plant.energy_of_errors) else "$V_2$"
+    if np.isfinite(positive).any():
+        axes.set_yscale("log")
+    elif np.isfinite(V).any():
+        say_zero(axes, 0.0, symbol, "1")
+    axes.set_ylabel(f"Lyapunov function {symbol}")
+    _style.time_axis(axes, window)
 
 
 def _joints(axes: Axes, curve: Curve, quantity: PanelQuantity, window: Window) -> None:
@@ -196,18 +201,3 @@ def _regions(figure: Figure, where: SubplotSpec, curve: Curve, window: Window) -
     axes.set_ylabel(quantity.label)
     for line in draw_paths(figure, grid[1], [curve]).get_lines():
         line.set_label("_")
-
-
-def _lyapunov(axes: Axes, curve: Curve, window: Window) -> None:
-    """The Lyapunov function on a logarithmic axis."""
-    V = curve["V"]
-    positive = np.where(np.isfinite(V) & (V > 0), V, np.nan)
-    axes.plot(*thinned(curve.t[: len(V)], positive), color=_style.blend(0.733))
-    energy = curve.run.scenario.loop.model.energy_of_errors
-    symbol = r"$\sum w_i V_i$" if is_default(energy, Plant.energy_of_errors) else "$V_2$"
-    if np.isfinite(positive).any():
-        axes.set_yscale("log")
-    elif np.isfinite(V).any():
-        say_zero(axes, 0.0, symbol, "1")
-    axes.set_ylabel(f"Lyapunov function {symbol}")
-    _style.time_axis(axes, window)

@@ -430,21 +430,6 @@ def signed(value: float, digits: int = 5) -> str:
     return f"{value:.{digits}g}".replace("-", "\N{MINUS SIGN}")
 
 
-def _mark_exit(
-    axes: Axes, curve: Curve, quantity: PanelQuantity, joint: int, window: Window
-) -> None:
-    """Marks with a cross where the joint of a panel left its bounds, at the edge of the panel if
-    the sample is outside.
-    """
-    index = curve.exit_index(quantity.field, joint)
-    y = curve[quantity.field][:, joint]
-    if index is not None and window[0] <= curve.t[index] <= window[1] and np.isfinite(y[index]):
-        style: dict[str, Any] = {"marker": "x", "markersize": 7, "markeredgewidth": 2}
-        style |= {"linestyle": "none", "zorder": 5, "clip_on": False}
-        height = np.clip(y[index], *axes.get_ylim())
-        axes.plot(curve.t[index], height, color=_style.failure(), **style)
-
-
 def _draw_bounds_and_guide(
     axes: Axes, curves: Sequence[Curve], quantity: PanelQuantity, joint: int, window: Window
 ) -> tuple[list, list]:
@@ -560,9 +545,15 @@ def show(
     set_limits(axes, owners, samples, always_shown, quantity)
     if not tight:
         annotate_clipped_peak(axes, owners, samples, quantity, [joint] * len(samples))
-    for curve in curves:
-        if curve.failed:
-            _mark_exit(axes, curve, quantity, joint, window)
+    for curve in (curve for curve in curves if curve.failed):
+        # A cross where the joint left its bounds, at the edge of the panel if it is outside.
+        index = curve.exit_index(quantity.field, joint)
+        y = curve[quantity.field][:, joint]
+        if index is not None and window[0] <= curve.t[index] <= window[1] and np.isfinite(y[index]):
+            style = {"marker": "x", "markersize": 7, "markeredgewidth": 2}
+            style |= {"linestyle": "none", "zorder": 5, "clip_on": False}
+            height = np.clip(y[index], *axes.get_ylim())
+            axes.plot(curve.t[index], height, color=_style.failure(), **style)
 
 
 def run_style(curves: Sequence[Curve], index: int) -> dict[str, Any]:

@@ -12,7 +12,6 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.image import AxesImage
 
 from iblf_jax.core import checks
 from iblf_jax.core.status import FAILED, VIOLATED
@@ -152,29 +151,21 @@ def _draw_heat_map(
     axes.set_xlabel(_axis_label(data, x))
     axes.set_ylabel(_axis_label(data, y))
     figure.colorbar(image, ax=axes, label=label)
-    axes.set_title(_equality(metric, picture))
-    if picture.size <= 150:
-        _write_numbers(axes, picture, image)
-
-
-def _equality(metric: str, picture: np.ndarray) -> str:
-    """A title where all points have one value, which then says nothing about what was swept."""
-    values = picture[np.isfinite(picture)]
-    if metric in SHARES or values.size < 2 or not np.allclose(values, values[0], 1e-6, 0.0):
-        return ""
-    if metric in MARGINS:
-        return "equal at all points, as margins of the start (t = 0) are"
-    return "equal at all points"
-
-
-def _write_numbers(axes: Any, picture: np.ndarray, image: AxesImage) -> None:
-    centred = {"ha": "center", "va": "center", "fontsize": _style.size(7.5)}
-    for (row, column), value in np.ndenumerate(picture):
+    finite = picture[np.isfinite(picture)]
+    has_values = metric not in SHARES and finite.size > 1
+    if has_values and np.allclose(finite, finite[0], 1e-6, 0.0):
+        # Then the picture says nothing about what was swept.
+        reason = ", as margins of the start (t = 0) are" if metric in MARGINS else ""
+        axes.set_title(f"equal at all points{reason}")
+    if picture.size > 150:
+        return
+    centred: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": _style.size(7.5)}
+    for (row, column), number in np.ndenumerate(picture):
         cell: Any = _style.background()
-        if np.isfinite(value):
-            cell = image.cmap(image.norm(value))[:3]
+        if np.isfinite(number):
+            cell = image.cmap(image.norm(number))[:3]
         colour = "black" if _style.is_light(cell) else "white"
-        axes.text(column, row, f"{value:.3g}", color=colour, **centred)
+        axes.text(column, row, f"{number:.3g}", color=colour, **centred)
 
 
 @_style.styled()

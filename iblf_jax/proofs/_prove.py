@@ -421,25 +421,16 @@ def _refuted(
         except AperiodicError as error:
             notices.warn(f"No run tried to refute the bounds: {error}.")
             return None
-        run, dt = _accurate_run(scenario, duration)
+        for dt in TIME_STEPS:
+            run = _run(scenario, duration, dt)
+            if not int(run.status) & Status.INACCURATE:
+                break
         if int(run.status) & UNRELIABLE or not int(run.status) & Status.BOUND_VIOLATED:
             continue
         margin = float(np.min(np.asarray(run.metrics["margin"])))
         state = problem.state_of(point, constants)
         return Violation(scenario, state, int(run.steps or 0) * dt, dt, margin)
     return None
-
-
-def _accurate_run(scenario: Scenario, duration: float) -> tuple[Rollout, float]:
-    """The run with the largest time step with which it is accurate, or with the smallest one, and
-    this step [s].
-    """
-    *larger, smallest = TIME_STEPS
-    for dt in larger:
-        run = _run(scenario, duration, dt)
-        if not int(run.status) & Status.INACCURATE:
-            return run, dt
-    return _run(scenario, duration, smallest), smallest
 
 
 def _run(scenario: Scenario, duration: float, dt: float) -> Rollout:

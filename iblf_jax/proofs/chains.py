@@ -9,6 +9,7 @@ import copy
 import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, ClassVar, NamedTuple, cast
 
 import jax
@@ -167,8 +168,15 @@ class ChainProblem(LevelSetProblem):
         law = self.parts.law
         # The weight of a level that is not observed is `weight`.
         scales = np.ones((self.sign_count, 1))
+        t, zero, one = jnp.zeros(()), jnp.zeros(1), jnp.ones(1)
         for i in np.flatnonzero(self.bound.observed).tolist():
-            slope = _slope_at_centre(self.parts, i)
+            # s_i' at e_i = 0 and t = 0 in the tube around the middle of the bounds.
+            tube, bounds = unit_tube(), self.parts.bounds[i]
+            if bounds is not None:
+                width = bounds.upper.at(t, zero) - bounds.lower.at(t, zero)
+                half = 0.5 * width * one
+                tube = tube._replace(lower=-half, upper=half)
+            slope = along(partial(law.barriers[i].slope, tube), (zero,), (one,))
             scales[i] = np.asarray(law.weights[i] * slope / (law.k[i] * self.parts.kappa[i]))
         return Constants(
             self.parts,
@@ -202,18 +210,6 @@ class ChainProblem(LevelSetProblem):
     def initial(self, state: ChainLevelSetState) -> Initial:
         """All levels of a state."""
         return Initial(x=state.x)
-
-
-def _slope_at_centre(parts: ChainParts, i: int) -> jax.Array:
-    """s_i' at e_i = 0 and t = 0 in the tube around the middle of the bounds, (1,)."""
-    zero, one = jnp.zeros(1), jnp.ones(1)
-    tube = unit_tube()
-    bounds = parts.bounds[i]
-    if bounds is not None:
-        lower, upper = (side.at(jnp.zeros(()), zero) for side in (bounds.lower, bounds.upper))
-        half = 0.5 * (upper - lower) * one
-        tube = tube._replace(lower=-half, upper=half)
-    return along(lambda e: parts.law.barriers[i].slope(tube, e), (zero,), (one,))
 
 
 def chain_problem(

@@ -92,7 +92,14 @@ def uncertain_coordinates(
             low.append(ends[0])
             high.append(ends[1])
             names.append(tuple(together))
-    rates = _disturbance_rates(disturbance_rate, scenario.n)
+    rates = np.zeros(0)
+    if disturbance_rate is not None:
+        n = scenario.n
+        rates = np.asarray(checks.as_floats("disturbance_rate", disturbance_rate), float)
+        if rates.shape not in ((), (n,)) or not np.all(np.isfinite(rates)) or np.any(rates < 0):
+            expected = f"one number >= 0, or {n}, in N m/s"
+            raise checks.fail("disturbance_rate", disturbance_rate, expected)
+        rates = np.broadcast_to(rates, (n,))
     references += [0.0] * len(rates)
     low, high = [*low, *(-rates)], [*high, *rates]
     if len(low) > MOST_CORNERS:
@@ -106,15 +113,6 @@ def uncertain_coordinates(
     return Uncertain(
         places, numbers, np.array(low, float), np.array(high, float), tuple(labels), tuple(names)
     )
-
-
-def _disturbance_rates(given: ArrayLike | None, n: int) -> np.ndarray:
-    if given is None:
-        return np.zeros(0)
-    rates = np.asarray(checks.as_floats("disturbance_rate", given), float)
-    if rates.shape not in ((), (n,)) or not np.all(np.isfinite(rates)) or np.any(rates < 0):
-        raise checks.fail("disturbance_rate", given, f"one number >= 0, or {n}, in N m/s")
-    return np.broadcast_to(rates, (n,))
 
 
 def _entries_of(scenario: Scenario, path: str) -> list[str]:

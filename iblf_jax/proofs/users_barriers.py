@@ -85,11 +85,16 @@ def check_barrier(
       ValueError: a case besides the sign of e1, a length of its own, joints that mix, or methods
         that contradict each other.
     """
+
+    def rule(eqn: core.JaxprEqn, operands: list[_Quantity]) -> list[_Quantity]:
+        if not homogeneous:  # Lengths do not matter: all units are equal.
+            operands = [x if x.degree is None else x._replace(degree=0) for x in operands]
+        return [_result(eqn, operands)] * len(eqn.outvars)
+
     digests = []
     for method, function, inputs, expected in _methods(barrier, o, n):
         jaxpr = traced(f"{name}.{method}", function, [jnp.ones(n) for _ in inputs])
         digests.append(digest_of(jaxpr))
-        rule = _homogeneous if homogeneous else _on_each_side
         try:
             outputs = interpreted(jaxpr, inputs, rule, _of_constant)
             if homogeneous:
@@ -148,7 +153,7 @@ def _of_constant(value: object) -> _Quantity:
     return _Quantity(0, is_side=is_truth)
 
 
-def _unit_of(quantities: list[_Quantity]) -> Any:
+def _unit_of(quantities: list[_Quantity]) -> Fraction | int | None:
     """The degree of quantities of one unit."""
     found = {x.degree for x in quantities if x.degree is not None}
     if len(found) > 1:
@@ -156,22 +161,14 @@ def _unit_of(quantities: list[_Quantity]) -> Any:
     return found.pop() if found else None
 
 
-def _homogeneous(eqn: core.JaxprEqn, operands: list[_Quantity]) -> list[_Quantity]:
-    """The results of an operation on quantities of given units."""
-    return [_result(eqn, operands)] * len(eqn.outvars)
-
-
-def _on_each_side(eqn: core.JaxprEqn, operands: list[_Quantity]) -> list[_Quantity]:
-    """The results of an operation where lengths do not matter: all units are equal."""
-    without = [x if x.degree is None else x._replace(degree=0) for x in operands]
-    return [_result(eqn, without)] * len(eqn.outvars)
-
-
 def _result(eqn: core.JaxprEqn, operands: list[_Quantity]) -> _Quantity:
     """The result of an operation."""
     primitive, first = eqn.primitive, operands[0] if operands else NUMBER
-    if primitive in COMPARISONS and _is_with_zero(operands):
-        return _Quantity(0, is_side=True)
+    if primitive in COMPARISONS:
+        one, other = operands
+        is_error_with_zero = one.is_error and other.degree is None
+        if is_error_with_zero or (other.is_error and one.degree is None):
+            return _Quantity(0, is_side=True)
     if primitive in LOGIC and all(x.is_side for x in operands):
         return _Quantity(0, is_side=True)
     if primitive is primitives.select_n_p and first.is_side:
@@ -182,33 +179,23 @@ def _result(eqn: core.JaxprEqn, operands: list[_Quantity]) -> _Quantity:
         return NUMBER
     if primitive in REARRANGING:
         return _moved(eqn, operands)
-    if primitive is primitives.convert_element_type_p and _is_exact(eqn):
-        return first
+    is_conversion = primitive is primitives.convert_element_type_p
+    if is_conversion:
+        # Integers do not vary, because no admitted operation gives one that does.
+        pair = (eqn.invars[0], eqn.outvars[0])
+        before, after = (v.aval.dtype for v in pair)  # type: ignore[attr-defined]
+        if before == after or jnp.issubdtype(before, jnp.integer):
+            return first
     if primitive in SUMS:
         is_error = any(x.is_error for x in operands) and any(x.degree is None for x in operands)
         return _Quantity(_unit_of(operands), is_error)
     if primitive in OF_ONE_UNIT:
         return first._replace(is_error=first.is_error and primitive is primitives.neg_p)
-    is_conversion = primitive is primitives.convert_element_type_p
     if primitive in CASES | KINKS and not is_conversion:
         raise _UnitError(f"{primitive.name}, which is no case of the sign of e1")
     if primitive not in SMOOTH:
         raise _UnitError(f"{primitive.name}, which a proof does not know")
     return _Quantity(_degree(eqn, operands))
-
-
-def _is_exact(eqn: Any) -> bool:
-    """Whether a conversion rounds nothing; integers do not vary, because no admitted operation
-    gives one that does.
-    """
-    before, after = (v.aval.dtype for v in (eqn.invars[0], eqn.outvars[0]))
-    return before == after or jnp.issubdtype(before, jnp.integer)
-
-
-def _is_with_zero(operands: list[_Quantity]) -> bool:
-    """Whether a comparison is one of e1 with 0."""
-    one, other = operands
-    return (one.is_error and other.degree is None) or (other.is_error and one.degree is None)
 
 
 def _moved(eqn: Any, operands: list[_Quantity]) -> _Quantity:

@@ -215,26 +215,18 @@ def with_step(
         end = jnp.where(piece.exists, piece.commands[-1], end)
     stages = [start + c * (end - start) for c in tableau(method).c]
     for piece in pieces:
+        # The stages of a piece that fills its step have the times of those of an undivided step,
+        # but a derivative with respect to the jump time at which the piece ends, which the
+        # correction by the polynomial removes.
         is_full = arrived.is_full(piece.length)
-        on_grid = _on_grid(method, arrived, piece)
-        stages = [jnp.where(is_full, own, line) for own, line in zip(on_grid, stages, strict=True)]
+        for i, (c, own) in enumerate(zip(tableau(method).c, piece.commands, strict=True)):
+            offset = (piece.begin + c * piece.length - arrived.start) / arrived.dt - c
+            corrected = interpolated(method, piece.commands, c - offset)
+            on_grid = own + corrected - interpolated(method, piece.commands, c)
+            stages[i] = jnp.where(is_full, on_grid, stages[i])
     return jnp.concatenate([jnp.stack(_padded(stages))[None], before[:-1]])
 
 
 def _padded(stages: Sequence[jax.Array]) -> list[jax.Array]:
     """The commands of the stages of a step, (n,) each, with the last one repeated up to STAGES."""
     return [*stages, *[stages[-1]] * (STAGES - len(stages))]
-
-
-def _on_grid(method: str, arrived: ArrivingCommands, piece: PieceCommands) -> list[jax.Array]:
-    """The commands of a piece that fills its step, (n,) each, at the stages of an undivided step.
-
-    The stages of both have the same times. Those of the piece have a derivative with respect to the
-    jump time at which it ends, which the correction by the polynomial removes.
-    """
-    found = []
-    for c, own in zip(tableau(method).c, piece.commands, strict=True):
-        offset = (piece.begin + c * piece.length - arrived.start) / arrived.dt - c
-        corrected = interpolated(method, piece.commands, c - offset)
-        found.append(own + corrected - interpolated(method, piece.commands, c))
-    return found

@@ -157,10 +157,16 @@ def _cuts(
     """The cuts of a step in the order of their times, and the pending events that are left."""
     cuts = []
     for _ in range(number):
-        events = first = _first(offsets, pending)
+        first = _first(offsets, pending)
+        events = first
         offset = jnp.where(jnp.any(first), jnp.sum(jnp.where(first, offsets, 0.0)), span.length)
         if jumps > MAX_CUTS:
-            events = _with_equal_times(first, offsets, pending, jumps, span)
+            # If the first event is a jump, the pending jumps at its time are events, too.
+            apart = JUMP_SEPARATION * jnp.finfo(offsets.dtype).eps * jnp.abs(span.end)
+            at = jax.lax.stop_gradient(jnp.sum(jnp.where(first, offsets, 0.0)))
+            equal = jnp.abs(jax.lax.stop_gradient(offsets) - at) <= apart
+            is_jump = np.arange(offsets.size) >= offsets.size - jumps
+            events = first | (pending & equal & is_jump & jnp.any(first & is_jump))
         cuts.append(_Cut(offset, events))
         pending = pending & ~events
     return cuts, pending
@@ -173,18 +179,6 @@ def _first(offsets: jax.Array, pending: jax.Array) -> jax.Array:
     order = jnp.where(pending, jax.lax.stop_gradient(offsets), jnp.inf)
     earliest = jnp.argmin(order).astype(jnp.int32)
     return pending & (jnp.arange(offsets.size, dtype=jnp.int32) == earliest)
-
-
-def _with_equal_times(
-    first: jax.Array, offsets: jax.Array, pending: jax.Array, jumps: int, span: Span
-) -> jax.Array:
-    """The first event and, if it is a jump, the pending jumps at its time, (E,) bool."""
-    apart = JUMP_SEPARATION * jnp.finfo(offsets.dtype).eps * jnp.abs(span.end)
-    offset = jax.lax.stop_gradient(jnp.sum(jnp.where(first, offsets, 0.0)))
-    equal = jnp.abs(jax.lax.stop_gradient(offsets) - offset) <= apart
-    is_jump = np.arange(offsets.size) >= offsets.size - jumps
-    together = pending & equal & is_jump & jnp.any(first & is_jump)
-    return first | together
 
 
 def _limits(times: jax.Array, passed: jax.Array, span: Span) -> tuple[jax.Array, jax.Array]:

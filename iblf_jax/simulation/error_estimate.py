@@ -420,8 +420,16 @@ def unresolved_signals(
     nodes = jnp.asarray([*table.c, *(node for node, _ in GAUSS), 1.0], dt.dtype)
     times = starts[:, None] + nodes * dt
     tube = _at_all_times(scenario.context.tube, times)
-    rate_error = _rate_errors(table, tube, starts, dt).reshape(EXAMINED_STEPS, -1, n)
-    rate_error = jnp.max(rate_error, axis=1)
+    weights = np.asarray(table.b, dt.dtype)[:, None]
+    values = jnp.concatenate([tube.q_d, tube.lower, tube.upper], axis=-1)
+    rates = jnp.concatenate([tube.dq_d, tube.dlower, tube.dupper], axis=-1)
+    rate = jnp.sum(weights * rates[:, : len(table.c)], axis=1)
+    change = (values[:, -1] - values[:, 0]) / dt
+    # Rounding of the two values grows with the time at which they are evaluated.
+    sizes = jnp.abs(values[:, 0]) + starts[:, None] * jnp.abs(rate)
+    rounding = 4.0 * jnp.finfo(dt.dtype).eps * sizes / dt
+    rate_error = jnp.maximum(jnp.abs(rate - change) - rounding, 0.0)
+    rate_error = jnp.max(rate_error.reshape(EXAMINED_STEPS, -1, n), axis=1)
     disturbance_error = _disturbance_error(scenario, table, tube, times)
     jumps = scenario.jump_times()
     if jumps.size:
@@ -443,19 +451,6 @@ def _at_all_times(signal: Callable, times: jax.Array, *others: jax.Array) -> Any
     flat = [x.reshape(times.size, *x.shape[2:]) for x in (times, *others)]
     found = jax.vmap(signal)(*flat)
     return jax.tree.map(lambda x: x.reshape(*times.shape, *x.shape[1:]), found)
-
-
-def _rate_errors(table: Tableau, tube: Tube, starts: jax.Array, dt: jax.Array) -> jax.Array:
-    """Quadrature error of the rates of reference and bounds, beyond rounding, (steps, 3 n)."""
-    weights = np.asarray(table.b, dt.dtype)[:, None]
-    values = jnp.concatenate([tube.q_d, tube.lower, tube.upper], axis=-1)
-    rates = jnp.concatenate([tube.dq_d, tube.dlower, tube.dupper], axis=-1)
-    rate = jnp.sum(weights * rates[:, : len(table.c)], axis=1)
-    change = (values[:, -1] - values[:, 0]) / dt
-    # Rounding of the two values grows with the time at which they are evaluated.
-    sizes = jnp.abs(values[:, 0]) + starts[:, None] * jnp.abs(rate)
-    rounding = 4.0 * jnp.finfo(dt.dtype).eps * sizes / dt
-    return jnp.maximum(jnp.abs(rate - change) - rounding, 0.0)
 
 
 def _disturbance_error(

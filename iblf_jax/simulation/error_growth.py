@@ -79,7 +79,6 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
-from iblf_jax.control.sensors import AnySensor
 from iblf_jax.control.sensors._base import sensor_of_x
 from iblf_jax.core import checks
 from iblf_jax.core.linalg import matmul_in_order
@@ -188,35 +187,23 @@ def initial_growth(scenario: Scenario, state: LoopState, derivative: jax.Array) 
     zero = jnp.zeros(scenario.n, state.x.dtype)
     peak: jax.Array | Absent = ()
     jumped = zero[0]
-    if scenario.sampling is not None and scenario.sampling.trigger is not None:
+    sampling = scenario.sampling
+    has_trigger = sampling is not None and sampling.trigger is not None
+    if has_trigger:
         peak = zero
-    if _rounds_twice(scenario):
-        jumped = jnp.where(_reads_without_rounding(scenario, state, derivative), 1.0, jumped)
+    rounds_twice = sampling is not None and (has_trigger or _rounds_torque(scenario))
+    if rounds_twice and _rounds_readings(scenario):
+        # Where the law depends on a level without rounding, the error of its command is not
+        # followed, so any of its codes may differ.
+        plant = ravel_pytree(integrated_part(state))[0].size
+        steps = _resolution(scenario, state.x)
+        by_level = [
+            jnp.where(step == 0, derivative[plant:, rows], 0.0)
+            for rows, step in zip(_rows_of_levels(state), steps, strict=True)
+        ]
+        jumped = jnp.where(jnp.any(jnp.stack(by_level) != 0.0), 1.0, jumped)
     none = jax.tree.map(jnp.zeros_like, _variables(scenario, state))
     return ErrorGrowth(none, jumped, zero, zero[0], peak)
-
-
-def _rounds_twice(scenario: Scenario) -> bool:
-    """Whether a loop with rounded readings has a rounded torque or an event trigger too."""
-    if scenario.sampling is None or not _rounds_readings(scenario):
-        return False
-    has_trigger = scenario.sampling.trigger is not None
-    return has_trigger or _rounds_torque(scenario)
-
-
-def _reads_without_rounding(
-    scenario: Scenario, state: LoopState, derivative: jax.Array
-) -> jax.Array:
-    """Whether the law depends on a level without rounding, () bool.
-
-    The error of its command is not followed then, so any of its codes may differ.
-    """
-    plant = ravel_pytree(integrated_part(state))[0].size
-    by_level = [
-        jnp.where(step == 0, derivative[plant:, rows], 0.0)
-        for rows, step in zip(_rows_of_levels(state), _resolution(scenario, state.x), strict=True)
-    ]
-    return jnp.any(jnp.stack(by_level) != 0.0)
 
 
 def _rows_of_levels(state: LoopState) -> list[slice]:
@@ -366,24 +353,19 @@ def _at_sample(
     normal = normals(noise_key, now.sampling_index, scenario.sensor.draws, scenario.n).astype(
         state.x.dtype
     )
-    if _rounds_readings(scenario):
-        reaches = _reaches_code(growth.error[0].x, scenario, before, normal)
-        return growth._replace(jumped=jnp.where(reaches, 1.0, growth.jumped))
-    return _after_law(growth, scenario, t, normal, before, state)
-
-
-def _reaches_code(
-    error: jax.Array, scenario: Scenario, state: LoopState, normal: jax.Array
-) -> jax.Array:
-    """Whether an error of the levels, (r, n), reaches the next code of a reading, () bool."""
-    step = _resolution(scenario, state.x)
+    if not _rounds_readings(scenario):
+        return _after_law(growth, scenario, t, normal, before, state)
+    # A code differs if the error of a level reaches the next one.
+    step = _resolution(scenario, before.x)
+    period = checks.given(scenario.sampling).period
     rounded, exact = (
-        _reading(sensor, scenario, state, normal)
+        sensor_of_x(sensor).measure(before.x, normal, period, before.sampled.sensor)[0].x
         for sensor in (scenario.sensor, scenario.sensor.unrounded)
     )
     distance = 0.5 * step - jnp.abs(rounded - exact)
     blur = ARITHMETIC * jnp.finfo(step.dtype).eps * jnp.abs(rounded)
-    return jnp.any((step > 0) & (jnp.abs(error) + blur >= distance))
+    reaches = jnp.any((step > 0) & (jnp.abs(growth.error[0].x) + blur >= distance))
+    return growth._replace(jumped=jnp.where(reaches, 1.0, growth.jumped))
 
 
 def _after_law(
@@ -450,15 +432,6 @@ def _difference(x: T, y: T) -> T:
         return b - a if jnp.issubdtype(a.dtype, jnp.floating) else jnp.zeros_like(a)
 
     return jax.tree.map(one, x, y)
-
-
-def _reading(
-    sensor: AnySensor, scenario: Scenario, state: LoopState, normal: jax.Array
-) -> jax.Array:
-    """The measured levels, (r, n)."""
-    sampling = checks.given(scenario.sampling)
-    before = state.sampled.sensor
-    return sensor_of_x(sensor).measure(state.x, normal, sampling.period, before)[0].x
 
 
 def _resolution(scenario: Scenario, x: jax.Array) -> jax.Array:
@@ -596,7 +569,10 @@ def _inputs(
             law = derivative[plant : plant + n, rows]
             by_law = columns(matmul_in_order(by_torque, law), derivative[plant + n :, rows])
             if sampling.queue:
-                by_law = _through_queue(by_law, law, plant, memory, n)
+                # The command waits in the queue.
+                last = plant + memory
+                waiting = [by_law[plant:last], law, by_law[last + n :]]
+                by_law = jnp.concatenate([jnp.zeros_like(by_law[:plant]), *waiting])
             inputs.append(by_law * of_level)
     none = jnp.zeros((size, 1), derivative.dtype)
     return direct * width, jnp.concatenate(inputs or [none], axis=1)
@@ -640,14 +616,6 @@ def errors_by_step(metrics: Mapping[Any, Any]) -> jax.Array:
     # Less the rounding error of the sum, so that it does not count as an error by the step.
     rest = errors - (1.0 + ARITHMETIC * jnp.finfo(errors.dtype).eps) * bounds
     return jnp.where(bounds > TOLERANCE, jnp.where(rest > TOLERANCE, rest, 0.0), errors)
-
-
-def _through_queue(
-    direct: jax.Array, command: jax.Array, plant: int, memory: int, n: int
-) -> jax.Array:
-    """The columns of a rounding error of a reading whose command waits in a queue."""
-    none, last = jnp.zeros_like(direct[:plant]), plant + memory
-    return jnp.concatenate([none, direct[plant:last], command, direct[last + n :]])
 
 
 def _torque_widths(scenario: Scenario, growth: ErrorGrowth) -> tuple[jax.Array, Any]:

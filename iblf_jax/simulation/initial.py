@@ -38,7 +38,15 @@ class Initial:
             if any(value is not None for value in (q, dq, higher)):
                 expected = "either x, or q and dq"
                 raise checks.fail("Initial.x", x, expected, "x is q, dq and the other levels.")
-            q, dq, higher = _split_levels(x)
+            levels = checks.as_floats("Initial.x", x)
+            if levels.ndim != 2 or len(levels) < 2:
+                expected = "one row a level, shape (r, n)"
+                got = f"shape {levels.shape}"
+                remedy = "Such as x=[[0.3], [0.0], [0.0]] for three levels of one number."
+                raise checks.fail("Initial.x", got, expected, remedy)
+            q, dq = levels[0], levels[1]
+            if len(levels) > 2:
+                higher = levels[2:]
         for name, value in (("q", q), ("dq", 0.0 if dq is None else dq), ("higher", higher)):
             object.__setattr__(self, name, value)
 
@@ -47,14 +55,3 @@ class Initial:
         """All given levels, (2, n) or (r, n)."""
         first = jnp.stack(jnp.broadcast_arrays(self.q, self.dq))
         return first if self.higher is None else jnp.concatenate([first, self.higher])
-
-
-def _split_levels(x: Any) -> tuple[Any, Any, Any]:
-    """The first two levels of a state (r, n), and the others; ValueError for another shape."""
-    array = checks.as_floats("Initial.x", x)
-    if array.ndim != 2 or len(array) < 2:
-        expected = "one row a level, shape (r, n)"
-        got = f"shape {array.shape}"
-        remedy = "Such as x=[[0.3], [0.0], [0.0]] for three levels of one number."
-        raise checks.fail("Initial.x", got, expected, remedy)
-    return array[0], array[1], array[2:] if len(array) > 2 else None

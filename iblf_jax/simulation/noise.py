@@ -150,22 +150,18 @@ def check_method(scenario: Scenario, method: str) -> None:
     """
     stages = tableau(method).c
     _check_kind_of_method(scenario, method)
-    if len(stages) == 1 and scenario.actuator.input_delay is not None:
-        raise _no_command_between_steps(scenario, method)
-
-
-def _no_command_between_steps(scenario: Scenario, method: str) -> ValueError:
-    """The error for a method of a single stage where the input has a delay."""
+    if len(stages) > 1 or scenario.actuator.input_delay is None:
+        return
     noise = scenario.process_noise
     if noise is not None and not noise.additive:
         expected = "noise that does not depend on the state, as the input has a delay"
         remedy = 'A delay needs method="stochastic_heun", which needs additive noise.'
-        return checks.fail("scenario.process_noise", type(noise).__name__, expected, remedy)
+        raise checks.fail("scenario.process_noise", type(noise).__name__, expected, remedy)
     fitting = '"rk4" or "heun"'
     if noise is not None:
         fitting = '"stochastic_heun"'
     remedy = "Between two steps of Euler's method the command has no value."
-    return checks.fail("method", method, f"{fitting}, as the input has a delay", remedy)
+    raise checks.fail("method", method, f"{fitting}, as the input has a delay", remedy)
 
 
 def _check_kind_of_method(scenario: Scenario, method: str) -> None:

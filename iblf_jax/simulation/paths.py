@@ -23,10 +23,11 @@ Sweeps, perturbations, tuning and scenario files address leaves by these paths.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple, TypeAlias
 
 import jax.numpy as jnp
@@ -73,7 +74,10 @@ class ParameterTable(tuple[Parameter, ...]):
 
     def _rows(self) -> list[tuple[str, str, str, str]]:
         rows = []
-        inside = {path: self._of_module(path) for path in self.large_modules}
+        inside = {
+            path: [p for p in self if p.path.startswith((f"{path}.", f"{path}["))]
+            for path in self.large_modules
+        }
         hidden = {p.path for leaves in inside.values() for p in leaves}
         heads = {leaves[0].path: path for path, leaves in inside.items()}
         for p in self:
@@ -85,10 +89,6 @@ class ParameterTable(tuple[Parameter, ...]):
             if p.path not in hidden:
                 rows.append((p.path, str(p.shape), p.unit, _value_text(p.value)))
         return rows
-
-    def _of_module(self, path: str) -> list[Parameter]:
-        """The leaves of a module."""
-        return [p for p in self if p.path.startswith((f"{path}.", f"{path}["))]
 
     def __repr__(self) -> str:
         return "\n".join(tables.as_text([Parameter._fields, *self._rows()]))
@@ -181,7 +181,12 @@ def _walk(part: Any, path: str, named: bool, symbols: Symbols) -> Iterator[Param
         value = values[field.name]
         name = _joined(path, field.name)
         if field.name == wrapped_field(part):
-            yield from _walk_wrapped(part, value, path, name, named, symbols)
+            # A leaf with the name of a field of the wrapper needs the path of the wrapped part.
+            for parameter in _walk(value, path, named, symbols):
+                rest = parameter.path[len(path) :].lstrip(".")
+                if has_field(part, str(parse(rest)[0])):
+                    parameter = parameter._replace(path=f"{name}.{rest}")
+                yield parameter
         elif isinstance(value, NUMBERS):
             unit = as_text(_unit(part, field, symbols))
             yield Parameter(name, jnp.shape(value), unit, value)
@@ -200,19 +205,6 @@ def _walk(part: Any, path: str, named: bool, symbols: Symbols) -> Iterator[Param
 def arrays_of_module(module: Any) -> dict[str, Any]:
     """Path in the module -> array, of every leaf of a module, in the order of its leaves."""
     return {p.path.lstrip("."): p.value for p in _walk(module, "", False, {})}
-
-
-def _walk_wrapped(
-    wrapper: Any, inner: Any, path: str, name: str, named: bool, symbols: Symbols
-) -> Iterator[Parameter]:
-    """The leaves of a wrapped component under the path of its wrapper, except for those that have
-    the name of a field of the wrapper.
-    """
-    for parameter in _walk(inner, path, named, symbols):
-        rest = parameter.path[len(path) :].lstrip(".")
-        if has_field(wrapper, str(parse(rest)[0])):
-            parameter = parameter._replace(path=f"{name}.{rest}")
-        yield parameter
 
 
 def _unit(part: Any, field: dataclasses.Field, symbols: Symbols) -> Unit:
@@ -280,13 +272,6 @@ def expand(path: str) -> list[str]:
     return [path]
 
 
-def _unknown(scenario: Scenario, path: str) -> ValueError:
-    """The error about a path that leads to no leaf."""
-    known = [p.path for p in parameters(scenario)]
-    remedy = checks.nearest(full_path(path), known) or "ij.parameters(scenario) lists them."
-    return checks.fail("path", path, "the path of a leaf of this scenario", remedy)
-
-
 def get(scenario: Scenario, path: str) -> Any:
     """The value at a path (the plant's, for `robot.`)."""
     return _resolved(scenario, path, expand(path)[0])[1]
@@ -299,19 +284,17 @@ def places(scenario: Scenario, path: str) -> list[list[str | int]]:
 
 def leaves(scenario: Scenario, path: str) -> list[str]:
     """The paths of the complete leaves that contain the numbers at a path."""
-    return [_leaf_path(scenario, tokens) for tokens in places(scenario, path)]
-
-
-def _leaf_path(scenario: Scenario, tokens: Sequence[str | int]) -> str:
-    """The path of the complete leaf at a location."""
-    part: Any = scenario
-    path = ""
-    for token in tokens:
-        if isinstance(part, NUMBERS):
-            break
-        part = member_of(part, token)
-        path += written(token)
-    return path.lstrip(".")
+    found = []
+    for tokens in places(scenario, path):
+        part: Any = scenario
+        leaf_path = ""
+        for token in tokens:
+            if isinstance(part, NUMBERS):
+                break
+            part = member_of(part, token)
+            leaf_path += written(token)
+        found.append(leaf_path.lstrip("."))
+    return found
 
 
 def written(token: str | int) -> str:
@@ -340,7 +323,10 @@ def _metadata(scenario: Scenario, path: str) -> Mapping[str, Any]:
     symbols = symbols_of(scenario)
     tokens = places(scenario, path)[0]
     while not modules.is_module(part):
-        name, index, tokens = _next_field(tokens)
+        name = str(tokens[0])
+        after = itertools.takewhile(lambda token: isinstance(token, int), tokens[1:])
+        index = tuple(int(i) for i in after)
+        tokens = tokens[1 + len(index) :]
         field = next(f for f in dataclasses.fields(part) if f.name == name)
         value = vars(part)[name]
         if isinstance(value, NUMBERS):
@@ -353,16 +339,6 @@ def _metadata(scenario: Scenario, path: str) -> Mapping[str, Any]:
     return {}  # The numbers of a module have no declared unit.
 
 
-def _next_field(
-    tokens: list[str | int],
-) -> tuple[str, tuple[int, ...], list[str | int]]:
-    """The first field of a full path, the indices after it, and the tokens that are left."""
-    count = 1
-    while count < len(tokens) and isinstance(tokens[count], int):
-        count += 1
-    return str(tokens[0]), tuple(int(i) for i in tokens[1:count]), tokens[count:]
-
-
 def _resolved(scenario: Scenario, path: str, full: str) -> tuple[list[str | int], Any]:
     """Fields and indices of a full path, and the value there.
 
@@ -371,7 +347,10 @@ def _resolved(scenario: Scenario, path: str, full: str) -> tuple[list[str | int]
     try:
         return resolve(scenario, full)
     except LookupError:
-        raise _unknown(scenario, path) from None
+        known = [p.path for p in parameters(scenario)]
+        remedy = checks.nearest(full_path(path), known) or "ij.parameters(scenario) lists them."
+        expected = "the path of a leaf of this scenario"
+        raise checks.fail("path", path, expected, remedy) from None
 
 
 def with_parameters(scenario: Scenario, values: Mapping[str, Any]) -> Scenario:

@@ -160,10 +160,7 @@ class Scenario:
         rules.check_modes(self.plant)
         for name, part in field_values(self).items():
             object.__setattr__(self, name, fit_joints(part, self.plant.n, name))
-        self._complete_law()
-
-    def _complete_law(self) -> None:
-        """Gives the law what it derives from its model and the start, such as weights."""
+        # The law gets what it derives from its model and the start, such as weights.
         law = unwrapped(self.controller)
         if is_default(law.with_defaults, TrackingLaw.with_defaults):
             return
@@ -368,7 +365,11 @@ def canonical(scenario: Scenario) -> Scenario:
     keep_programs()
     rules.check_leaves(scenario)
     note_code(scenario)
-    scenario = _with_sufficient_queue(scenario)
+    sampling = scenario.sampling
+    if sampling is not None and checks.is_concrete(sampling) and sampling.queue < sampling.needed:
+        # The delay may have changed since the sampling was constructed.
+        sampling = dataclasses.replace(sampling, queue=sampling.needed)
+        scenario = dataclasses.replace(scenario, sampling=sampling)
     dtype = _shared_dtype(scenario)
     scenario = jax.tree.map(lambda x: _typed(x, dtype), scenario)
     if not checks.is_concrete(scenario):
@@ -379,17 +380,6 @@ def canonical(scenario: Scenario) -> Scenario:
     for text in advice_of(scenario):
         notices.warn(text)
     return scenario
-
-
-def _with_sufficient_queue(scenario: Scenario) -> Scenario:
-    """The scenario with a queue that is long enough for its delay, which may have changed since the
-    sampling was constructed.
-    """
-    sampling = scenario.sampling
-    if sampling is None or not checks.is_concrete(sampling) or sampling.queue >= sampling.needed:
-        return scenario
-    sampling = dataclasses.replace(sampling, queue=sampling.needed)
-    return dataclasses.replace(scenario, sampling=sampling)
 
 
 def _typed(x: Any, dtype) -> jax.Array:

@@ -199,10 +199,6 @@ def _other_input(s: Combination) -> Found | None:
     return Found(f"{type(law).__name__}, which commands [{given}]", words)
 
 
-def _input_without_drive(s: Combination) -> Found | None:
-    return _other_input(s) if isinstance(s.scenario.plant, plants.ElectricDrive) else None
-
-
 COMBINATION = (
     Rule("Scenario.model", _other_components, "{components}, as the plant has"),
     Rule(
@@ -255,7 +251,7 @@ COMBINATION = (
     ),
     Rule(
         "Scenario.controller",
-        _input_without_drive,
+        lambda s: _other_input(s) if isinstance(s.scenario.plant, plants.ElectricDrive) else None,
         "a law that commands the input of {kind} [{unit}]",
         "Such as controllers.WithDrive(law, drive=plant), or model=plant.",
     ),
@@ -483,7 +479,14 @@ def _initial_values(scenario: Scenario) -> InitialValues:
     upper = limit("bounds[0].upper.at(t, q_d)", positions.upper)
     for name, part in (("plant", plant), ("model", model)):
         if not part.is_robot:
-            _check_shapes_of_plant(name, part, t, start_levels(scenario)[: part.order])
+            x = start_levels(scenario)[: part.order]
+            shape = x.shape
+            words = f"{len(x)} levels of {plants.counted_components(part, shape[1])}"
+            remedy = f"The {name} has {words}."
+            _shaped(f"{name}.drift(t, x)", partial(part.drift, t, x), *shape, remedy=remedy)
+            if jnp.ndim(jax.eval_shape(part.gain, t, x)) != 2:
+                shape = (*shape, shape[1])
+            _shaped(f"{name}.gain(t, x)", partial(part.gain, t, x), *shape, remedy=remedy)
         if part.robot is not None:
             _shaped(f"{name}.mass_matrix(q)", partial(part.robot.mass_matrix, q), n, n)
             _shaped(f"{name}.coriolis(q, v, u)", partial(part.robot.coriolis, q, dq, dq), n)
@@ -499,16 +502,6 @@ def _initial_values(scenario: Scenario) -> InitialValues:
     if scenario.regions and plant.robot is not None:
         margins = regions.margins(scenario.regions, plant.robot, q)
     return InitialValues(q, dq, q_d, (lower, upper), speed_limits, margins)
-
-
-def _check_shapes_of_plant(name: str, plant: Plant, t: jax.Array, x: jax.Array) -> None:
-    """Raises ValueError where drift or gain of a plant has another shape than its state."""
-    order, n = x.shape
-    remedy = f"The {name} has {order} levels of {plants.counted_components(plant, n)}."
-    _shaped(f"{name}.drift(t, x)", partial(plant.drift, t, x), order, n, remedy=remedy)
-    diagonal = jnp.ndim(jax.eval_shape(plant.gain, t, x)) == 2
-    shape = (order, n) if diagonal else (order, n, n)
-    _shaped(f"{name}.gain(t, x)", partial(plant.gain, t, x), *shape, remedy=remedy)
 
 
 def _shaped(name: str, call: Callable[[], jax.Array], *shape: int, remedy: str = "") -> jax.Array:
@@ -709,17 +702,6 @@ def _check_gains(name: str, gains: np.ndarray, x: jax.Array, without_dq: str) ->
             raise checks.fail(f"{name}.gain(t, x)[{i}]", matrix, expected, remedy + without_dq)
 
 
-def _check_mass_matrix(name: str, matrix: np.ndarray) -> None:
-    """Raises ValueError for a mass matrix that is not finite, symmetric and positive definite."""
-    remedy = "Check the masses, lengths and inertias."
-    is_finite = np.all(np.isfinite(matrix))
-    if not is_finite or np.ptp(matrix - matrix.T) > 1e-4 * np.max(np.abs(matrix)):
-        raise checks.fail(name, matrix, "a finite symmetric matrix", remedy)
-    eigenvalues = np.linalg.eigvalsh(0.5 * (matrix + matrix.T))
-    if eigenvalues[0] <= len(matrix) * np.finfo(matrix.dtype).eps * eigenvalues[-1]:
-        raise checks.fail(name, matrix, "a positive definite matrix", remedy)
-
-
 def check_start(scenario: Scenario) -> None:
     """Raises ValueError for a start outside its bounds or too fast, or a mass matrix there that is
     not positive definite.
@@ -734,6 +716,14 @@ def check_start(scenario: Scenario) -> None:
         expected = f"speeds below {limit:g} {as_text(plants.units_of(plant)[1])}"
         raise checks.fail("initial.dq", at.dq, expected, "A run that fast counts as diverged.")
     for name, part in (("plant", plant), ("model", model)):
-        if part.robot is not None:
-            matrix = np.asarray(mass_matrix_at(part.robot, scenario.initial.q))
-            _check_mass_matrix(f"{name}.mass_matrix(initial.q)", matrix)
+        if part.robot is None:
+            continue
+        matrix = np.asarray(mass_matrix_at(part.robot, scenario.initial.q))
+        label = f"{name}.mass_matrix(initial.q)"
+        remedy = "Check the masses, lengths and inertias."
+        is_finite = np.all(np.isfinite(matrix))
+        if not is_finite or np.ptp(matrix - matrix.T) > 1e-4 * np.max(np.abs(matrix)):
+            raise checks.fail(label, matrix, "a finite symmetric matrix", remedy)
+        eigenvalues = np.linalg.eigvalsh(0.5 * (matrix + matrix.T))
+        if eigenvalues[0] <= len(matrix) * np.finfo(matrix.dtype).eps * eigenvalues[-1]:
+            raise checks.fail(label, matrix, "a positive definite matrix", remedy)

@@ -285,22 +285,20 @@ class Comparison(Result):
             f" {float(run.dt):g} s, {run.method}; worst {noun}"
         )
         notes = self.notes
-        return [
-            headline,
-            *(self._as_table(kind, rows, notes[kind]) for kind, rows in self.table.items()),
-        ]
-
-    def _as_table(self, kind: str, rows: tuple[Row, ...], notes: list[str]) -> Table:
-        """One of both tables, without the columns of constraints that the scenario lacks."""
-        shown = [
-            name not in OPTIONAL or any(math.isfinite(row._asdict()[name]) for row in rows)
-            for name in Row._fields
-        ]
-        heading, *lines = (
-            tuple(itertools.compress(line, shown))
-            for line in [headings(self.scenario), *(map(_cell, row) for row in rows)]
-        )
-        return Table(heading, lines, TITLES[kind], notes, left=(0, len(heading) - 1))
+        tables = []
+        for kind, rows in self.table.items():
+            # Without the columns of constraints that the scenario lacks.
+            shown = [
+                name not in OPTIONAL or any(math.isfinite(row._asdict()[name]) for row in rows)
+                for name in Row._fields
+            ]
+            heading, *lines = (
+                tuple(itertools.compress(line, shown))
+                for line in [headings(self.scenario), *(map(_cell, row) for row in rows)]
+            )
+            left = (0, len(heading) - 1)
+            tables.append(Table(heading, lines, TITLES[kind], notes[kind], left=left))
+        return [headline, *tables]
 
     def to_pandas(self):
         """A `pandas.DataFrame` (pandas comes with xarray), one line a law and table, columns as

@@ -159,9 +159,12 @@ class EffortSearch:
         nearest = sorted(
             self.failed_groups(), key=lambda group: min(abs(math.log(x)) for x in group[0])
         )
-        groups = [
-            f"{_range(factors)} ({_reasons(status, self.texts)})" for factors, status in nearest
-        ]
+        groups = []
+        for factors, status in nearest:
+            where = f"at {factors[0]:.4g}"
+            if len(factors) > 1:
+                where = f"{len(factors)} from {factors[0]:.4g} to {factors[-1]:.4g}"
+            groups.append(f"{where} ({_reasons(status, self.texts)})")
         words = [f"{len(self.failed)} of them fail: {_few(groups)}"]
         if self.smaller_dt is not None:
             words.append(
@@ -376,12 +379,6 @@ def _few(words: Sequence[str]) -> str:
     if len(words) > MAX_NAMED:
         text += f" and {len(words) - MAX_NAMED} more"
     return text
-
-
-def _range(factors: Sequence[float]) -> str:
-    if len(factors) == 1:
-        return f"at {factors[0]:.4g}"
-    return f"{len(factors)} from {factors[0]:.4g} to {factors[-1]:.4g}"
 
 
 def _reasons(status: Sequence[int], texts: Mapping[Status, str]) -> str:

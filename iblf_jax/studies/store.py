@@ -370,24 +370,20 @@ def open_store(
     if not any_unit:
         found += differences({"unit": store.unit}, {"unit": unit})
     if found:
-        raise StoreError(_of_another_configuration(folder, found))
+        remedy = "Go on with the same arguments, or choose another path."
+        if any(text.startswith("kernel.") for text in found):
+            remedy = (
+                "A native kernel is tied to processor and compiler: go on on a machine of the same"
+                ' kind, or choose another path, with backend="vmap" if machines of several kinds'
+                " are to share it."
+            )
+        shown = "; ".join(found[:3])
+        if len(found) > 3:
+            shown += f" (and {len(found) - 3} more)"
+        raise StoreError(f"{folder}: was made with another configuration: {shown}. {remedy}")
     if not os.access(folder, os.W_OK):
         raise _write_error(folder, PermissionError(errno.EACCES, os.strerror(errno.EACCES)))
     return store
-
-
-def _of_another_configuration(folder: Path, found: list[str]) -> str:
-    remedy = "Go on with the same arguments, or choose another path."
-    if any(text.startswith("kernel.") for text in found):
-        remedy = (
-            "A native kernel is tied to processor and compiler: go on on a machine of the same"
-            ' kind, or choose another path, with backend="vmap" if machines of several kinds are to'
-            " share it."
-        )
-    shown = "; ".join(found[:3])
-    if len(found) > 3:
-        shown += f" (and {len(found) - 3} more)"
-    return f"{folder}: was made with another configuration: {shown}. {remedy}"
 
 
 def _is_occupied(folder: Path) -> bool:

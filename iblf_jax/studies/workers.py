@@ -42,7 +42,7 @@ from iblf_jax.core.pytree import is_component_class, register_component
 from iblf_jax.engine import uses_host_compiler
 from iblf_jax.studies.blocks import BlockResults, named_arrays, run_spans_here
 from iblf_jax.studies.options import LocalExecutor
-from iblf_jax.studies.store import StoreError, load_store
+from iblf_jax.studies.store import Store, StoreError, load_store
 from iblf_jax.studies.study_setup import PreparedStudy
 
 MAX_IN_FLIGHT = 1024
@@ -210,7 +210,7 @@ def run_task(payload: bytes, first: int, last: int) -> BlockResults | None:
     return None
 
 
-def _open_shared(shared: SharedStore) -> Any:
+def _open_shared(shared: SharedStore) -> Store:
     try:
         store = load_store(shared.path)
     except StoreError as error:
@@ -256,8 +256,9 @@ def run_on_workers(
             for future in wait(waiting, return_when=FIRST_COMPLETED).done:
                 yield waiting.pop(future), future.result()
     except Exception as error:
-        if not _is_executor_error(error):
-            raise
+        is_of_executor = isinstance(error, BrokenExecutor | CancelledError)
+        if not is_of_executor and type(error).__module__.partition(".")[0] != "distributed":
+            raise  # the task failed
         raise WorkerError(
             f"A worker of the executor was lost ({type(error).__name__}: {error}). What is written"
             " in a store is valid: start the same call again, with this or another executor, to"
@@ -266,10 +267,3 @@ def run_on_workers(
     finally:
         for future in waiting:
             future.cancel()
-
-
-def _is_executor_error(error: Exception) -> bool:
-    """Whether an error reports a lost worker or executor, and not a failed task."""
-    if isinstance(error, BrokenExecutor | CancelledError):
-        return True
-    return type(error).__module__.partition(".")[0] == "distributed"

@@ -118,9 +118,17 @@ class SafetyFilter(Wrapping):
         self, t: jax.Array, q: jax.Array, dq: jax.Array, context: LawContext
     ) -> tuple[jax.Array, jax.Array]:
         """The accelerations that the conditions allow, lowest and highest, (n,) each [rad/s^2]."""
+
+        def sides(t):
+            return bounds_at(context.bounds[0], t, context.reference.position(t))
+
+        def rates(t):
+            return jax.jvp(sides, (t,), (jnp.ones_like(t),))[1]
+
+        first, second = jax.jvp(rates, (t,), (jnp.ones_like(t),))
         lowest, highest = (
             ddside + self._room(side - q, dside - dq)
-            for side, dside, ddside in _moving_bounds(t, context)
+            for side, dside, ddside in zip(sides(t), first, second, strict=True)
         )
         if self.margin is not None:
             lowest, highest = lowest + self.margin, highest - self.margin
@@ -216,20 +224,3 @@ def _nearest(conditions: list[Condition]) -> Solution:
     found = quadratic_program(jnp.eye(G.shape[1], dtype=G.dtype), G, room, soft)
     free = jnp.all(room >= 0)
     return Solution(*(jnp.where(free, 0.0, x) for x in found))
-
-
-def _moving_bounds(
-    t: jax.Array, context: LawContext
-) -> list[tuple[jax.Array, jax.Array, jax.Array]]:
-    """Lower and upper bound of q, each with its first and second rate, (n,) [rad], [rad/s],
-    [rad/s^2].
-    """
-
-    def sides(t):
-        q_d = context.reference.position(t)
-        return bounds_at(context.bounds[0], t, q_d)
-
-    def rates(t):
-        return jax.jvp(sides, (t,), (jnp.ones_like(t),))[1]
-
-    return list(zip(sides(t), *jax.jvp(rates, (t,), (jnp.ones_like(t),)), strict=True))

@@ -133,22 +133,14 @@ class ExtendedState(RobotObserver):
         l1, l2 = self._gains
         w = 0.5 * l1
         if self.bandwidth is None:
+            # Even functions of a root, real or not, by its square: cosh(root), sinh(root)/root.
             square = (w * w - l2) * period**2
-            C, S = _even_cosh(square), period * _even_sinh(square)
+            is_small = jnp.abs(square) < 1e-12
+            root = jnp.sqrt(jnp.maximum(jnp.abs(square), 1e-12))
+            cosh = jnp.where(square > 0, jnp.cosh(root), jnp.cos(root))
+            sinh = jnp.where(square > 0, jnp.sinh(root), jnp.sin(root))
+            C = jnp.where(is_small, 1.0, cosh)
+            S = period * jnp.where(is_small, 1.0, sinh / root)
         else:
             C, S = jnp.ones_like(w), period * jnp.ones_like(w)
         return w, jnp.exp(-w * period), C, S
-
-
-def _even_cosh(square: jax.Array) -> jax.Array:
-    """Cosh of a root, real or not, by its square."""
-    root = jnp.sqrt(jnp.maximum(jnp.abs(square), 1e-12))
-    cosh = jnp.where(square > 0, jnp.cosh(root), jnp.cos(root))
-    return jnp.where(jnp.abs(square) < 1e-12, 1.0, cosh)
-
-
-def _even_sinh(square: jax.Array) -> jax.Array:
-    """Sinh of a root divided by it, real or not, by its square."""
-    root = jnp.sqrt(jnp.maximum(jnp.abs(square), 1e-12))
-    sinh = jnp.where(square > 0, jnp.sinh(root), jnp.sin(root))
-    return jnp.where(jnp.abs(square) < 1e-12, 1.0, sinh / root)

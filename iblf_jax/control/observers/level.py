@@ -100,7 +100,11 @@ class LevelObserver(Observer):
         factor exp(-kappa period).
         """
         rate = self.derivative(t, x, u, model, state)
-        return state + period * _mean_decay(self.gain * period) * rate
+        # (1 - exp(-k)) / k is the mean of exp(-k s) for s from 0 to 1, 1 at k = 0.
+        k = self.gain * period
+        is_zero = k == 0.0
+        mean_decay = jnp.where(is_zero, 1.0, -jnp.expm1(-k) / jnp.where(is_zero, 1.0, k))
+        return state + period * mean_decay * rate
 
     def at_period(self, period: jax.Array) -> LevelObserver:
         """The observer with the gains (1 - exp(-kappa period)) / period, for which 1 - gain period
@@ -115,9 +119,3 @@ def check_rows(name: str, value: jax.Array, model: Plant) -> None:
         return
     expected = f"one number, or {model.order} rows, as the model has {model.order} levels"
     raise checks.fail(name, f"{len(value)} rows", expected)
-
-
-def _mean_decay(x: jax.Array) -> jax.Array:
-    """(1 - exp(-x)) / x, the mean of exp(-x s) for s from 0 to 1; 1 at x = 0."""
-    is_zero = x == 0.0
-    return jnp.where(is_zero, 1.0, -jnp.expm1(-x) / jnp.where(is_zero, 1.0, x))

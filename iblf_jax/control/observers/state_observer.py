@@ -249,7 +249,14 @@ class StateObserver(Observer):
         x_hat = state.x_hat + correction.x_hat
         d_hat = jax.tree.map(jnp.add, state.d_hat, correction.d_hat)
         flow = self._flow(model, u, d_hat)
-        return StateObserverValues(_runge_kutta(flow, t, x_hat, period), d_hat)
+        # One step of the classical Runge-Kutta method.
+        half = 0.5 * period
+        first = flow(t, x_hat)
+        second = flow(t + half, x_hat + half * first)
+        third = flow(t + half, x_hat + half * second)
+        fourth = flow(t + period, x_hat + period * third)
+        x_hat = x_hat + period / 6.0 * (first + 2.0 * second + 2.0 * third + fourth)
+        return StateObserverValues(x_hat, d_hat)
 
     def _flow(self, model: Plant, u: jax.Array, d_hat: jax.Array) -> Flow:
         """The rate of the model's state with the estimated disturbance, a function of t and x."""
@@ -345,13 +352,3 @@ def fading_memory_gains(a: jax.Array, count: int, period: jax.Array) -> list[jax
         scaled = sum(float(vector[k]) * (-a) ** j for j, vector in enumerate(coefficients))
         gains.append(scaled * math.factorial(k) / period**k)
     return gains
-
-
-def _runge_kutta(flow: Flow, t: jax.Array, x: jax.Array, period: jax.Array) -> jax.Array:
-    """The state a period later, by one step of the classical Runge-Kutta method."""
-    half = 0.5 * period
-    first = flow(t, x)
-    second = flow(t + half, x + half * first)
-    third = flow(t + half, x + half * second)
-    fourth = flow(t + period, x + period * third)
-    return x + period / 6.0 * (first + 2.0 * second + 2.0 * third + fourth)

@@ -180,21 +180,17 @@ def _gains(scenario: Scenario, given: Any) -> tuple[GainOption, ...]:
     for item, block in zip(tunables, blocks, strict=True):
         part = slice(block.start, block.start + block.size)
         least, most = _range_end(item.low, low[part]), _range_end(item.high, high[part])
-        found.append(_gain(scenario, item, least, most))
+        gain = _gain(scenario, item, least, most)
+        found.append(gain)
         if item.low is None or item.high is None:
-            _warn_of_default_range(found[-1])
+            ends = [np.array2string(x, precision=4) for x in (gain.low, gain.high)]
+            notices.warn(
+                f"gains: {gain.path}: the range {' to '.join(ends)} has a default end, from a"
+                " linear analysis near the reference that changes one gain at a time. The loop may"
+                " be unstable within it, elsewhere or with other gains. Give limits that you have"
+                f' simulated: ij.tunable("{gain.path}", low, high).'
+            )
     return tuple(found)
-
-
-def _warn_of_default_range(gain: GainOption) -> None:
-    """Warns that a range in which an operator may change a gain was not simulated."""
-    low, high = (np.array2string(x, precision=4) for x in (gain.low, gain.high))
-    notices.warn(
-        f"gains: {gain.path}: the range {low} to {high} has a default end, from a linear analysis"
-        " near the reference that changes one gain at a time. The loop may be unstable within it,"
-        " elsewhere or with other gains. Give limits that you have simulated:"
-        f' ij.tunable("{gain.path}", low, high).'
-    )
 
 
 def _range_end(given: ArrayLike | None, numbers: np.ndarray) -> np.ndarray:

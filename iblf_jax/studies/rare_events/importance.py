@@ -179,13 +179,8 @@ def tail_shape(weights: np.ndarray) -> float:
     excess = ordered[-count:] - ordered[-count - 1]
     if not np.any(excess > 0):
         return -np.inf
-    return _pareto_shape(excess[excess > 0])
-
-
-def _pareto_shape(x: np.ndarray) -> float:
-    """The shape of a generalised Pareto distribution by the estimator of Zhang and Stephens, from
-    its ordered sample.
-    """
+    # The estimator of Zhang and Stephens, from the ordered sample.
+    x = excess[excess > 0]
     n = len(x)
     grid = 30 + int(np.sqrt(n))
     quartile = x[int(0.25 * n + 0.5) - 1] if n > 2 else x[0]

@@ -58,50 +58,37 @@ def fit_modes(part: Any) -> int:
         it.
     """
     owner = type(part).__name__
-    _check_inner(owner, part.plant)
-    parameters = _as_parameters(owner, part.plant, part.parameters)
-    object.__setattr__(part, "parameters", parameters)
-    return len(parameters[0].values)
-
-
-def _check_inner(owner: str, plant: Any) -> None:
-    """Raises ValueError for something that is neither a robot nor a plant."""
-    name = f"{owner}.plant"
-    if is_chain(plant):
-        checks.conforms(name, plant, Plant, "iblf_jax.plants has them.")
-        return
-    checks.conforms(name, plant, Robot, "iblf_jax.robots has them.")
-
-
-def _as_parameters(owner: str, plant: Any, parameters: Any) -> tuple[ModeValues, ...]:
-    """The parameters of a plant with modes as a tuple; ValueError for parameters that do not fit
-    the plant.
-    """
-    name = f"{owner}.parameters"
+    if is_chain(part.plant):
+        checks.conforms(f"{owner}.plant", part.plant, Plant, "iblf_jax.plants has them.")
+    else:
+        checks.conforms(f"{owner}.plant", part.plant, Robot, "iblf_jax.robots has them.")
+    name, parameters = f"{owner}.parameters", part.parameters
     if isinstance(parameters, dict):
         parameters = [ModeValues(path, values) for path, values in parameters.items()]
     is_tuple = isinstance(parameters, tuple | list) and len(parameters) > 0
-    if not is_tuple or not all(isinstance(part, ModeValues) for part in parameters):
+    if not is_tuple or not all(isinstance(one, ModeValues) for one in parameters):
         expected = 'path -> one value a mode, such as {"mass[1]": (0.85, 1.5)}'
         raise checks.fail(name, parameters, expected)
-    for part in parameters:
+    for one in parameters:
         try:
-            old = resolve(plant, part.path)[1]
+            old = resolve(part.plant, one.path)[1]
         except LookupError:
-            expected = f"the path of a parameter of {type(plant).__name__}, such as mass[1]"
-            raise checks.fail(name, part.path, expected) from None
-        shape = jnp.shape(part.values)
+            expected = f"the path of a parameter of {type(part.plant).__name__}, such as mass[1]"
+            raise checks.fail(name, one.path, expected) from None
+        shape = jnp.shape(one.values)
         if not shape or shape[1:] not in ((), jnp.shape(old)):
             expected = f"one value of shape {jnp.shape(old)} for each mode"
             got = f"shape {shape}"
-            raise checks.fail(f"{name}[{part.path!r}]", got, expected)
-        for value in part.values:
-            changed(plant, part.path, value)  # Raises for a value that the parameter may not have.
-    counts = {len(part.values) for part in parameters}
+            raise checks.fail(f"{name}[{one.path!r}]", got, expected)
+        for value in one.values:
+            # Raises for a value that the parameter may not have.
+            changed(part.plant, one.path, value)
+    counts = {len(one.values) for one in parameters}
     if len(counts) > 1:
         expected = "the same number of modes for every parameter"
         raise checks.fail(name, f"{sorted(counts)} values", expected)
-    return tuple(parameters)
+    object.__setattr__(part, "parameters", tuple(parameters))
+    return counts.pop()
 
 
 def changed(plant: P, path: str, value: jax.Array) -> P:

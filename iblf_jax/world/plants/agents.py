@@ -81,8 +81,17 @@ class Agents(Plant):
         """
         if not isinstance(self.agents, tuple | list) or not self.agents:
             raise checks.fail("Agents.agents", self.agents, "a tuple of plants or robots")
-        agents = tuple(_as_agent(i, part) for i, part in enumerate(self.agents))
-        object.__setattr__(self, "agents", agents)
+        agents: list[Any] = list(self.agents)
+        for i, part in enumerate(agents):
+            name = f"Agents.agents[{i}]"
+            if is_chain(part):
+                checks.conforms(name, part, Plant, "iblf_jax.plants has them.")
+                continue
+            try:
+                agents[i] = Rigid(part)
+            except ValueError as error:
+                raise checks.fail(name, part, "a plant or a robot") from error
+        object.__setattr__(self, "agents", tuple(agents))
         count = len(agents)
         adjacency = _weights("Agents.adjacency", self.adjacency, (count, count))
         leader = _weights("Agents.leader", self.leader, (count,))
@@ -176,7 +185,14 @@ class Agents(Plant):
     @property
     def units(self) -> tuple[Units, ...]:
         """The units of the levels and of the input."""
-        return tuple(map(_joined_units, zip(*map(_units_by_component, self.agents), strict=True)))
+        found: list[Units] = []
+        for of_level in zip(*map(units_of, self.agents), strict=True):
+            of_components: list[str] = []
+            for agent, unit in zip(self.agents, of_level, strict=True):
+                of_components += [unit] * agent.n if isinstance(unit, str) else unit
+            is_same = len(set(of_components)) == 1
+            found.append(of_components[0] if is_same else tuple(of_components))
+        return tuple(found)
 
     @property
     def level_names(self) -> tuple[str, ...]:
@@ -443,17 +459,6 @@ class NeighbourModel(Plant):
 # --- checks ---------------------------------------------------------------------------------------
 
 
-def _as_agent(i: int, part: Any) -> Any:
-    """A plant, or a robot as a `Rigid`; ValueError for something else."""
-    if is_chain(part):
-        checks.conforms(f"Agents.agents[{i}]", part, Plant, "iblf_jax.plants has them.")
-        return part
-    try:
-        return Rigid(part)
-    except ValueError as error:
-        raise checks.fail(f"Agents.agents[{i}]", part, "a plant or a robot") from error
-
-
 def _weights(name: str, value: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
     """The weights of a graph as an array; ValueError for others than finite numbers >= 0."""
     expected = f"finite numbers >= 0, shape {shape}, one for each of {shape[0]} agents"
@@ -489,19 +494,3 @@ def _joined(parts: list[jax.Array | None], axis: int) -> jax.Array | None:
     if len(known) < len(parts):
         return None
     return jnp.concatenate(known, axis=axis)
-
-
-def _units_by_component(agent: Plant) -> list[tuple[str, ...]]:
-    """The units of each component of the levels and of the input."""
-    found = []
-    for unit in units_of(agent):
-        found.append((unit,) * agent.n if isinstance(unit, str) else tuple(unit))
-    return found
-
-
-def _joined_units(parts: tuple[tuple[str, ...], ...]) -> Units:
-    """The units of a level of the stack: one text where all components have the same."""
-    joined_parts = tuple(unit for part in parts for unit in part)
-    if len(set(joined_parts)) == 1:
-        return joined_parts[0]
-    return joined_parts

@@ -183,7 +183,16 @@ def checked(root: ET.Element, folder: Path) -> Mjcf:
     for compiler in root.findall("compiler"):
         meshes = compiler.get("meshdir", compiler.get("assetdir", meshes))
         bare = compiler.get("strippath", str(bare).lower()) == "true"
-    return Mjcf(ET.tostring(copy, encoding="unicode"), _tendons(root), folder / meshes, bare)
+    # The joints and sites that each constraint on tendons ties together.
+    defined = {tendon.get("name"): tendon for tendon in root.findall("tendon/*")}
+    ties: Tendons = {}
+    for element in root.findall("equality/tendon"):
+        joints, sites = ties[label(element)] = (set(), set())
+        for which in ("tendon1", "tendon2"):
+            tendon = defined.get(element.get(which), ET.Element("tendon"))
+            joints |= {x.get("joint", "") for x in tendon.findall("joint")}
+            sites |= {x.get("site", "") for x in tendon.findall("site")}
+    return Mjcf(ET.tostring(copy, encoding="unicode"), ties, folder / meshes, bare)
 
 
 def _copy(source: ET.Element, target: ET.Element, section: str) -> None:
@@ -207,19 +216,6 @@ def _copy(source: ET.Element, target: ET.Element, section: str) -> None:
             longest = MAX_BYTES if name in LONG_ATTRIBUTES.split() else MAX_NUMBERS
             floats(f"{label(element)}: {name}", text, count, most=most, longest=longest)
         _copy(element, ET.SubElement(target, tag, attributes), section or tag)
-
-
-def _tendons(root: ET.Element) -> Tendons:
-    """The constraints on tendons, and the joints and sites that each ties together."""
-    defined = {tendon.get("name"): tendon for tendon in root.findall("tendon/*")}
-    ties: Tendons = {}
-    for element in root.findall("equality/tendon"):
-        joints, sites = ties[label(element)] = (set(), set())
-        for which in ("tendon1", "tendon2"):
-            tendon = defined.get(element.get(which), ET.Element("tendon"))
-            joints |= {x.get("joint", "") for x in tendon.findall("joint")}
-            sites |= {x.get("site", "") for x in tendon.findall("site")}
-    return ties
 
 
 def _explicit(body: mujoco.MjsBody, where: str, balanced: bool) -> Weight | None:
