@@ -35,6 +35,7 @@ from iblf_jax.simulation.closed_loop import (
     sample_at,
 )
 from iblf_jax.simulation.discontinuities import JUMP_SEPARATION
+from iblf_jax.simulation.levels import disturbance_torque
 from iblf_jax.simulation.metrics import Fold, as_folds, metric_units
 from iblf_jax.simulation.noise import has_noise, noise_key
 from iblf_jax.simulation.results import Metrics, Rollout
@@ -43,7 +44,6 @@ from iblf_jax.simulation.scenario import Scenario, canonical, check_step
 from iblf_jax.simulation.signals import FIELDS
 from iblf_jax.world import plants
 from iblf_jax.world.disturbances import Nothing
-from iblf_jax.world.robots import at_time
 
 if TYPE_CHECKING:
     import mujoco
@@ -241,9 +241,7 @@ def _law(scenario: Scenario, t, state: LoopState, index, noise) -> LoopState:
 def _delivered(scenario: Scenario, t, q, dq, command, state):
     """The actuator's output, and its torque plus that of the disturbance."""
     delivered = scenario.actuator.at(t).deliver(command, dq, state)
-    return delivered, delivered.tau + scenario.disturbance.torque(
-        t, q, dq, at_time(scenario.plant, t), scenario.model
-    )
+    return delivered, delivered.tau + disturbance_torque(scenario, t, q, dq)
 
 
 class _Run:
