@@ -22,6 +22,7 @@ from iblf_jax.control.actuators import Ideal
 from iblf_jax.control.actuators.delay import WHOLE_TOLERANCE
 from iblf_jax.core import checks, notices
 from iblf_jax.core.attributes import attributes
+from iblf_jax.core.first_use import ModuleOnFirstUse
 from iblf_jax.core.progress import announced
 from iblf_jax.core.status import Status
 from iblf_jax.deployment.mujoco_plant import INTEGRATORS, MujocoPlant, Stages
@@ -47,6 +48,8 @@ from iblf_jax.world.disturbances import Nothing
 
 if TYPE_CHECKING:
     import mujoco
+else:
+    mujoco = ModuleOnFirstUse("mujoco")
 
 
 @notices.each_warning_once
