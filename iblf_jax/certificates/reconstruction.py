@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from iblf_jax.certificates.terms import terms_and_sample
 from iblf_jax.core import checks
@@ -41,18 +42,27 @@ if TYPE_CHECKING:
 BLOCK_STEPS = 1024
 """Steps in a block: memory does not grow with the length of a run, and one program serves every
 length."""
-POSITIONS, SPEEDS = ("q", "q_d", "lower", "upper"), ("dq", "alpha")
-TORQUES = ("tau", "disturbance", "disturbance_estimate")
 STATES = {
     "q": "position",
     "dq": "speed",
-    "controller_state": "torque",
-    "observer_state": "torque",
-    "x[2:]": "speed",
+    "controller_state": "memory",
+    "observer_state": "memory",
+    "x[2:]": "level",
 }
-"""Part of a state -> kind of its tolerance."""
-OWN_UNITS = ("controller_state", "observer_state", "x[2:]")
-"""Parts with units of their own, hence with their own scale if it is larger."""
+SIGNALS = {
+    "q_d": "position",
+    "lower": "position",
+    "upper": "position",
+    "alpha": "speed",
+    "tau": "torque",
+    "disturbance": "torque",
+    "disturbance_estimate": "torque",
+    "e": "level",
+    "level_lower": "level",
+    "level_upper": "level",
+}
+"""Part of a state or signal -> kind of its tolerance.  A level above the second and each array of a
+memory have units of their own, hence their own scale if it is larger."""
 
 
 T = TypeVar("T")
@@ -315,23 +325,34 @@ def _defect(energy: jax.Array) -> np.ndarray:
 # --- comparison with what the run recorded -------------------------------------------------------
 
 
-def tolerances(run: Rollout) -> dict[str, float]:
-    """Admissible differences between recorded and reconstructed signals, by kind [rad, rad/s,
-    N m].
+def tolerances(run: Rollout) -> dict[str, Any]:
+    """Admissible differences between recorded and reconstructed signals, by kind: of positions,
+    speeds and torques, () [rad, rad/s, N m], and of each level, (r, 1).
     """
-
-    def largest(names):
-        recorded = attributes(run, names).values()
-        return max(float(np.max(np.abs(values), initial=0.0)) for values in recorded)
-
     relative = np.sqrt(np.finfo(run.q.dtype).eps)
-    position, torque = largest(POSITIONS), largest(TORQUES)
+
+    def of_kind(kind: str, *states: str) -> float:
+        names = (*states, *(name for name, own in SIGNALS.items() if own == kind))
+        return max(relative * _largest(values) for values in attributes(run, names).values())
+
+    position = of_kind("position", "q")
     # The speeds of a loop at rest are rounding errors, so positions set their scale, too.
+    speed = max(of_kind("speed", "dq"), position)
+    level = np.array([position, *[speed] * (run.x.shape[1] - 1)])
+    for values in (run.x, run.e, run.level_lower, run.level_upper):
+        for i in range(2, values.shape[1]):
+            level[i] = max(level[i], relative * _largest(values[:, i]))
     return {
-        "position": relative * position,
-        "speed": relative * max(largest(SPEEDS), position),
-        "torque": relative * torque,
+        "position": position,
+        "speed": speed,
+        "torque": of_kind("torque"),
+        "level": level[:, None],
     }
+
+
+def _largest(values: ArrayLike) -> float:
+    """The largest finite size of some numbers; 0 without one."""
+    return float(np.max(np.abs(values), where=np.isfinite(values), initial=0.0))
 
 
 def _parts_of_state(state: LoopState) -> dict[str, Any]:
@@ -354,23 +375,26 @@ def _check_arrival(
     for label, kind in STATES.items():
         leaves = (jax.tree.leaves(expected[label]), jax.tree.leaves(reached[label]))
         for kept, made in zip(*leaves, strict=True):
-            tolerance = sizes[kind]
-            if label in OWN_UNITS:
-                own = np.max(np.abs(kept), initial=0.0)
-                tolerance = max(tolerance, np.sqrt(np.finfo(kept.dtype).eps) * own)
+            if kind == "memory":
+                own = np.sqrt(np.finfo(kept.dtype).eps) * np.max(np.abs(kept), initial=0.0)
+                tolerance = max(sizes["torque"], own)
+            elif kind == "level":
+                tolerance = sizes[kind][2:]
+            else:
+                tolerance = sizes[kind]
             _compare(run, label, kept, made, rows, tolerance)
 
 
-def _check_signals(run: Rollout, steps: Steps, rows: np.ndarray, sizes: dict[str, float]) -> None:
+def _check_signals(run: Rollout, steps: Steps, rows: np.ndarray, sizes: dict[str, Any]) -> None:
     """Raises ValueError if the signals of the scenario at recorded states are not those that the
     run recorded.
     """
-    for names, kind in ((POSITIONS, "position"), (SPEEDS, "speed"), (TORQUES, "torque")):
-        reconstructed = attributes(steps.sample, names)
-        for name, recorded in attributes(run, names).items():
-            _compare(
-                run, name, recorded[rows], reconstructed[name][steps.recorded], rows, sizes[kind]
-            )
+    reconstructed = attributes(steps.sample, SIGNALS)
+    for name, recorded in attributes(run, SIGNALS).items():
+        tolerance = sizes[SIGNALS[name]]
+        if SIGNALS[name] == "level":
+            tolerance = tolerance[: recorded.shape[1]]
+        _compare(run, name, recorded[rows], reconstructed[name][steps.recorded], rows, tolerance)
 
 
 def _compare(
@@ -379,12 +403,12 @@ def _compare(
     recorded: np.ndarray,
     reconstructed: np.ndarray,
     rows: np.ndarray,
-    tolerance: float,
+    tolerance: float | np.ndarray,
 ) -> None:
     """Raises ValueError if a reconstructed signal differs from the recorded one."""
-    far = np.any(
-        ~(np.abs(reconstructed - recorded) <= tolerance), axis=tuple(range(1, np.ndim(recorded)))
-    )
+    # Levels without bounds have infinite ones.
+    close = np.isclose(reconstructed, recorded, rtol=0.0, atol=tolerance, equal_nan=True)
+    far = ~np.all(close, axis=tuple(range(1, np.ndim(recorded))))
     if not far.any():
         return
     k = int(np.argmax(far))

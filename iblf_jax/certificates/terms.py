@@ -45,6 +45,7 @@ from iblf_jax.control.controllers._base import law_of_x, layers_with_states, pos
 from iblf_jax.core.linalg import matvec, solve_spd
 from iblf_jax.core.pytree import layers, unwrapped
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, plant_input, rate
+from iblf_jax.simulation.levels import disturbance_torque
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import Sample, margin_of
 from iblf_jax.world import plants
@@ -274,7 +275,7 @@ def _signals(scenario: Scenario, t: jax.Array, state: LoopState) -> tuple[dict[s
     external = jnp.zeros_like(state.q)
     robot = scenario.loop.plant.at(t).robot
     if robot is not None:
-        external = scenario.disturbance.torque(t, state.q, state.dq, robot, scenario.model)
+        external = disturbance_torque(scenario, t, state.q, state.dq)
         external += friction_torque(robot, state.dq)
     signals = {
         "V": sample.V,

@@ -1,5 +1,5 @@
-"""Names of a package that Python imports when they are first used, so that importing the package
-stays quick.
+"""Modules, and names of a package, that Python imports when they are first used, so that importing
+the package stays quick.
 """
 
 from __future__ import annotations
@@ -10,6 +10,21 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from iblf_jax.core.former_names import no_attribute
+
+
+class ModuleOnFirstUse:
+    """A module that Python imports when one of its names is read, for annotations that
+    `typing.get_type_hints` evaluates.
+
+    Args:
+      name: of the module.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(importlib.import_module(self._name), name)
 
 
 def on_first_use(

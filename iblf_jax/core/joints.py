@@ -21,11 +21,11 @@ import numpy as np
 
 from iblf_jax.core import checks
 
-Selection: TypeAlias = "tuple[int | str, ...] | None"
+Selection: TypeAlias = tuple[int | str, ...] | None
 """Indices, names, slices as text, or truth values; None for all joints."""
 
 Joints: TypeAlias = (
-    "int | str | slice | Sequence[int | str | slice | bool] | jax.Array | np.ndarray | None"
+    int | str | slice | Sequence[int | str | slice | bool] | jax.Array | np.ndarray | None
 )
 """What users give for `joints=`."""
 

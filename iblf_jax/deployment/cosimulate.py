@@ -22,6 +22,7 @@ from iblf_jax.control.actuators import Ideal
 from iblf_jax.control.actuators.delay import WHOLE_TOLERANCE
 from iblf_jax.core import checks, notices
 from iblf_jax.core.attributes import attributes
+from iblf_jax.core.first_use import ModuleOnFirstUse
 from iblf_jax.core.progress import announced
 from iblf_jax.core.status import Status
 from iblf_jax.deployment.mujoco_plant import INTEGRATORS, MujocoPlant, Stages
@@ -35,6 +36,7 @@ from iblf_jax.simulation.closed_loop import (
     sample_at,
 )
 from iblf_jax.simulation.discontinuities import JUMP_SEPARATION
+from iblf_jax.simulation.levels import disturbance_torque
 from iblf_jax.simulation.metrics import Fold, as_folds, metric_units
 from iblf_jax.simulation.noise import has_noise, noise_key
 from iblf_jax.simulation.results import Metrics, Rollout
@@ -43,10 +45,11 @@ from iblf_jax.simulation.scenario import Scenario, canonical, check_step
 from iblf_jax.simulation.signals import FIELDS
 from iblf_jax.world import plants
 from iblf_jax.world.disturbances import Nothing
-from iblf_jax.world.robots import at_time
 
 if TYPE_CHECKING:
     import mujoco
+else:
+    mujoco = ModuleOnFirstUse("mujoco")
 
 
 @notices.each_warning_once
@@ -241,9 +244,7 @@ def _law(scenario: Scenario, t, state: LoopState, index, noise) -> LoopState:
 def _delivered(scenario: Scenario, t, q, dq, command, state):
     """The actuator's output, and its torque plus that of the disturbance."""
     delivered = scenario.actuator.at(t).deliver(command, dq, state)
-    return delivered, delivered.tau + scenario.disturbance.torque(
-        t, q, dq, at_time(scenario.plant, t), scenario.model
-    )
+    return delivered, delivered.tau + disturbance_torque(scenario, t, q, dq)
 
 
 class _Run:

@@ -14,6 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from iblf_jax.core import checks
+from iblf_jax.core.first_use import ModuleOnFirstUse
 from iblf_jax.core.status import FAILED, VIOLATED
 from iblf_jax.plotting import _style
 from iblf_jax.plotting._curves import escaped
@@ -22,6 +23,8 @@ from iblf_jax.studies.statistics import SMALLER_IS_WORSE
 
 if TYPE_CHECKING:
     import xarray
+else:
+    xarray = ModuleOnFirstUse("xarray")
 
 SHARES = {
     "failed": (int(FAILED), "share of failed runs [1]"),
@@ -42,8 +45,6 @@ def summary(data: xarray.Dataset, metric: str) -> tuple[xarray.DataArray, str]:
     Raises:
       ValueError: not the Dataset of a sweep, or an unknown metric.
     """
-    import xarray
-
     if not isinstance(data, xarray.Dataset) or "config" not in data.attrs:
         remedy = "ij.sweep and ij.load_sweep return one."
         raise checks.fail("data", type(data).__name__, "the Dataset of a sweep", remedy)

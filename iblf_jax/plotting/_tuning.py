@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from iblf_jax.core import checks
+from iblf_jax.core.first_use import ModuleOnFirstUse
 from iblf_jax.plotting import _scales, _style
 from iblf_jax.plotting._curves import ROUNDING, Curve, check_class, curves_of, escaped, peak_of
 from iblf_jax.plotting._panels import (
@@ -26,7 +27,9 @@ from iblf_jax.plotting._panels import (
 from iblf_jax.studies.summaries import LEVELS, initial_margins
 
 if TYPE_CHECKING:
-    from iblf_jax.tuning import ParetoFront, TuneResult
+    from iblf_jax import tuning as results
+else:
+    results = ModuleOnFirstUse("iblf_jax.tuning")
 
 MAX_NAMED = 28
 """Largest number of gains in the legend."""
@@ -34,7 +37,7 @@ MAX_NAMED = 28
 
 @_style.styled()
 def tuning(
-    result: TuneResult, *, landscape: tuple[str, str] | None = None, points: int = 13
+    result: results.TuneResult, *, landscape: tuple[str, str] | None = None, points: int = 13
 ) -> Figure:
     """The overview of a tuning: objective, margin and gains over the steps, the loss near the
     optimum, torques and positions before and after.
@@ -138,7 +141,7 @@ def _torque(axes: Axes, curves: list[Curve], window: Window) -> None:
     _style.time_axis(axes, window)
 
 
-def _accepted(result: TuneResult) -> np.ndarray:
+def _accepted(result: results.TuneResult) -> np.ndarray:
     """The steps of the best start at which its loss fell below all previous values."""
     loss = np.where(result.history["valid"], result.history["loss"], np.inf)[:, result.best_start]
     before = np.minimum.accumulate(np.concatenate([[np.inf], loss[:-1]]))
@@ -148,7 +151,7 @@ def _accepted(result: TuneResult) -> np.ndarray:
     return found
 
 
-def _progress(axes: Axes, result: TuneResult) -> None:
+def _progress(axes: Axes, result: results.TuneResult) -> None:
     history = result.history
     trials = np.where(history["valid"], history["objective"], np.nan)
     steps = np.arange(1, len(trials) + 1)
@@ -160,7 +163,7 @@ def _progress(axes: Axes, result: TuneResult) -> None:
     axes.set_ylabel("objective")
 
 
-def _margin(axes: Axes, result: TuneResult) -> None:
+def _margin(axes: Axes, result: results.TuneResult) -> None:
     margin = result.history["margin"][:, result.best_start]
     axes.plot(np.arange(1, len(margin) + 1), margin, marker=".", markersize=3, **_style.series(2))
     axes.axhline(0.0, color=_style.failure(), linewidth=0.8)
@@ -174,7 +177,7 @@ def _margin(axes: Axes, result: TuneResult) -> None:
         axes.set_title("that of the start (t = 0) at every step")
 
 
-def _gains(axes: Axes, result: TuneResult) -> None:
+def _gains(axes: Axes, result: results.TuneResult) -> None:
     steps = _accepted(result)
     x = result.history["x"][steps, result.best_start]
     ends = result.at_limits
@@ -208,7 +211,7 @@ def _draw_contours(
         axes.contourf(x, y, finite.T, levels=levels, cmap=cmap, extend="max")
 
 
-def _landscape(axes: Axes, result: TuneResult, names: tuple[str, str], points: int) -> None:
+def _landscape(axes: Axes, result: results.TuneResult, names: tuple[str, str], points: int) -> None:
     a, b, loss = result.landscape(*names, points=points)
     _draw_contours(axes, a, b, loss, 0.8, 12)
     pair = [result.names.index(name) for name in names]
@@ -226,7 +229,7 @@ def _landscape(axes: Axes, result: TuneResult, names: tuple[str, str], points: i
 
 @_style.styled()
 def paths(
-    result: TuneResult,
+    result: results.TuneResult,
     others: Mapping[str, Any] | None = None,
     *,
     gains: tuple[str, str] | None = None,
@@ -286,9 +289,7 @@ def paths(
 
 def _check_tuned(result: object) -> None:
     """Raises ValueError for something that is no result of `tune`."""
-    from iblf_jax.tuning import TuneResult  # a result exists only where its package is loaded
-
-    check_class("result", result, TuneResult, "ij.tune returns one.")
+    check_class("result", result, results.TuneResult, "ij.tune returns one.")
 
 
 def _axis(x: np.ndarray, points: int, *, logarithmic: bool) -> np.ndarray:
@@ -316,7 +317,7 @@ def _draw_iterates(axes: Axes, iterates: Mapping[str, np.ndarray], tuned: np.nda
 
 
 @_style.styled()
-def pareto(front: ParetoFront) -> Figure:
+def pareto(front: results.ParetoFront) -> Figure:
     """A front of two objectives, with all trials.
 
     Args:
@@ -327,9 +328,7 @@ def pareto(front: ParetoFront) -> Figure:
 
     Source: design of this package.
     """
-    from iblf_jax.tuning import ParetoFront  # a result exists only where its package is loaded
-
-    check_class("front", front, ParetoFront, "ij.pareto returns one.")
+    check_class("front", front, results.ParetoFront, "ij.pareto returns one.")
     figure = _style.new_figure(0.7 * _style.WIDTH, 3.6)
     axes = figure.subplots()
     dots: dict[str, Any] = {"linestyle": "none", "marker": ".", "markersize": 3}

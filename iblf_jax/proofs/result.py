@@ -15,6 +15,7 @@ import numpy as np
 
 from iblf_jax.control.controllers._base import position_barrier
 from iblf_jax.core import checks, tables
+from iblf_jax.core.first_use import ModuleOnFirstUse
 from iblf_jax.core.presentation import Content, Result, present
 from iblf_jax.core.pytree import astype
 from iblf_jax.engine.simulate import simulate
@@ -26,7 +27,8 @@ from iblf_jax.world import plants
 
 if TYPE_CHECKING:
     import xarray
-    from matplotlib.figure import Figure
+else:
+    xarray = ModuleOnFirstUse("xarray")
 
 INSTANTS = 512
 """Times of a guaranteed tube."""
@@ -242,7 +244,7 @@ class Proof(Result):
                 for point in points
             ]
 
-    def plot(self, **options: Any) -> Figure:
+    def plot(self, **options: Any) -> Any:
         """The tube over the reference with the bounds; see `plotting.guaranteed_tube`."""
         return present("proof figure", self, **options)
 

@@ -52,7 +52,7 @@ from iblf_jax.core.units import POSITION
 from iblf_jax.simulation.closed_loop import LoopState, perturbed_state
 from iblf_jax.simulation.discontinuities import has_jump
 from iblf_jax.simulation.integrators import Tableau, tableau
-from iblf_jax.simulation.levels import disturbed_parts
+from iblf_jax.simulation.levels import disturbance_torque
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.stability import SLOWEST_RATE
 from iblf_jax.world.bounds import Tube
@@ -463,7 +463,7 @@ def _disturbance_error(
     def torque(t: jax.Array, q: jax.Array, dq: jax.Array) -> jax.Array:
         if scenario.loop.plant.robot is None:
             return jnp.zeros_like(q)
-        return scenario.disturbance.torque(t, q, dq, *disturbed_parts(scenario, t))
+        return disturbance_torque(scenario, t, q, dq)
 
     stages = len(table.c)
     own = np.asarray(table.b, times.dtype)[:, None]

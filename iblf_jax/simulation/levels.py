@@ -7,7 +7,7 @@ plant of order 2 of a robot, and parts of x of those that users wrote for q and 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -156,10 +156,10 @@ def estimated_levels(
 
 def motion(scenario: Scenario, t: jax.Array, x: jax.Array, u: jax.Array) -> jax.Array:
     """The rate x' of the plant's state under the input u, (r, n)."""
-    given, disturbance = scenario.plant.at(t), scenario.disturbance
+    given = scenario.plant.at(t)
     plant = plants.as_plant(given)
     q, dq = x[0], x[1]
-    external = disturbance.torque(t, q, dq, *disturbed_parts(scenario, t))
+    external = disturbance_torque(scenario, t, q, dq)
     if plant.robot is None:
         friction = plant.friction_torque(x)
         torque: jax.Array | float = 0.0 if friction is None else friction
@@ -167,17 +167,16 @@ def motion(scenario: Scenario, t: jax.Array, x: jax.Array, u: jax.Array) -> jax.
     else:
         torque = external + friction_torque(plant.robot, dq)
     rate = plants.flow(plant, t, x, u, torque)
-    added = disturbance.rates(t, x, given, scenario.model)
+    added = scenario.disturbance.rates(t, x, given, scenario.model)
     return rate if added is None else rate + added
 
 
-def disturbed_parts(scenario: Scenario, t: jax.Array) -> tuple[Any, Any]:
-    """Plant and model as the torque of a disturbance receives them: a robot as it is, another plant
-    as the robot inside it, or as it is if it contains none.
+def disturbance_torque(scenario: Scenario, t: jax.Array, q: jax.Array, dq: jax.Array) -> jax.Array:
+    """The torque of the disturbance, (n,).  It receives plant and model as
+    `plants.robot_or_plant`.
     """
-    given, known = scenario.plant.at(t), scenario.model
-    plant, model = plants.robot_of(given), plants.robot_of(known)
-    return given if plant is None else plant, known if model is None else model
+    plant, model = map(plants.robot_or_plant, (scenario.plant.at(t), scenario.model))
+    return scenario.disturbance.torque(t, q, dq, plant, model)
 
 
 def acceleration(
@@ -185,8 +184,7 @@ def acceleration(
 ) -> jax.Array:
     """Acceleration of a robot under the torque `tau`, (n,) [rad/s^2]."""
     plant = at_time(scenario.plant, t)
-    external = scenario.disturbance.torque(t, q, dq, plant, scenario.model)
-    applied = tau + external + friction_torque(plant, dq)
+    applied = tau + disturbance_torque(scenario, t, q, dq) + friction_torque(plant, dq)
     return forward_dynamics(plant, q, dq, applied)
 
 
@@ -197,6 +195,5 @@ def torque_needed(
     `acceleration`.
     """
     plant = at_time(scenario.plant, t)
-    external = scenario.disturbance.torque(t, q, dq, plant, scenario.model)
-    passive = external + friction_torque(plant, dq)
+    passive = disturbance_torque(scenario, t, q, dq) + friction_torque(plant, dq)
     return inverse_dynamics(plant, q, dq, dq, ddq) - passive

@@ -31,7 +31,7 @@ from iblf_jax.core.modules import NUMBERS
 from iblf_jax.core.pytree import field_values, layers, unwrapped
 from iblf_jax.core.units import as_text
 from iblf_jax.simulation.initial import Initial
-from iblf_jax.simulation.levels import disturbed_parts, has_speed_limits, start_levels
+from iblf_jax.simulation.levels import disturbance_torque, has_speed_limits, start_levels
 from iblf_jax.simulation.sampling import Sampling
 from iblf_jax.world import plants, process_noise, regions
 from iblf_jax.world.bounds import Bounds, Funnel, Side, bounds_at, speed_limits_at
@@ -491,7 +491,7 @@ def _initial_values(scenario: Scenario) -> InitialValues:
             _shaped(f"{name}.mass_matrix(q)", partial(part.robot.mass_matrix, q), n, n)
             _shaped(f"{name}.coriolis(q, v, u)", partial(part.robot.coriolis, q, dq, dq), n)
             _shaped(f"{name}.gravity(q)", partial(part.robot.gravity, q), n)
-    torque = partial(scenario.disturbance.torque, t, q, dq, *disturbed_parts(scenario, t))
+    torque = partial(disturbance_torque, scenario, t, q, dq)
     _shaped("disturbance.torque(t, q, dq, plant, model)", torque, n)
     speed_limits = None
     if velocities is not None and has_speed_limits(scenario):

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from iblf_jax.core import checks, notices, tables
+from iblf_jax.core.first_use import ModuleOnFirstUse
 from iblf_jax.core.presentation import Content, Result
 from iblf_jax.core.progress import announced, bar
 from iblf_jax.core.pytree import field_values
@@ -41,6 +42,8 @@ from iblf_jax.studies.study_setup import PreparedStudy, prepare
 
 if TYPE_CHECKING:
     import xarray
+else:
+    xarray = ModuleOnFirstUse("xarray")
 
 
 TAILS = (0.025, 0.975)
@@ -70,8 +73,6 @@ class Sensitivity(Result):
 
     def to_xarray(self) -> xarray.Dataset:
         """The indices along the dimension `parameter`."""
-        import xarray
-
         names = {"first_order": "S", "total_order": "ST"}
         values = field_values(self)
         variables: dict[str, Any] = {

@@ -22,6 +22,7 @@ import jax
 import numpy as np
 
 from iblf_jax.core import checks, notices
+from iblf_jax.core.first_use import ModuleOnFirstUse
 from iblf_jax.core.presentation import Content, Result, present
 from iblf_jax.core.progress import announced
 from iblf_jax.core.status import FAILED, Status, describe, has_flag
@@ -46,6 +47,8 @@ from iblf_jax.world.regions import in_words
 
 if TYPE_CHECKING:
     import xarray
+else:
+    xarray = ModuleOnFirstUse("xarray")
 
 VIOLATED = CONSTRAINT_VIOLATED | Status.NOT_FINITE
 """The flags that `violation_probability` counts: a bound or region was violated, or the run

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from iblf_jax.core import checks, notices
+from iblf_jax.core.first_use import ModuleOnFirstUse
 from iblf_jax.core.progress import announced, bar
 from iblf_jax.engine import cases_per_unit, takes_runs, whole_blocks
 from iblf_jax.simulation.error_growth import errors_by_step
@@ -47,6 +48,8 @@ from iblf_jax.studies.time_step import warn_of_sampling, warn_of_step
 
 if TYPE_CHECKING:
     import xarray
+else:
+    xarray = ModuleOnFirstUse("xarray")
 
 
 @notices.each_warning_once

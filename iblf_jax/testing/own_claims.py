@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.certificates.claims.own import METHODS, stated_methods, states_disturbance_terms
+from iblf_jax.certificates.terms import receives_q_dq
 from iblf_jax.control.controllers import Law
 from iblf_jax.control.controllers._base import law_of_x
 from iblf_jax.core.attributes import attributes, has_members
@@ -43,7 +44,7 @@ def check_claims(findings: Findings, scenario: Scenario) -> None:
     q, dq = jnp.asarray(rng.uniform(-SPREAD, SPREAD, (2, STATES, scenario.n)))
     width = 0.9 * jnp.minimum(tube.k_l, tube.k_u)
     q, dq = tube.q_d + jnp.clip(q, -width, width), tube.dq_d + dq
-    f_tilde = jnp.broadcast_to(jnp.linspace(0.1, 0.2, scenario.n), model.estimate_shape)
+    f_tilde = jnp.broadcast_to(jnp.linspace(0.1, 0.2, scenario.n), _shape_of_error(scenario))
 
     def outputs(law, t, x, f_tilde, context):
         of_x = law_of_x(law)
@@ -69,11 +70,17 @@ def check_claims(findings: Findings, scenario: Scenario) -> None:
         findings.require(lowest >= 0, f"{name} is {lowest:.3g} somewhere where f_tilde = 0", remedy)
 
 
+def _shape_of_error(scenario: Scenario) -> tuple[int, ...]:
+    """The shape of the error of the estimate that `certify` passes to the law."""
+    model = scenario.loop.model
+    return model.estimate_shape if receives_q_dq(scenario) else (model.order, model.n)
+
+
 def _shapes(findings: Findings, scenario: Scenario) -> None:
     law: Any = scenario.controller
     context, model = scenario.context, scenario.loop.model
     x = start_levels(scenario)[: model.order]
-    q, t, zero = x[0], jnp.zeros((), x.dtype), jnp.zeros(model.estimate_shape, x.dtype)
+    q, t, zero = x[0], jnp.zeros((), x.dtype), jnp.zeros(_shape_of_error(scenario), x.dtype)
     measured, names = ((x[0], x[1]), "q, dq, f_tilde")
     if isinstance(law, Law):
         measured, names = (x,), "x, d_tilde"  # type: ignore[assignment]

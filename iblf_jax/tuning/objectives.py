@@ -31,11 +31,12 @@ max_i |y_i| / limit_i < 1.
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from iblf_jax.core import checks, notices
 from iblf_jax.core.joints import Joints, Selection, indices, selection
@@ -54,9 +55,6 @@ from iblf_jax.tuning.quantities import (
 )
 from iblf_jax.tuning.quantities import Quantity as Quantity
 from iblf_jax.world import plants
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
 
 A_SHARE = "a share of the runs, from 0 to 1"
 UNSUITABLE_SCALES = (

@@ -19,11 +19,12 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from iblf_jax.core import checks, notices
 from iblf_jax.simulation import paths
@@ -37,9 +38,6 @@ from iblf_jax.tuning.ranges import (
     default_highs,
     default_lows,
 )
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
 
 LIMIT_DISTANCE = 1e-3
 """Smallest distance of the start of a squashed coordinate from a limit, relative to the box."""

@@ -28,6 +28,7 @@ from iblf_jax.core.linalg import matvec
 from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.core.time import Timed, joined, jump_times_of, no_times
 from iblf_jax.core.units import TORQUE, VELOCITY, PlantUnit
+from iblf_jax.world import plants
 from iblf_jax.world.robots import Robot, momentum
 
 
@@ -40,8 +41,13 @@ class Disturbance(Timed):
     def torque(
         self, t: jax.Array, q: jax.Array, dq: jax.Array, plant: Robot, model: Robot
     ) -> jax.Array:
-        """Generalised torque on the plant, (n,) [N m], at time t [s] and state q [rad], dq
-        [rad/s].
+        """Generalised torque on the plant, (n,) [N m].
+
+        Args:
+          t: time, () [s].
+          q, dq: position [rad] and velocity [rad/s], (n,).
+          plant, model: robots as they are, of other plants the robot inside them, and plants
+            without a robot as they are.
         """
 
     @abc.abstractmethod
@@ -55,7 +61,7 @@ class Disturbance(Timed):
 
     def rates(self, t: jax.Array, x: jax.Array, plant: Any, model: Any) -> jax.Array | None:
         """D_1 ... d_r of (S.1), (r, n), which are added to x' of a plant in strict-feedback form;
-        None if there is nothing to add.
+        None if there is nothing to add.  It receives plant and model as the scenario has them.
         """
         return None
 
@@ -284,8 +290,8 @@ class Levels(Disturbance):
 
         x_i' = f_i + G_i x_{i+1} + d_i
 
-    d_i is the `torque` of part i, which receives the first two levels as q and q'; its numbers are
-    in the unit of level i per second.
+    d_i is the `torque` of part i, which receives the first two levels as q and q', and plant and
+    model as every torque does; its numbers are in the unit of level i per second.
 
     Args:
       parts: a disturbance for each level, or None for a level without one, a tuple or a list; fewer
@@ -317,8 +323,9 @@ class Levels(Disturbance):
 
     def rates(self, t: jax.Array, x: jax.Array, plant: Any, model: Any) -> jax.Array:
         """d_1 ... d_r, (r, n)."""
+        parts = (plants.robot_or_plant(plant), plants.robot_or_plant(model))
         rows = [
-            jnp.zeros_like(x[0]) if part is None else part.torque(t, x[0], x[1], plant, model)
+            jnp.zeros_like(x[0]) if part is None else part.torque(t, x[0], x[1], *parts)
             for part in self.parts[: len(x)]
         ]
         rows += [jnp.zeros_like(x[0])] * (len(x) - len(rows))

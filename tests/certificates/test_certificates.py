@@ -896,6 +896,51 @@ def test_an_own_claim_with_terms_of_its_own_and_a_memory(paper):
     assert "what the law states" in line.statement
 
 
+@ij.component
+class PassiveOfLevels(ij.controllers.Law):
+    """`Passive` as a law of x, with d_tilde in x' in the place of f_tilde."""
+
+    law: Passive
+
+    def init(self, x, context):
+        return ()
+
+    def command(self, t, x, d_hat, context, state):
+        return self.law.command(t, x[0], x[1], d_hat, context, state)
+
+    def lyapunov(self, t, x, d_tilde, context, state):
+        return self.law.lyapunov(t, x[0], x[1], d_tilde, context, state)
+
+    def decay(self, t, x, d_tilde, context, state):
+        return self.law.decay(t, x[0], x[1], d_tilde, context, state)
+
+
+@ij.component
+class PassiveWithTerms(PassiveOfLevels):
+    """The same, with T of its own: r . M0 d_tilde_2."""
+
+    def disturbance_terms(self, t, x, d_tilde, dd, context, state):
+        assert d_tilde.shape == dd.shape == x.shape
+        _, _, r, _ = self.law.errors(t, x[0], x[1], context)
+        return r @ (context.model.mass_matrix(x[0]) @ d_tilde[1])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("is_limited", [False, True])
+@pytest.mark.parametrize("kind", [PassiveOfLevels, PassiveWithTerms])
+def test_a_law_of_x_on_a_robot_has_its_uncertain_term_in_the_rates(own, kind, is_limited):
+    law = kind(own.controller)
+    if is_limited:
+        law = ij.controllers.Saturated(law=law, limit=[500.0, 500.0])
+    scenario = dataclasses.replace(own, controller=law)
+    line = certify(scenario, **OWN)["inequality, own V"]
+    assert line.verdict == "holds"
+    assert abs(line.margin) <= line.tolerance < 1e-10
+    assert ("what the law states" in line.statement) == (kind is PassiveWithTerms)
+    if not is_limited:
+        ij.testing.check_law(law, scenario=scenario)
+
+
 @pytest.mark.release
 def test_where_an_own_claim_is_not_made(own):
     law = own.controller

@@ -296,6 +296,18 @@ def test_without_disturbance_V_decays_at_its_rate(undisturbed):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("signal", ["e", "level_lower", "level_upper"])
+def test_a_run_with_an_altered_signal_of_the_third_level_is_refused(signal):
+    run = ij.simulate(pendulum(), duration=0.1, dt=2e-3)
+    altered = getattr(run, signal).at[7, 2, 0].add(1e-3)
+    with pytest.raises(ValueError, match=rf"^run.*{signal} of sample 7.*Simulate it again"):
+        certify(run.scenario, dataclasses.replace(run, **{signal: altered}))
+    # Other programs may round differently.
+    rounded = getattr(run, signal) * (1 + 1e-13)
+    assert certify(run.scenario, dataclasses.replace(run, **{signal: rounded})).holds
+
+
+@pytest.mark.slow
 def test_a_disturbed_run_has_the_true_terms():
     scenario = pendulum(disturbance=DISTURBANCES)
     run = ij.simulate(scenario, duration=2.0, dt=2e-3)

@@ -206,14 +206,38 @@ def chain():
     return dataclasses.replace(pendulum(), disturbance=disturbance)
 
 
+@ij.component
+class PassOn(controllers.Law):
+    """A law of x that commands what the law that it wraps commands."""
+
+    law: controllers.TrackingLaw
+    wraps = "law"
+
+    def init(self, x, context):
+        return controllers.law_of_x(self.law).init(x, context)
+
+    def command(self, t, x, d_hat, context, state):
+        return controllers.law_of_x(self.law).command(t, x, d_hat, context, state)
+
+    def energy(self, t, x, context):
+        return controllers.law_of_x(self.law).energy(t, x, context)
+
+    def energy_decay(self, t, x, context):
+        return controllers.law_of_x(self.law).energy_decay(t, x, context)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("make", "paths"),
     [
         (lambda: ARM, ("plant.mass", "plant.payload", "model.mass")),
+        (
+            lambda: dataclasses.replace(ARM, controller=adapting(PassOn(ARM.controller.law))),
+            ("plant.mass", "plant.payload", "model.mass"),
+        ),
         (chain, ("plant.H", "plant.Km", "model.H")),
     ],
-    ids=["arm", "order 3"],
+    ids=["arm", "law of x around one of robots", "order 3"],
 )
 def test_the_rate_of_the_lyapunov_function_is_what_is_claimed(make, paths, rng):
     scenario = ij.simulation.scenario.canonical(make())

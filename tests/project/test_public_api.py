@@ -11,6 +11,8 @@ import json
 import re
 import subprocess
 import sys
+import typing
+from typing import Any
 
 import pytest
 from conftest import ROOT
@@ -245,6 +247,43 @@ def test_every_public_name_is_documented(module):
     assert module.__doc__
     missing = [x for name, thing in public(module).items() for x in undocumented(name, thing)]
     assert not missing, f"{module.__name__}: without a docstring: {missing}"
+
+
+def functions_of(thing: object) -> dict[str, Any]:
+    """A function, or a class and its public methods, by name."""
+    if not inspect.isclass(thing):
+        return {getattr(thing, "__name__", ""): thing}
+    members = {name: value for base in thing.__mro__ for name, value in vars(base).items()}
+    found = {thing.__name__: thing}
+    for name, value in members.items():
+        function = getattr(value, "fget", None) or getattr(value, "__func__", value)
+        own = inspect.isfunction(function) and function.__module__.startswith("iblf_jax")
+        if own and not name.startswith("_"):
+            found[f"{thing.__name__}.{name}"] = function
+    return found
+
+
+@pytest.mark.slow
+def test_every_annotation_can_be_evaluated():
+    """By `typing.get_type_hints`, which tools for documentation and for checks of types call."""
+    listed = names_in(PAGE, "stable") | names_in(PAGE, "provisional")
+    things = {name: getattr(ij, name) for name in listed}
+    for module in filter(inspect.ismodule, [*things.values()]):
+        things |= public(module)
+    functions = {}
+    for thing in things.values():
+        if (getattr(thing, "__module__", None) or "").startswith("iblf_jax"):
+            functions |= functions_of(thing)
+    assert len(functions) > 500
+    # Only checkers of types need typing_extensions, which has its `TypeIs`.
+    del functions["is_absent"]
+    wrong = {}
+    for name, function in functions.items():
+        try:
+            typing.get_type_hints(function)
+        except (NameError, ModuleNotFoundError) as error:
+            wrong[name] = str(error)
+    assert wrong == {}
 
 
 @pytest.mark.parametrize(

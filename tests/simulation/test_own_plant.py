@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, ClassVar
 
 import jax
@@ -10,8 +11,11 @@ import numpy as np
 import pytest
 
 import iblf_jax as ij
+from iblf_jax.certificates.terms import TorquePoint
 from iblf_jax.core.status import Status
-from iblf_jax.simulation.levels import motion, start_levels
+from iblf_jax.deployment.cosimulate import _delivered
+from iblf_jax.simulation.closed_loop import initial_state
+from iblf_jax.simulation.levels import acceleration, motion, start_levels, torque_needed
 from iblf_jax.simulation.scenario import canonical
 from iblf_jax.tuning.objectives import fitted
 
@@ -177,30 +181,65 @@ class Noting(ij.disturbances.Disturbance):
         return jnp.zeros(0)
 
 
-@pytest.mark.parametrize("plant", ["a robot", "Rigid"])
-def test_a_disturbance_receives_the_same_parts_at_the_check_and_in_the_loop(plant):
-    """A model without a robot is the model itself, under a plant that is or contains one."""
-    robot = ij.presets.zhang_yan_2024().plant
-    model = ij.plants.StrictFeedback(
-        drift=lambda t, x: jnp.stack([0.0 * x[0], -x[1]]),
-        gain=lambda t, x: jnp.ones_like(x),
-        n=2,
-        order=2,
-    )
+ROBOT = ij.robots.PlanarChain(mass=[1.3], length=[0.4], centre=[0.2], inertia=[0.02])
+FLEXIBLE = ij.plants.FlexibleJoint(ROBOT, stiffness=300.0, motor_inertia=0.01)
+WITHOUT_ROBOT = ij.plants.StrictFeedback(
+    drift=lambda t, x: jnp.stack([0.0 * x[0], -x[1]]),
+    gain=lambda t, x: jnp.ones_like(x),
+    n=1,
+    order=2,
+)
+PARTS = {
+    "robots": (ROBOT, ROBOT, "PlanarChain"),
+    "the model is Rigid": (ROBOT, ij.plants.Rigid(ROBOT), "PlanarChain"),
+    "the plant is Rigid": (ij.plants.Rigid(ROBOT), ROBOT, "PlanarChain"),
+    "the plant is a flexible joint": (FLEXIBLE, FLEXIBLE.rigid(), "WithMotors"),
+    "the model has no robot": (ROBOT, WITHOUT_ROBOT, "StrictFeedback"),
+    "a Rigid plant, and a model without a robot": (
+        ij.plants.Rigid(ROBOT),
+        WITHOUT_ROBOT,
+        "StrictFeedback",
+    ),
+}
+"""Plants with their models, and the class of the model that a torque receives."""
+
+
+@pytest.mark.parametrize("parts", PARTS)
+def test_every_user_of_a_disturbance_passes_it_the_same_plant_and_model(parts):
+    """Those without a robot as they are, and of others the robot inside them."""
+    plant, model, received = PARTS[parts]
     noting = Noting()
     noting.seen.clear()
-    scenario = ij.with_parts(
-        ij.presets.zhang_yan_2024(),
-        plant=robot if plant == "a robot" else ij.plants.Rigid(robot),
-        model=model,
-        controller=ij.controllers.BarrierBackstepping(k=(2.0, 10.0), weights=1.0),
-        observer=ij.observers.NoObserver(),
-        disturbance=noting,
+    law: ij.controllers.TrackingLaw = ij.controllers.Backstepping(k1=2.0, K2=5.0)
+    if not isinstance(model, ij.robots.Robot):
+        law = ij.controllers.BarrierBackstepping(k=(2.0, 10.0), weights=1.0)
+    scenario = canonical(
+        tanks(
+            plant=plant,
+            model=model,
+            bounds=ij.Bounds(lower=ij.bounds.Constant(-0.1), upper=ij.bounds.Constant(0.4)),
+            controller=law,
+            disturbance=ij.disturbances.Sum((noting, ij.disturbances.Levels((noting, noting)))),
+            initial=ij.Initial(q=0.12),
+        )
     )
-    checked = canonical(scenario)
-    assert noting.seen == {("TwoLink", "StrictFeedback")}
-    motion(checked, jnp.zeros(()), start_levels(checked), jnp.zeros(2))
-    assert noting.seen == {("TwoLink", "StrictFeedback")}
+    expected = {("PlanarChain", received)}
+    assert noting.seen == expected
+    t, x, joint = jnp.zeros(()), start_levels(scenario), jnp.zeros(1)
+    users = {"the loop": lambda s: motion(s, t, x, joint)}
+    if isinstance(law, ij.controllers.Backstepping):
+        point = partial(TorquePoint, t=t, state=initial_state(scenario))
+        users["certify"] = lambda s: point(s).now["external"]
+    if isinstance(plant, ij.robots.Robot):
+        users |= {
+            "replay": lambda s: acceleration(s, t, joint, joint, joint),
+            "excitation": lambda s: torque_needed(s, t, joint, joint, joint),
+            "cosimulate": lambda s: _delivered(s, t, joint, joint, joint, ())[1],
+        }
+    for name, user in users.items():
+        noting.seen.clear()
+        jax.eval_shape(user, scenario)
+        assert noting.seen == expected, name
 
 
 def test_the_message_about_a_drift_of_another_shape_counts_levels_and_components():

@@ -184,7 +184,7 @@ def _why_not_with_estimates(scenario: Scenario) -> str:
         return about
     if states_disturbance_terms(law):
         return f"{about}; the T that the law states does not contain their error"
-    start = jax.eval_shape(law.init, scenario.initial.q, scenario.initial.dq, scenario.context)
+    start = jax.eval_shape(law_of_x(law).init, scenario.initial.x, scenario.context)
     if jax.tree.leaves(start):
         return f"{about}, which act on the law's own state"
     return ""

@@ -217,8 +217,8 @@ class Law(TrackingLaw):
     of an observer of torques on a plant with a robot inside.
 
     A law may state a Lyapunov function of its own, which `certify` checks: `LyapunovLaw` with x in
-    the place of q and q' and d_tilde, (r, n), in the place of f_tilde.  T is then
-    dV/dx . d_tilde + dV/dd_tilde . d' by default.
+    the place of q and q' and d_tilde in the place of f_tilde: (r, n), or the torque f_tilde, (n,),
+    for a law that wraps one of robots.  T is then dV/dx . d_tilde + dV/dd_tilde . d' by default.
     """
 
     receives_x: ClassVar[bool] = True
@@ -282,9 +282,7 @@ class Law(TrackingLaw):
         context: LawContext,
         state: State,
     ) -> jax.Array | None:
-        """T, () or (n,): what d_tilde and d', (r, n) each, may add to V'; None for what they add
-        for any law.
-        """
+        """T, () or (n,): what d_tilde and d' may add to V'; None for what they add for any law."""
         return None
 
 

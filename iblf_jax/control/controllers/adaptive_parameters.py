@@ -43,7 +43,6 @@ from jax.typing import DTypeLike
 
 from iblf_jax.control.controllers._base import (
     Command,
-    Law,
     LawContext,
     State,
     TrackingLaw,
@@ -56,12 +55,9 @@ from iblf_jax.control.controllers._base import (
 from iblf_jax.core import checks
 from iblf_jax.core.component_paths import member_of, replaced, resolve
 from iblf_jax.core.families import is_default
-from iblf_jax.core.linalg import inner
 from iblf_jax.core.pytree import Leaf, component, leaf, static
 from iblf_jax.core.units import PlantUnit, of_entry
 from iblf_jax.world import plants
-from iblf_jax.world.robots import inverse_dynamics
-from iblf_jax.world.robots._base import forward_dynamics
 
 SHARE_OF_BAND = 0.05
 """Width of the projection's band in that of the box, if none is given."""
@@ -398,19 +394,16 @@ class AdaptiveParameters(Wrapping):
           t, x, context: as `command`.
           command: of the law at this state.
           theta: parameters, (p,).
-          disturbance: of the model itself, f (n,), or d (r, n).
+          disturbance: of the model itself, f (n,) or d (r, n).
         """
         true = self._with_parameters(context, theta)
-        if isinstance(self.law, Law):
-            flow = plants.flow(plants.as_plant(context.model), t, x, command.tau)
-            true_flow = plants.flow(plants.as_plant(true.model), t, x, command.tau)
-            slopes = jax.grad(self.law.energy, argnums=1)(t, x, true)
-            return jnp.sum(slopes * (flow + disturbance - true_flow))
-        q, dq = x[0], x[1]
-        driving = command.tau + disturbance
-        ddq = forward_dynamics(context.model, q, dq, driving)
-        needed = inverse_dynamics(true.model, q, dq, dq, ddq)
-        return inner(command.input_slope, needed - command.tau)
+        model, true_model = map(plants.as_plant, (context.model, true.model))
+        if disturbance.ndim == 1:
+            disturbance = plants.torque_as_rates(model, x, disturbance)
+        flow = plants.flow(model, t, x, command.tau)
+        true_flow = plants.flow(true_model, t, x, command.tau)
+        slopes = jax.grad(self.inner.energy, argnums=1)(t, x, true)
+        return jnp.sum(slopes * (flow + disturbance - true_flow))
 
     def true_parameters(self, t: jax.Array, context: LawContext) -> jax.Array:
         """The true parameters theta at time t, (p,): those of the plant where the context has one

@@ -6,23 +6,20 @@ Each function is a member of `AsPublished` and of `Momentum`; the first argument
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.control.observers._base import RobotObserver
 from iblf_jax.core import checks
 from iblf_jax.world.robots import Robot, momentum
-
-if TYPE_CHECKING:
-    from iblf_jax.control.observers.as_published import AsPublished
-    from iblf_jax.control.observers.momentum import Momentum
 
 STARTS = ("zero", "matched")
 
 
-def kf_advice(observer: AsPublished | Momentum) -> list[str]:
+def kf_advice(observer: RobotObserver) -> list[str]:
     """Warnings about a kf below the condition of Theorem 2; none for traced values."""
     kf = observer.kf
     if not checks.is_concrete(kf) or bool(np.all(np.asarray(kf) > 0.5)):
@@ -39,9 +36,7 @@ def kf_advice(observer: AsPublished | Momentum) -> list[str]:
     return [f"observer.kf = {kf}: {need}. {lost}; {rest}."]
 
 
-def initial_eta(
-    observer: AsPublished | Momentum, q: jax.Array, dq: jax.Array, model: Robot
-) -> jax.Array:
+def initial_eta(observer: Any, q: jax.Array, dq: jax.Array, model: Robot) -> jax.Array:
     """eta(0) of an observer with `kf`, `eta0` and `start`, (n,) [N m]."""
     eta0 = jnp.broadcast_to(observer.eta0, q.shape)
     if observer.start == "zero":
@@ -50,7 +45,7 @@ def initial_eta(
 
 
 def eta_and_momentum(
-    observer: AsPublished | Momentum,
+    observer: RobotObserver,
     t: jax.Array,
     q: jax.Array,
     dq: jax.Array,
@@ -62,7 +57,7 @@ def eta_and_momentum(
 
 
 def advanced_eta(
-    observer: AsPublished | Momentum,
+    observer: RobotObserver,
     t: jax.Array,
     q: jax.Array,
     dq: jax.Array,
@@ -80,7 +75,7 @@ def advanced_eta(
     return state - jnp.expm1(-observer.kf * period) / observer.kf * rate
 
 
-def with_discrete_gain(observer: AsPublished | Momentum, period: jax.Array) -> Any:
+def with_discrete_gain(observer: Any, period: jax.Array) -> Any:
     """The observer with kf = (1 - exp(-kf period)) / period, for which 1 - kf period is what is
     left of an error after a period.
     """

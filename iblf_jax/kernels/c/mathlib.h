@@ -1,4 +1,4 @@
-/* Elementary functions, on vectors of runs or (scalar.h) one run.  tests/test_lowering_math.py holds their errors to: sin, cos 2.1 ulp, for every
+/* Elementary functions, on vectors of runs or (scalar.h) one run.  tests/kernels/test_operations.py holds their errors to: sin, cos 2.1 ulp, for every
    finite x; exp, expm1, log, log1p, atan 3.6 ulp; tanh, tan, logistic 5.6 ulp.  Sources: W. J. Cody, W. Waite, Software Manual for the
    Elementary Functions, 1980 (range reduction); S. Moshier, Cephes (coefficients of sin, cos, atan). */
 

@@ -9,6 +9,7 @@ import jax
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.core.first_use import ModuleOnFirstUse
 from iblf_jax.core.presentation import Content, Result, present
 from iblf_jax.core.status import describe
 from iblf_jax.core.tables import as_text
@@ -22,6 +23,8 @@ from iblf_jax.studies.rare_events.limit_state import Level, stagnate
 
 if TYPE_CHECKING:
     import xarray
+else:
+    xarray = ModuleOnFirstUse("xarray")
 
 GROUP = "rare draws"
 """Name of the draw that the leaves of `rare_draws` share."""
@@ -190,8 +193,6 @@ class FailureProbability(Result):
         """Levels along `level`, failures along `failure`: z, margins, weights, and the drawn
         values.
         """
-        import xarray
-
         levels = {
             "threshold": [x.threshold for x in self.levels],
             "conditional_probability": [x.probability for x in self.levels],

@@ -32,6 +32,7 @@ from iblf_jax.world.plants._base import level_rate as level_rate
 from iblf_jax.world.plants._base import nominal_of as nominal_of
 from iblf_jax.world.plants._base import order_of as order_of
 from iblf_jax.world.plants._base import robot_of as robot_of
+from iblf_jax.world.plants._base import robot_or_plant as robot_or_plant
 from iblf_jax.world.plants._base import speed_limit as speed_limit
 from iblf_jax.world.plants._base import state_of_levels as state_of_levels
 from iblf_jax.world.plants._base import torque_as_rates as torque_as_rates

@@ -319,6 +319,14 @@ def robot_of(part: Any) -> Any:
     return part
 
 
+def robot_or_plant(part: Any) -> Any:
+    """The robot of a part, as the torque of a disturbance receives it; a plant without a robot
+    itself.
+    """
+    robot = robot_of(part)
+    return part if robot is None else robot
+
+
 def declared_joints(part: Any) -> tuple[str, ...]:
     """The names that a robot, or the robot inside a plant, gives its joints; () without names."""
     robot = robot_of(part)
