@@ -28,6 +28,19 @@ import iblf_jax as ij
 from iblf_jax.kernels import processor
 
 ROOT = Path(__file__).resolve().parents[1]
+ARM = """
+jax.config.update("jax_enable_x64", True)
+import iblf_jax as ij
+sensor = ij.sensors.Encoder(counts=2.0**16, velocity=ij.sensors.FilteredDifference(cutoff=300.0))
+arm = ij.with_parts(
+    ij.presets.ur5(),
+    sampling=ij.Sampling(period=2e-3, delay=1e-3),
+    sensor=sensor,
+    actuator=ij.actuators.Motor(bandwidth=200.0),
+)
+"""
+"""An arm whose first results are measured, as the text of a program: sampled, with encoders and
+motors."""
 
 
 def once(call: Callable[[], Any]) -> float:

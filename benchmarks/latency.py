@@ -27,7 +27,7 @@ jax.config.update("jax_enable_x64", True)
 
 import jax.numpy as jnp
 import numpy as np
-from _timing import interleaved, report
+from _timing import ARM, interleaved, report
 from jax.flatten_util import ravel_pytree
 from scipy.integrate import solve_ivp
 
@@ -80,21 +80,12 @@ FIRST_RESULTS = {
     "report of a study": "ij.report(found, folder + '/report.html')",
 }
 """Call -> its text in FIRST_RESULT."""
-FIRST_RESULT = """
+FIRST_RESULT = f"""
 import resource, sys, tempfile
 import jax
-jax.config.update("jax_enable_x64", True)
-import iblf_jax as ij
-sensor = ij.sensors.Encoder(counts=2.0**16, velocity=ij.sensors.FilteredDifference(cutoff=300.0))
-arm = ij.with_parts(
-    ij.presets.ur5(),
-    sampling=ij.Sampling(period=2e-3, delay=1e-3),
-    sensor=sensor,
-    actuator=ij.actuators.Motor(bandwidth=200.0),
-)
-timing = {"duration": 1.5, "dt": 1e-3}
+{ARM}timing = {{"duration": 1.5, "dt": 1e-3}}
 def study():
-    unknown = {"plant.payload": ij.value(ij.uniform(1.0, 2.0))}
+    unknown = {{"plant.payload": ij.value(ij.uniform(1.0, 2.0))}}
     return ij.monte_carlo(arm, unknown, runs=64, **timing)
 def used():
     whose = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)

@@ -4,9 +4,9 @@
 
 BEFORE is by default the commit that `benchmarks/baseline` names.  Every number is one of a fresh
 process that imports the package of its tree: processor seconds, those of the compilers that it
-starts included, and counts of operations, which are exact.  The trees take turns, and the smallest
-number of each counts, since other programs only add to it.  A row that lost more than 5 % is
-measured again a few times before it is named.
+starts included, and counts of operations, which are exact.  The trees take turns (`change` says
+what of the turns counts).  A row that lost more than 5 % is measured again a few times before it is
+named.
 
 With --quick the arm of six joints, whose first result takes half a minute, is left out.  The exit
 status is 1 if a row lost more than PERCENT.
@@ -21,6 +21,7 @@ import argparse
 import contextlib
 import json
 import os
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -28,7 +29,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from _timing import ROOT, report
+from _timing import ARM, ROOT, report
 
 BASELINE = ROOT / "benchmarks" / "baseline"
 NAMED = 0.05
@@ -55,17 +56,6 @@ paper = ij.presets.zhang_yan_2024()
 unknown = {"plant.mass[1]": ij.factor(ij.uniform(0.9, 1.1))}
 def study(runs, steps):
     ij.monte_carlo(paper, unknown, runs=runs, duration=steps * 1e-3, dt=1e-3, progress=False)
-"""
-ARM = """
-jax.config.update("jax_enable_x64", True)
-import iblf_jax as ij
-sensor = ij.sensors.Encoder(counts=2.0**16, velocity=ij.sensors.FilteredDifference(cutoff=300.0))
-arm = ij.with_parts(
-    ij.presets.ur5(),
-    sampling=ij.Sampling(period=2e-3, delay=1e-3),
-    sensor=sensor,
-    actuator=ij.actuators.Motor(bandwidth=200.0),
-)
 """
 
 
@@ -129,6 +119,7 @@ def measured(tree: Path, measure: Measure) -> list[float]:
     found: list[float] = []
     with tempfile.TemporaryDirectory() as cache:
         environment = os.environ | {"PYTHONPATH": str(tree), "XDG_CACHE_HOME": cache}
+        environment.pop("PYTHONDONTWRITEBYTECODE", None)  # it would compile all in each process
         for process in range(measure.starts):
             code = f"{PREAMBLE}process = {process}\n{measure.code}\nprint(json.dumps(found))"
             run = subprocess.run(
@@ -145,38 +136,39 @@ def measured(tree: Path, measure: Measure) -> list[float]:
     return found
 
 
-def smallest(turns: Sequence[Sequence[float]]) -> list[float]:
-    """The smallest number of each row."""
-    return [min(row) for row in zip(*turns, strict=True)]
+def change(before: Sequence[float], after: Sequence[float]) -> float:
+    """The share by which a number grew, by its turns in both trees.
+
+    It is the smaller one of two: that of the smallest numbers, as other programs only add to them,
+    and the median of the turns, since both trees of a turn meet much the same machine.  One lucky
+    turn before, or some unlucky ones after, are thus no loss.
+    """
+    turns = [second / first for first, second in zip(before, after, strict=True)]
+    return min(min(after) / min(before), statistics.median(turns)) - 1.0
 
 
 def compared(trees: Sequence[Path], measure: Measure) -> list[list[float]]:
-    """Rows of one measure: before and after."""
+    """Rows of one measure: the smallest numbers before and after, and the change."""
     turns: list[list[list[float]]] = [[], []]
     for number in range(measure.rounds + MORE_ROUNDS):
         for tree, own in zip(trees, turns, strict=True):
             own.append(measured(tree, measure))
         if number + 1 < measure.rounds:
             continue
-        before, after = map(smallest, turns)
-        rows = [list(pair) for pair in zip(before, after, strict=True)]
+        columns = zip(*(zip(*own, strict=True) for own in turns), strict=True)
+        rows = [[min(before), min(after), change(before, after)] for before, after in columns]
         is_exact = measure.rows[0].startswith(COUNTS)
-        if is_exact or not any(loss(*row) > NAMED for row in rows):
+        if is_exact or not any(share > NAMED for *_, share in rows):
             break
     return rows
 
 
-def loss(before: float, after: float) -> float:
-    """Share by which a number grew."""
-    return after / before - 1.0
-
-
 def verdict(rows: Sequence[Sequence], fail: float) -> tuple[str, bool]:
-    """What lost more than NAMED, and whether a row lost more than `fail`."""
-    lost = {str(name): loss(before, after) for name, before, after, _ in rows}
-    named = [f"{name} {100 * share:+.0f} %" for name, share in lost.items() if share > NAMED]
-    if not named:
+    """What lost more than NAMED, and whether a row lost more than `fail` percent."""
+    lost = {str(name): percent for name, *_, percent in rows if percent > 100 * NAMED}
+    if not lost:
         return f"no row lost more than {100 * NAMED:.0f} %", False
+    named = [f"{name} {percent:+.0f} %" for name, percent in lost.items()]
     return f"lost: {'; '.join(named)}", max(lost.values()) > fail
 
 
@@ -184,8 +176,10 @@ def table(trees: Sequence[Path], measures: Sequence[Measure]) -> list[list]:
     """All rows: name, before, after and the change in percent."""
     rows: list[list] = []
     for measure in measures:
-        for name, (before, after) in zip(measure.rows, compared(trees, measure), strict=True):
-            rows.append([name, before, after, 100 * loss(before, after)])
+        for name, (before, after, share) in zip(
+            measure.rows, compared(trees, measure), strict=True
+        ):
+            rows.append([name, before, after, 100 * share])
             print(f"{name}: {before:.4g} -> {after:.4g}", file=sys.stderr, flush=True)
     return rows
 
@@ -230,7 +224,7 @@ def main() -> int:
     measures = [x for x in MEASURES if x.quick or not args.quick]
     with checked_out(before) as first, checked_out(args.after) as second:
         rows = table((first, second), measures)
-    words, failed = verdict(rows, args.fail / 100)
+    words, failed = verdict(rows, args.fail)
     columns = ["processor seconds, and counts", "before", "after", "change, %"]
     title = f"{args.after or 'Working tree'} against {before}"
     report(title, columns, rows, args.json, {"verdict": words})
