@@ -407,7 +407,7 @@ def _compare(
 ) -> None:
     """Raises ValueError if a reconstructed signal differs from the recorded one."""
     # Levels without bounds have infinite ones.
-    close = np.isclose(reconstructed, recorded, rtol=0.0, atol=tolerance, equal_nan=True)
+    close = np.isclose(reconstructed, recorded, rtol=0.0, atol=tolerance)
     far = ~np.all(close, axis=tuple(range(1, np.ndim(recorded))))
     if not far.any():
         return

@@ -7,7 +7,7 @@ from __future__ import annotations
 import importlib
 import sys
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from iblf_jax.core.former_names import no_attribute
 
@@ -25,6 +25,13 @@ class ModuleOnFirstUse:
 
     def __getattr__(self, name: str) -> Any:
         return getattr(importlib.import_module(self._name), name)
+
+
+if TYPE_CHECKING:
+    import mujoco as mujoco
+    import xarray as xarray
+else:
+    mujoco, xarray = ModuleOnFirstUse("mujoco"), ModuleOnFirstUse("xarray")
 
 
 def on_first_use(

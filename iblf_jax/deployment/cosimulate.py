@@ -12,7 +12,7 @@ import math
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ from iblf_jax.control.actuators import Ideal
 from iblf_jax.control.actuators.delay import WHOLE_TOLERANCE
 from iblf_jax.core import checks, notices
 from iblf_jax.core.attributes import attributes
-from iblf_jax.core.first_use import ModuleOnFirstUse
+from iblf_jax.core.first_use import mujoco
 from iblf_jax.core.progress import announced
 from iblf_jax.core.status import Status
 from iblf_jax.deployment.mujoco_plant import INTEGRATORS, MujocoPlant, Stages
@@ -45,11 +45,6 @@ from iblf_jax.simulation.scenario import Scenario, canonical, check_step
 from iblf_jax.simulation.signals import FIELDS
 from iblf_jax.world import plants
 from iblf_jax.world.disturbances import Nothing
-
-if TYPE_CHECKING:
-    import mujoco
-else:
-    mujoco = ModuleOnFirstUse("mujoco")
 
 
 @notices.each_warning_once

@@ -157,11 +157,11 @@ def fields_of_line(stored: dict[str, Any]) -> dict[str, Any]:
     """The fields of a stored line of a certificate.  Its name said what it is in earlier versions,
     which named two of its fields otherwise.
     """
+    if "role" in stored:
+        return stored
     # Imported here, as scenarios are read without certificates.
     from iblf_jax.certificates.lines import Role
 
-    if "role" in stored:
-        return stored
     former = {"counts": "enters_verdict", "first": "first_broken"}
     present = {former.get(name, name): x for name, x in stored.items()}
     name = str(stored.get("name"))

@@ -58,10 +58,8 @@ def interpret(b: Builder, jaxpr: Any, consts: Sequence[Ids], inputs: Sequence[Id
         elif name in CONTROL:
             results = CONTROL[name](b, eqn, operands, uses[id(eqn)])
         elif name in RULES:
-            for dtype in [v.aval.dtype for v in eqn.outvars if eqn.invars]:
-                # Constants, which have no operands, are rounded.
-                if np.issubdtype(dtype, np.floating) and dtype != b.dtype:
-                    raise UnsupportedError(f"it mixes {dtype} with {b.dtype} ({name})")
+            for v in eqn.outvars:
+                _check_float(b, v.aval.dtype, eqn)
             found = RULES[name](b, eqn, *operands)
             results = found if isinstance(found, list | tuple) else [found]
         else:
@@ -75,6 +73,12 @@ def interpret(b: Builder, jaxpr: Any, consts: Sequence[Ids], inputs: Sequence[Id
                 )
             known[v] = ids
     return [read(v) for v in jaxpr.outvars]
+
+
+def _check_float(b: Builder, dtype, eqn) -> None:
+    """Refuses floats of another type than the program's, except constants, which are rounded."""
+    if np.issubdtype(dtype, np.floating) and dtype != b.dtype and eqn.invars:
+        raise UnsupportedError(f"it mixes {dtype} with {b.dtype} ({eqn.primitive.name})")
 
 
 def closed(b: Builder, function: core.ClosedJaxpr, operands: Sequence[Ids]) -> list[Ids]:

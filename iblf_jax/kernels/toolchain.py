@@ -372,20 +372,7 @@ def cached_file(
     """
     path = cache_path(content, suffix)
     with _made_once(path.stem):
-        folder = path.parent
-        try:
-            if _checked(path) is None:
-                for left in folder.glob("tmp????????"):  # of version 0.1.0
-                    remove_abandoned(left, lockable=False)
-                with draft(folder, "kernel") as work:
-                    made = work / f"made{path.suffix}"
-                    make(made)
-                    image = _read(made)
-                    if not image:
-                        raise ToolchainError("the compiler left no file")
-                    _write(work, image, path)
-        except OSError as error:
-            raise ToolchainError(f"the cache {folder} cannot be used: {error}") from None
+        _make_if_missing(path.parent, path, make)
     return path, path.stem
 
 
@@ -424,6 +411,23 @@ def _made_once(key: str) -> Iterator[None]:
         if waiting:
             stop_own_compilers()
         raise
+
+
+def _make_if_missing(folder: Path, path: Path, make: Callable[[Path], object]) -> None:
+    """Makes a file of the cache unless an intact one exists."""
+    try:
+        if _checked(path) is None:
+            for left in folder.glob("tmp????????"):  # of version 0.1.0
+                remove_abandoned(left, lockable=False)
+            with draft(folder, "kernel") as work:
+                made = work / f"made{path.suffix}"
+                make(made)
+                image = _read(made)
+                if not image:
+                    raise ToolchainError("the compiler left no file")
+                _write(work, image, path)
+    except OSError as error:
+        raise ToolchainError(f"the cache {folder} cannot be used: {error}") from None
 
 
 def _write(folder: Path, image: bytes, path: Path) -> None:

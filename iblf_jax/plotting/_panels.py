@@ -545,7 +545,9 @@ def show(
     set_limits(axes, owners, samples, always_shown, quantity)
     if not tight:
         annotate_clipped_peak(axes, owners, samples, quantity, [joint] * len(samples))
-    for curve in (curve for curve in curves if curve.failed):
+    for curve in curves:
+        if not curve.failed:
+            continue
         # A cross where the joint left its bounds, at the edge of the panel if it is outside.
         index = curve.exit_index(quantity.field, joint)
         y = curve[quantity.field][:, joint]

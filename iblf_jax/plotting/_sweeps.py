@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -14,17 +14,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from iblf_jax.core import checks
-from iblf_jax.core.first_use import ModuleOnFirstUse
+from iblf_jax.core.first_use import xarray
 from iblf_jax.core.status import FAILED, VIOLATED
 from iblf_jax.plotting import _style
 from iblf_jax.plotting._curves import escaped
 from iblf_jax.plotting._studies import MARGINS
 from iblf_jax.studies.statistics import SMALLER_IS_WORSE
-
-if TYPE_CHECKING:
-    import xarray
-else:
-    xarray = ModuleOnFirstUse("xarray")
 
 SHARES = {
     "failed": (int(FAILED), "share of failed runs [1]"),

@@ -7,7 +7,7 @@ import enum
 import math
 from collections.abc import Mapping
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ import numpy as np
 
 from iblf_jax.control.controllers._base import position_barrier
 from iblf_jax.core import checks, tables
-from iblf_jax.core.first_use import ModuleOnFirstUse
+from iblf_jax.core.first_use import xarray
 from iblf_jax.core.presentation import Content, Result, present
 from iblf_jax.core.pytree import astype
 from iblf_jax.engine.simulate import simulate
@@ -24,11 +24,6 @@ from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.world import plants
-
-if TYPE_CHECKING:
-    import xarray
-else:
-    xarray = ModuleOnFirstUse("xarray")
 
 INSTANTS = 512
 """Times of a guaranteed tube."""

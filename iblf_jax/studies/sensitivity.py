@@ -17,12 +17,12 @@ import dataclasses
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from iblf_jax.core import checks, notices, tables
-from iblf_jax.core.first_use import ModuleOnFirstUse
+from iblf_jax.core.first_use import xarray
 from iblf_jax.core.presentation import Content, Result
 from iblf_jax.core.progress import announced, bar
 from iblf_jax.core.pytree import field_values
@@ -39,12 +39,6 @@ from iblf_jax.studies.draws import draw_shapes
 from iblf_jax.studies.execution import run_all_cases
 from iblf_jax.studies.options import LocalExecutor, RunOptions, executor_of
 from iblf_jax.studies.study_setup import PreparedStudy, prepare
-
-if TYPE_CHECKING:
-    import xarray
-else:
-    xarray = ModuleOnFirstUse("xarray")
-
 
 TAILS = (0.025, 0.975)
 """Ends of an interval of 95 %."""

@@ -16,13 +16,13 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import numpy as np
 
 from iblf_jax.core import checks, notices
-from iblf_jax.core.first_use import ModuleOnFirstUse
+from iblf_jax.core.first_use import xarray
 from iblf_jax.core.presentation import Content, Result, present
 from iblf_jax.core.progress import announced
 from iblf_jax.core.status import FAILED, Status, describe, has_flag
@@ -44,11 +44,6 @@ from iblf_jax.studies.statistics import Probability
 from iblf_jax.studies.study_setup import PreparedStudy
 from iblf_jax.world import plants
 from iblf_jax.world.regions import in_words
-
-if TYPE_CHECKING:
-    import xarray
-else:
-    xarray = ModuleOnFirstUse("xarray")
 
 VIOLATED = CONSTRAINT_VIOLATED | Status.NOT_FINITE
 """The flags that `violation_probability` counts: a bound or region was violated, or the run

@@ -13,12 +13,12 @@ import random
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import closing
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from iblf_jax.core import checks, notices
-from iblf_jax.core.first_use import ModuleOnFirstUse
+from iblf_jax.core.first_use import xarray
 from iblf_jax.core.progress import announced, bar
 from iblf_jax.engine import cases_per_unit, takes_runs, whole_blocks
 from iblf_jax.simulation.error_growth import errors_by_step
@@ -45,11 +45,6 @@ from iblf_jax.studies.store import Store, StoreError, Variable, load_store, open
 from iblf_jax.studies.study_setup import PreparedStudy, prepare
 from iblf_jax.studies.sweep_points import make_points
 from iblf_jax.studies.time_step import warn_of_sampling, warn_of_step
-
-if TYPE_CHECKING:
-    import xarray
-else:
-    xarray = ModuleOnFirstUse("xarray")
 
 
 @notices.each_warning_once

@@ -271,10 +271,8 @@ class Leader(Reference):
         """
         checks.conforms("Leader.motion", self.motion, Reference, "iblf_jax.references has them.")
         checks.positive_integer("Leader.components", self.components, most=checks.MAX_JOINTS)
-        is_valid = isinstance(self.weights, tuple) and len(self.weights) > 0
-        for weight in self.weights if is_valid else ():
-            is_valid &= isinstance(weight, numbers.Real) and 0.0 <= float(weight) < math.inf
-        if not is_valid:
+        is_tuple = isinstance(self.weights, tuple) and len(self.weights) > 0
+        if not is_tuple or not all(map(_is_weight, self.weights)):
             expected = "a tuple of finite numbers >= 0, one for each agent"
             raise checks.fail("Leader.weights", self.weights, expected)
 
@@ -297,6 +295,11 @@ class Leader(Reference):
     def jump_times(self) -> jax.Array:
         """The times at which the motion jumps, (k,) [s]."""
         return jump_times_of("motion", self.motion)
+
+
+def _is_weight(value: object) -> bool:
+    """Whether a value is a finite number >= 0."""
+    return isinstance(value, numbers.Real) and 0.0 <= float(value) < math.inf
 
 
 @memoised(32)

@@ -54,7 +54,7 @@ def test_a_loss_is_measured_again(losses, numbers, before, after, turns, change)
 
 def test_counts_are_exact_and_measured_once(losses, numbers):
     taken = numbers(before=[100], after=[120])
-    measure = losses.Measure(("operations of a step",), "", rounds=1)
+    measure = losses.Measure(("operations of a step",), "", rounds=1, is_exact=True)
     losses.table((BEFORE, AFTER), [measure])
     assert taken == {BEFORE: 1, AFTER: 1}
 

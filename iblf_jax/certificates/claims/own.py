@@ -33,6 +33,7 @@ from iblf_jax.core import checks
 from iblf_jax.core.attributes import attributes
 from iblf_jax.core.families import is_default
 from iblf_jax.core.linalg import solve_spd
+from iblf_jax.simulation.levels import start_levels
 from iblf_jax.simulation.scenario import Scenario
 
 METHODS = ("lyapunov", "decay")
@@ -184,7 +185,8 @@ def _why_not_with_estimates(scenario: Scenario) -> str:
         return about
     if states_disturbance_terms(law):
         return f"{about}; the T that the law states does not contain their error"
-    start = jax.eval_shape(law_of_x(law).init, scenario.initial.x, scenario.context)
+    x = start_levels(scenario)[: scenario.loop.model.order]
+    start = jax.eval_shape(law_of_x(law).init, x, scenario.context)
     if jax.tree.leaves(start):
         return f"{about}, which act on the law's own state"
     return ""

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.core.first_use import ModuleOnFirstUse
+from iblf_jax.core.first_use import xarray
 from iblf_jax.core.presentation import Content, Result, present
 from iblf_jax.core.status import describe
 from iblf_jax.core.tables import as_text
@@ -20,11 +20,6 @@ from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.units import status_words
 from iblf_jax.studies.distributions import Perturbation, joint_samples, value
 from iblf_jax.studies.rare_events.limit_state import Level, stagnate
-
-if TYPE_CHECKING:
-    import xarray
-else:
-    xarray = ModuleOnFirstUse("xarray")
 
 GROUP = "rare draws"
 """Name of the draw that the leaves of `rare_draws` share."""
