@@ -180,7 +180,7 @@ def test_the_two_runs_side_by_side(shaken):
         run = ij.simulate(scenario, **SHORT)
     error = np.max(np.abs(run.q - fine.q) / (run.upper - run.lower))
     assert float(pair.difference) == pytest.approx(error, rel=0.5)
-    assert float(pair.estimate.relative) == pytest.approx(float(run.metrics[RELATIVE]), rel=0.05)
+    assert float(pair.accuracy.relative) == pytest.approx(float(run.metrics[RELATIVE]), rel=0.05)
     np.testing.assert_allclose(pair.coarse[:2], run.q[-1], atol=1e-9)
 
 
