@@ -10,7 +10,7 @@ import runpy
 import shutil
 import signal
 import sys
-import zlib
+import time
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -81,6 +81,8 @@ by operation and on one thread, and does not check itself after each pass.  The 
 does not optimise either (`quick_compiler`).  `test_users_settings.py` runs tests as users compile;
 so do the release tests, and all of them with TEST_AS_USERS=1 in the environment."""
 
+STARTED = time.monotonic()
+
 MEMORY = 3 * 2**30
 """Bytes of a process from which what it has compiled is let go after a test: what is needed again
 is compiled again."""
@@ -131,26 +133,41 @@ def pytest_configure(config):
         config.pluginmanager.register(Times(ROOT / folder))
 
 
-def slow_part(test: str, parts: int) -> int:
-    """Which part of the slow tests a test belongs to, from 0; all cases of a test are in one part,
-    since they share what is compiled."""
-    return zlib.crc32(test.split("[")[0].encode()) % parts
+def file_of(item: pytest.Item) -> str:
+    """The file of a test, relative to the repository."""
+    return item.nodeid.split("::")[0]
 
 
 def pytest_collection_modifyitems(config, items):
-    """Leaves the slow tests out that are of another part than TEST_PART names: "2/8" is the third
-    of eight parts."""
-    if not (chosen := os.environ.get("TEST_PART")):
+    """With SLOW_FILES, which names files of tests, the nearest ones to a change first: leaves the
+    slow tests of other files out.
+
+    The tests of these files come in their order.  Two workers begin at both halves of the list, so
+    every second file is in its second half.
+    """
+    if (chosen := os.environ.get("SLOW_FILES")) is None:
         return
-    part, parts = (int(word) for word in chosen.split("/"))
-    other = [
+    places = {file: place for place, file in enumerate(chosen.split())}
+    left_out = {
         item
         for item in items
-        if item.get_closest_marker("slow") and slow_part(item.nodeid, parts) != part
-    ]
-    config.hook.pytest_deselected(items=other)
-    left_out = set(other)
+        if item.get_closest_marker("slow") and file_of(item) not in places
+    }
+    config.hook.pytest_deselected(items=list(left_out))
     items[:] = [item for item in items if item not in left_out]
+
+    def place(item):
+        number = places.get(file_of(item), len(places))
+        return number % 2, number
+
+    items.sort(key=place)
+
+
+def pytest_runtest_setup(item):
+    """Skips a slow test that would begin more than SLOW_MINUTES after the start."""
+    minutes = float(os.environ.get("SLOW_MINUTES", "inf"))
+    if item.get_closest_marker("slow") and time.monotonic() - STARTED > 60.0 * minutes:
+        pytest.skip(f"slow, and not begun within {minutes:g} minutes")
 
 
 @pytest.fixture(autouse=True)

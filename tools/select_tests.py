@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Prints the test files that a change reaches, or `tests` if it reaches all of them.
+"""Prints the test files that a change reaches, the nearest ones first.
 
     python3 tools/select_tests.py [BASE]
 
@@ -24,7 +24,7 @@ nodes of the graph are the names that modules define:
 
 **Other files.**  Data in the package counts as the modules of its folder.  Any other file selects
 the tests that name it, or a folder in which it is, in a text.  What is in EVERYTHING, and what
-selects no test by these rules, selects all.
+selects no test by these rules, selects all; those that it reaches are still the first.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from __future__ import annotations
 import ast
 import fnmatch
 import functools
+import math
 import os
 import re
 import subprocess
@@ -331,13 +332,15 @@ class Graph:
             if files & distances.keys()
         }
 
-    def tests_of(self, path: str) -> set[str]:
-        """The test files that a changed file reaches; empty if it is not known which."""
-        found = {*self.reaching(path)}
+    def tests_of(self, path: str) -> dict[str, float]:
+        """The test files that a changed file reaches -> how many nodes are between, at least; empty
+        if it is not known which.  A test that names the file is as near as one that uses it.
+        """
+        found: dict[str, float] = {**self.reaching(path)}
         if path in self._files:
             return found
         parts = {*Path(path).parts} - NO_NAMES
-        return found | {test for test, words in self._words.items() if names(words, parts)}
+        return {test: 1 for test, words in self._words.items() if names(words, parts)} | found
 
 
 def names(words: Iterable[str], parts: set[str]) -> bool:
@@ -461,25 +464,26 @@ class Reader(ast.NodeVisitor):
 
 
 def selected(graph: Graph, changed: Iterable[str]) -> list[str]:
-    """The test files that a change reaches, or the folder of all tests.
+    """The test files that a change reaches, the nearest ones first.
 
     Args:
       graph: the names of the working tree.
       changed: files that were changed, added or removed, relative to its root.
     """
-    found: set[str] = set()
+    distance: dict[str, float] = {}
     for path in changed:
         removed_test = re.fullmatch(r"tests/(.*/)?test_\w+\.py", path) and (
             path not in graph.paths.values()
         )
         if removed_test:
             continue
-        reached = set() if path.startswith(EVERYTHING) else graph.tests_of(path)
-        if not reached:
+        reached = graph.tests_of(path)
+        if path.startswith(EVERYTHING) or not reached:
             print(f"all tests, because of {path}", file=sys.stderr)
-            return ["tests"]
-        found |= reached
-    return sorted(found)
+            reached = dict.fromkeys(graph.distances, math.inf) | reached
+        for test, nodes in reached.items():
+            distance[test] = min(nodes, distance.get(test, math.inf))
+    return sorted(distance, key=lambda test: (distance[test], test))
 
 
 def git(*arguments: str) -> str | None:
@@ -520,10 +524,8 @@ def main() -> None:
     changed = changed_files(base) if base else None
     if changed is None:
         print("all tests, because it is not known where the change begins", file=sys.stderr)
-        print("tests")
-        return
-    graph = Graph()
-    files = selected(graph, changed)
+        changed = [EVERYTHING[0]]
+    files = selected(Graph(), changed)
     print(f"{len(changed)} files changed; {len(files)} files of tests", file=sys.stderr)
     print(*files, sep="\n")
 

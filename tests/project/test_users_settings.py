@@ -38,7 +38,8 @@ SETTINGS = "project/test_users_settings.py::test_the_testers_own_flags_come_last
 
 def plain_environment() -> dict[str, str]:
     """The environment without what this run of the tests has put into it."""
-    return {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
+    own = ("PYTEST_", "SLOW_")
+    return {name: value for name, value in os.environ.items() if not name.startswith(own)}
 
 
 def test_the_testers_own_flags_come_last():
@@ -75,7 +76,7 @@ def test_the_same_as_users_compile(what):
     done = subprocess.run(
         command,
         cwd=ROOT,
-        env=plain | {"TEST_AS_USERS": "1", "TEST_PART": ""},
+        env=plain | {"TEST_AS_USERS": "1"},
         capture_output=True,
         text=True,
         timeout=300,
@@ -84,22 +85,48 @@ def test_the_same_as_users_compile(what):
     assert f"{len(names)} passed" in done.stdout
 
 
-def slow_tests(part: str) -> set[str]:
-    """The slow tests of a file that a run with this TEST_PART has."""
-    command = [sys.executable, "-m", "pytest", "--collect-only", "-n", "0", "-m", "slow"]
+def collected(files: str | None, *options: str) -> list[str]:
+    """The tests that a run of two files has, in their order, with SLOW_FILES; None is without."""
+    command = [sys.executable, "-m", "pytest", "--collect-only", "-n", "0", "-m", "not release"]
+    paths = [str(ROOT / "tests" / "control" / name) for name in ("test_laws.py", "test_decays.py")]
     done = subprocess.run(
-        [*command, str(ROOT / "tests" / "control" / "test_laws.py")],
+        [*command, *options, *paths],
         cwd=ROOT,
-        env=plain_environment() | {"TEST_PART": part},
+        env=plain_environment() | ({} if files is None else {"SLOW_FILES": files}),
         capture_output=True,
         text=True,
         check=True,
     )
-    return {line for line in done.stdout.splitlines() if "::" in line}
+    return [line for line in done.stdout.splitlines() if "::" in line]
 
 
 @pytest.mark.slow
-def test_the_parts_of_the_slow_tests_are_disjoint_and_complete():
-    every, first, second = slow_tests(""), slow_tests("0/2"), slow_tests("1/2")
-    assert first and second and not first & second
-    assert first | second == every
+def test_a_change_runs_the_slow_tests_of_the_files_that_it_reaches():
+    """Those of the nearest file first; the default tests of all files run in any case."""
+    laws, decays = "tests/control/test_laws.py", "tests/control/test_decays.py"
+    every, chosen = collected(None), collected(decays)
+    left_out = set(every) - set(chosen)
+    assert left_out and all(test.startswith(laws) for test in left_out)
+    assert left_out == set(collected(None, "-m", "slow and not release")) & left_out
+    assert any(test.startswith(laws) for test in chosen)
+    assert collected(f"{decays} {laws}")[0].startswith(decays)
+    assert collected(f"{laws} {decays}")[0].startswith(laws)
+
+
+@pytest.mark.slow
+def test_slow_tests_that_begin_late_are_skipped():
+    """And the others run."""
+    names = "test_a_base_that_does_not_exist_is_not_known or test_changes_of_this_package"
+    done = subprocess.run(
+        [
+            *(sys.executable, "-m", "pytest", "-n", "0", "-rs", "-m", "not release", "-k", names),
+            str(ROOT / "tests" / "project" / "test_select_tests.py"),
+        ],
+        cwd=ROOT,
+        env=plain_environment() | {"SLOW_MINUTES": "0"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "slow, and not begun within 0 minutes" in done.stdout
+    assert "1 passed, 1 skipped" in done.stdout
