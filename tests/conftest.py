@@ -149,9 +149,7 @@ def pytest_collection_modifyitems(config, items):
         return
     places = {file: place for place, file in enumerate(chosen.split())}
     left_out = {
-        item
-        for item in items
-        if item.get_closest_marker("slow") and file_of(item) not in places
+        item for item in items if item.get_closest_marker("slow") and file_of(item) not in places
     }
     config.hook.pytest_deselected(items=list(left_out))
     items[:] = [item for item in items if item not in left_out]

@@ -122,7 +122,9 @@ def graph(tmp_path_factory) -> Graph:
 def names(graph: Graph, *changed: str) -> set[str] | None:
     """The tests that a change selects; None for all."""
     found = selected(graph, changed)
-    return None if len(found) == len(graph.tests) else {Path(x).stem.removeprefix("test_") for x in found}
+    if len(found) == len(graph.tests):
+        return None
+    return {Path(x).stem.removeprefix("test_") for x in found}
 
 
 USE_ALL = {"all_names", "command", "site"}
