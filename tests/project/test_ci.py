@@ -50,6 +50,7 @@ def folder(tmp_path: Path) -> Path:
         (tmp_path / name).chmod(0o755)
     (tmp_path / ".ci").mkdir()
     shutil.copy(ROOT / ".ci" / "run", tmp_path / ".ci" / "run")
+    (tmp_path / ".ci" / "tested").write_text("a_commit\n")
     command = "<!-- test command -->\n```bash\n./readme_command\n```\n"
     (tmp_path / "README.md").write_text(command)
     os.mkfifo(tmp_path / "ready")
@@ -76,6 +77,18 @@ def test_every_step_is_called(folder):
     calls = (folder / "calls").read_text().splitlines()
     for call in (NEWEST, LOSSES, TESTS_OF_NEWEST, SITE, LINT, INSTALLATION_OF_ROS, TESTS_OF_ROS):
         assert call in [line.strip() for line in calls]
+
+
+def test_the_slow_tests_are_those_that_the_change_reaches(folder):
+    (folder / "path" / "python3").write_text('#!/bin/sh\necho "reached by $*"\n')
+    (folder / "readme_command").write_text('#!/bin/sh\necho "$SLOW_FILES, $SLOW_MINUTES" > slow\n')
+    for variables, base in (
+        ({}, " a_commit"),
+        ({"BASE": "another"}, " another"),
+        ({"BASE": ""}, ""),
+    ):
+        assert ci(folder, **variables).returncode == 0
+        assert f"reached by tools/select_tests.py{base}, " in (folder / "slow").read_text()
 
 
 @pytest.mark.parametrize(
