@@ -3,10 +3,8 @@ falls back."""
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import shutil
-import stat
 import warnings
 from functools import partial
 
@@ -24,8 +22,7 @@ from iblf_jax.engine import RunRequest, compile, execute, loops, native, registr
 from iblf_jax.engine.batch import Batch
 from iblf_jax.engine.carry import Inputs, initial_carry
 from iblf_jax.engine.time_step import TimeStep
-from iblf_jax.kernels import cpu, directory, packed, toolchain
-from iblf_jax.kernels.toolchain import ToolchainError
+from iblf_jax.kernels import cpu, packed
 from iblf_jax.simulation.metrics import as_folds, standard
 from iblf_jax.simulation.scenario import canonical
 from iblf_jax.tuning.quantities import Peak, Quantities, TimeIntegral
@@ -93,7 +90,9 @@ def recorded_steps():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("family", ["g++", "clang++", "ziglang"])
+@pytest.mark.parametrize(
+    "family", ["g++", "clang++", pytest.param("ziglang", marks=pytest.mark.release)]
+)
 def test_every_compiler_gives_the_same_numbers(tmp_path, monkeypatch, recorded_steps, family):
     """Flags and pragmas suit GCC and Clang; the compilers optimise here, as a user's do."""
     if family == "ziglang":
@@ -112,30 +111,6 @@ def test_every_compiler_gives_the_same_numbers(tmp_path, monkeypatch, recorded_s
     for x, y in zip(jax.tree.leaves(fewer), jax.tree.leaves(found), strict=True):
         np.testing.assert_array_equal(x, y[2:])
     cpu.kernel.cache_clear()
-
-
-@pytest.mark.slow
-@needs_compiler
-def test_a_spline_is_looked_up():
-    times = np.linspace(0.0, 0.04, 9)
-    spline = ij.references.WaypointSpline(
-        tuple(times.tolist()), 0.5 + 0.1 * np.sin(20 * np.stack([times, times + 1], axis=1))
-    )
-    scenario, dt = (
-        canonical(dataclasses.replace(ij.presets.zhang_yan_2024(), reference=spline)),
-        jnp.asarray(1e-3),
-    )
-    varied = {k: jnp.asarray(v) for k, v in draws(3).items()}
-    request = RunRequest(1, "heun", backend="native")
-    assert execute.compile_batch(request, scenario, varied, (), dt).backend == "native"
-    requests = [RunRequest(50, "heun", 10, backend=backend) for backend in ("native", "vmap")]
-    found, expected = (
-        jax.jit(lambda s, v, request=request: execute.run_batch(s, v, (), dt, request))(
-            scenario, varied
-        )
-        for request in requests
-    )
-    assert_same(jax.tree.map(np.asarray, found), jax.tree.map(np.asarray, expected), 1e-10)
 
 
 @pytest.mark.slow
@@ -185,27 +160,6 @@ def test_a_run_that_fails_does_not_touch_the_others():
     np.testing.assert_array_equal(found.status, batch(backend="vmap", values=broken).status)
 
 
-@pytest.mark.slow
-@needs_compiler
-def test_a_sine_of_any_size_is_finite_in_a_batch():
-    scenario = canonical(ij.presets.zhang_yan_2024())
-    varied = {
-        "disturbance.phase": jnp.asarray([0.3, 1e7, 1e18]),
-        "disturbance.velocity_phase": jnp.asarray([[0.1, 0.2]] * 2 + [[3e17, 1.0]]),
-    }
-
-    def run(backend):
-        request = RunRequest(3, "euler", backend=backend)
-        f = jax.jit(
-            lambda v: execute.run_batch(scenario, v, standard(), jnp.asarray(1e-3), request)
-        )
-        return jax.tree.map(np.asarray, f(varied))
-
-    found = run("native")
-    assert not np.any(found.status & ij.Status.NOT_FINITE)
-    assert_same(found, run("vmap"), TOLERANCE["float64"])
-
-
 @needs_compiler
 def test_a_step_that_is_too_large_is_seen_by_every_backend():
     values = {
@@ -239,9 +193,7 @@ def test_one_run_and_threads():
 
 @pytest.mark.slow
 @needs_compiler
-@pytest.mark.parametrize(
-    ("runs", "dtype"), [(1, "float32"), (64, "float64"), (65, "float32"), (200, "float64")]
-)
+@pytest.mark.parametrize(("runs", "dtype"), [(1, "float64"), (65, "float32")])
 def test_leaves_become_rows_and_leaves_again(runs, dtype):
     """As by JAX's own operations, for every type and shape that a carry may have."""
     rng, leaves = np.random.default_rng(runs), []
@@ -286,17 +238,14 @@ def forget_kernels():
 
 @pytest.mark.slow
 @needs_compiler
-@pytest.mark.parametrize(
-    ("parts", "record_every"), [("functions", 100), ("calls", None), ("both", 100)]
-)
+@pytest.mark.parametrize(("parts", "record_every"), [("functions", 100), ("both", 100)])
 def test_a_long_step_is_cut_into_functions(monkeypatch, parts, record_every):
-    """Cut into pieces of fifty operations, or with its stages as calls, the numbers stay: the
+    """Cut into pieces of fifty operations, and with its stages as calls, the numbers stay: the
     places of some products with sums differ."""
     whole = batch(record_every=record_every)
-    if parts != "calls":
-        monkeypatch.setattr(thresholds, "MAX_C_FUNCTION_NODES", 0)
-        monkeypatch.setattr(thresholds, "SEGMENT_NODES", 50)
-    if parts != "functions":
+    monkeypatch.setattr(thresholds, "MAX_C_FUNCTION_NODES", 0)
+    monkeypatch.setattr(thresholds, "SEGMENT_NODES", 50)
+    if parts == "both":
         limits = thresholds.LOWERING_LIMITS._replace(written_out=10)
         monkeypatch.setattr(thresholds, "LOWERING_LIMITS", limits)
     forget_kernels()
@@ -363,39 +312,6 @@ def test_without_a_compiler_it_runs_on_vmap_with_one_warning(monkeypatch):
         warnings.simplefilter("error")
         with_fallback("auto", called.append, lambda: called.append("vmap"))
     assert called == ["vmap"] * 2
-
-
-@needs_compiler
-def test_a_compiler_that_fails_is_reported_in_one_line():
-    with pytest.raises(ToolchainError, match=r"failed: .*error") as error:
-        toolchain.built("this is not C;")
-    assert "\n" not in str(error.value)
-
-
-@needs_compiler
-def test_the_cache_is_private_and_found_again(monkeypatch, tmp_path):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    library, key = toolchain.built('extern "C" int one(void) { return 1; }')
-    folder = tmp_path / "iblf_jax"
-    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
-    assert library.name == f"{key}.so"
-    assert [p.name for p in folder.iterdir()] == [library.name], "nothing temporary stays"
-    made = library.stat().st_mtime_ns
-    assert toolchain.built('extern "C" int one(void) { return 1; }')[0].stat().st_mtime_ns == made
-    library.chmod(0o777)
-    toolchain.built('extern "C" int one(void) { return 1; }')
-    assert stat.S_IMODE(library.stat().st_mode) & 0o022 == 0, (
-        "what others could have written is built anew"
-    )
-
-
-def test_a_cache_of_someone_else_is_refused(monkeypatch, tmp_path):
-    target = tmp_path / "elsewhere"
-    target.mkdir()
-    (tmp_path / "iblf_jax").symlink_to(target)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    with pytest.raises(OSError, match="not a directory of this user"):
-        directory()
 
 
 @pytest.mark.slow
