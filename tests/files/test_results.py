@@ -155,11 +155,11 @@ def _pendulum() -> tuple[ij.Scenario, dict[str, Any]]:
     return scenario, {"plant.mass": ij.factor(ij.interval(0.99, 1.01))}
 
 
-def _proof(**options: Any) -> Any:
+@functools.cache
+def _proof() -> Any:
     scenario, masses = _pendulum()
-    return ij.prove(
-        scenario, level=0.5, parameters=masses, weight=0.01, max_boxes=2000, **options, **QUIET
-    )
+    options = {"parameters": masses, "weight": 0.01, "max_boxes": 2000}
+    return ij.prove(scenario, level=0.5, disturbance_rate=0.1, **options, **QUIET)
 
 
 def _gains() -> Any:
@@ -181,16 +181,18 @@ def _identification() -> Any:
     return ij.identify(scenario, log, ["robot.mass"])
 
 
+@functools.cache
 def _sampled() -> ij.Rollout:
     scenario = ij.with_parts(
-        ij.presets.flexible_joint_two_link(),
-        observer=ij.observers.StateObserver(bandwidth=60.0, measured=(1, 3)),
+        ij.presets.motor_driven_pendulum(),
+        observer=ij.observers.StateObserver(bandwidth=60.0, measured=(1,)),
         sampling=ij.Sampling(period=2e-3),
-        sensor=ij.sensors.Levels((ij.sensors.Direct(), None, ij.sensors.Direct(), None)),
+        sensor=ij.sensors.Levels((ij.sensors.Direct(), None, None)),
     )
     return ij.simulate(scenario, throw=False, **TIMES)
 
 
+@functools.cache
 def _many() -> ij.Rollout:
     def run(gain: jax.Array) -> ij.Rollout:
         return ij.simulate(ij.with_parameters(PAPER, {"controller.K2": gain}), **TIMES)
@@ -202,7 +204,7 @@ EXAMPLES: dict[str, tuple[Callable[[], Any], ...]] = {
     "WorstCase": (lambda: ij.falsify(PAPER, MASS, starts=2, iterations=2, **TIMES, **QUIET),),
     "Certificate": (
         lambda: _certificate(PAPER),
-        lambda: _certificate(ij.presets.flexible_joint_two_link()),
+        lambda: _certificate(ij.presets.motor_driven_pendulum()),
     ),
     "Comparison": (lambda: ij.compare(PAPER, laws=("integral", "log"), **TIMES),),
     "Counterexample": (
@@ -228,8 +230,8 @@ EXAMPLES: dict[str, tuple[Callable[[], Any], ...]] = {
     "Identification": (_identification,),
     "OneRun": (lambda: _study()[3],),
     "Probability": (lambda: _study().violation_probability,),
-    "Proof": (_proof, functools.partial(_proof, disturbance_rate=0.1)),
-    "Rollout": (lambda: ij.simulate(PAPER, **TIMES), _many, _sampled),
+    "Proof": (_proof,),
+    "Rollout": (_many, _sampled),
     "Sensitivity": (
         lambda: ij.sensitivity(PAPER, MASS, output="rmse", points=8, **TIMES, **QUIET),
     ),
@@ -290,7 +292,7 @@ def test_a_loaded_result_replays_its_runs(tmp_path):
 
 @pytest.mark.slow
 def test_a_loaded_proof_finds_its_problem(tmp_path):
-    proof = _proof(disturbance_rate=0.1)
+    proof = _proof()
     assert proof.problem.names  # Now the proof keeps the problem, which no file can hold.
     proof.save(tmp_path / "proof")
     again = ij.load(tmp_path / "proof")
