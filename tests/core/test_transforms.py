@@ -445,13 +445,6 @@ def test_a_run_alone_falls_back_where_its_kernel_cannot_be_built(paper, tmp_path
     np.testing.assert_array_equal(ij.simulate(paper, **short, backend="native").q, expected.q)
 
 
-@pytest.mark.slow
-def test_the_same_run_twice_is_bit_identical(paper, short_run):
-    again = ij.simulate(paper, **SHORT)
-    for name in ("q", "tau", "V"):
-        np.testing.assert_array_equal(getattr(again, name), getattr(short_run, name))
-
-
 def test_no_warning_on_a_good_run(paper):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
