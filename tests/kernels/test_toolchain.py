@@ -603,7 +603,6 @@ UNUSABLE = {
     "a name too long": a_name_too_long,
     "read-only": nothing_fits(30),
     "no inodes": nothing_fits(28),
-    "quota": nothing_fits(122),
     "full at the last write": no_room_to_write,
 }
 
