@@ -38,10 +38,7 @@ def between(low, high):
     return ij.value(ij.uniform(low, high))
 
 
-VARIANTS = (
-    ("corrected", "printed", "float32"),
-    ("printed", "momentum", "float64"),
-)
+VARIANTS = (("corrected", "printed", "float32"), ("printed", "momentum", "float64"))
 BARRIERS = {
     "integral": ij.barriers.Integral(),
     "log_p2": ij.barriers.Log(p=2),
@@ -1102,10 +1099,7 @@ def test_search_returns_what_can_be_run():
 def test_search_refuses_perturbations_without_a_start(paper):
     cases = (
         ({"initial.q": between(1.1, 1.2)}, "start inside the bounds"),
-        (
-            {"robot.mass": between(-2.0, -1.0)},
-            "positive",
-        ),
+        ({"robot.mass": between(-2.0, -1.0)}, "positive"),
     )
     for perturbations, words in cases:
         with pytest.raises(

@@ -174,13 +174,7 @@ def test_an_integral_barrier_gives_an_inequality():
 
 def drift(t, x):
     """A pendulum with a motor."""
-    return jnp.stack(
-        [
-            -0.3 * jnp.sin(x[0]),
-            -x[1] - 2.0 * jnp.sin(x[0]),
-            -0.5 * x[2] - 0.2 * x[1],
-        ]
-    )
+    return jnp.stack([-0.3 * jnp.sin(x[0]), -x[1] - 2.0 * jnp.sin(x[0]), -0.5 * x[2] - 0.2 * x[1]])
 
 
 def gain(t, x):

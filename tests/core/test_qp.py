@@ -43,11 +43,7 @@ def elsewhere(H, g, G, h):
 
 
 @pytest.mark.parametrize(
-    ("n", "m", "count"),
-    [
-        (2, 8, 300),
-        pytest.param(7, 30, 500, marks=pytest.mark.slow),
-    ],
+    ("n", "m", "count"), [(2, 8, 300), pytest.param(7, 30, 500, marks=pytest.mark.slow)]
 )
 def test_random_programs_have_the_solution_of_a_maintained_solver(n, m, count, rng):
     H, G, h = random_programs(rng, count, n, m)

@@ -30,9 +30,7 @@ from iblf_jax.identification.log import read
 from iblf_jax.identification.replay import inverse_dynamics
 from iblf_jax.identification.shooting import ShootingProblem, windows
 from iblf_jax.identification.smoothing import smooth_logs
-from iblf_jax.identification.standstill import (
-    free_torques_at_standstill,
-)
+from iblf_jax.identification.standstill import free_torques_at_standstill
 from iblf_jax.reports import shown
 from iblf_jax.simulation.scenario import canonical
 

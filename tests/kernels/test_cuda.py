@@ -98,10 +98,7 @@ def runs_here(monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "dtype",
-    [
-        "float64",
-        pytest.param("float32", marks=pytest.mark.skipif(not ON_A_GPU, reason="no GPU")),
-    ],
+    ["float64", pytest.param("float32", marks=pytest.mark.skipif(not ON_A_GPU, reason="no GPU"))],
 )
 def test_a_batch_agrees_with_the_reference(dtype, runs_here):
     """37 runs are two blocks, the second not full; 200 steps are four launches, the last not

@@ -126,10 +126,9 @@ def test_a_damaged_kernel_is_built_again(library, damage):
     assert toolchain._checked(library) is None, "the damage is seen"
     assert value() == 41
     assert toolchain._checked(library) is not None
-    assert sorted(x.suffix for x in library.parent.iterdir()) == [
-        ".so",
-        ".so",
-    ], "nothing temporary stays"
+    assert sorted(x.suffix for x in library.parent.iterdir()) == [".so", ".so"], (
+        "nothing temporary stays"
+    )
     assert stat.S_IMODE(library.stat().st_mode) == 0o700
 
 
