@@ -604,41 +604,6 @@ def test_members_of_any_number_of_joints(family):
     check(member_of(per_joint(n)))
 
 
-@pytest.mark.parametrize("n", [1, 3])
-def test_the_number_of_joints_is_that_of_the_leaves(n):
-    from iblf_jax.testing.joints import joints_of, scenario_of
-
-    assert joints_of(VoltageMotor(R=per_joint(n))) == n
-    assert (
-        joints_of(
-            ij.controllers.Saturated(ij.controllers.PDGravity(Kp=per_joint(n), Kd=1.0), limit=2.0)
-        )
-        == n
-    )
-    assert joints_of(PlainLaw(jnp.asarray(per_joint(n)))) == n
-    assert (
-        joints_of(
-            ij.disturbances.Sum(
-                (ij.disturbances.Step(size=per_joint(n), time=1.0), ij.disturbances.Friction())
-            )
-        )
-        == n
-    )
-    # Coordinates of the tip, and waypoints, are not one number per joint.
-    assert joints_of(ij.disturbances.TipForce(amplitude=[1.0, 2.0, 3.0])) == 2
-    scenario = scenario_of(n)
-    assert scenario.n == n
-    tube = scenario.context.tube(jnp.asarray(0.0))
-    assert bool(
-        jnp.all(
-            (tube.lower < tube.q_d)
-            & (tube.q_d < tube.upper)
-            & (tube.lower < 0.8)
-            & (tube.upper > 0.8)
-        )
-    )
-
-
 def test_leaves_of_different_numbers_of_joints_are_a_finding():
     rejects(
         ij.testing.check_actuator,
