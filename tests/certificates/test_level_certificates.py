@@ -553,6 +553,7 @@ def test_a_search_for_counterexamples_finds_one_of_a_wrong_law_only():
         counterexample(double_integrator(TwoLevels()), start)
 
 
+@pytest.mark.slow
 def test_the_figure_has_a_panel_for_every_level(undisturbed):
     figure = undisturbed.plot(until=1.5)
     labels = [axes.get_ylabel() for axes in figure.axes]
