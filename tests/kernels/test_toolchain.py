@@ -492,7 +492,7 @@ import jax.numpy as jnp
 jnp.ones(3) + 1.0  # something of the user's that JAX has compiled before
 import iblf_jax as ij
 print(repr(jax.config.jax_compilation_cache_dir), end=" ")
-ij.simulate(ij.presets.zhang_yan_2024(), duration=0.1, dt=1e-3)
+ij.simulate(ij.presets.zhang_yan_2024(), duration=0.05, dt=1e-3)
 print(repr(jax.config.jax_compilation_cache_dir), [sum(e.endswith(x) for e in events) for x in ("cache_hits", "cache_misses")])
 """
 
