@@ -34,7 +34,7 @@ from compared_texts import same_row
 import iblf_jax as ij
 
 FILE = TESTS / "data" / "certificates.txt"
-RUN: dict[str, Any] = {"duration": 0.08, "dt": 1e-3, "method": "euler"}
+RUN: dict[str, Any] = {"duration": 0.1, "dt": 1e-3, "method": "euler"}
 HEADING = "=== "
 QUICK = ("printed gap, printed", "own claim, order 2, that fails")
 """Cases of the default tests."""

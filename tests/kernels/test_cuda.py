@@ -132,7 +132,7 @@ def test_a_batch_agrees_with_the_reference(dtype, runs_here):
 @needs_compiler
 @pytest.mark.slow
 def test_one_run_is_the_run(runs_here, paper):
-    timing = {"duration": 0.06, "dt": 1e-3, "method": "heun", "record_every": 10}
+    timing = {"duration": 0.06, "dt": 4e-4, "method": "heun", "record_every": 10}
     one, other = (ij.simulate(paper, **timing, backend=backend) for backend in ("gpu", "vmap"))
     np.testing.assert_allclose(one.tau, other.tau, rtol=0, atol=1e-9)
 

@@ -119,7 +119,8 @@ def test_program_and_kernel_do_what_the_step_does(name, monkeypatch):
     operation of either."""
     scenario = canonical(scenarios()[name]())
     dt, index = jnp.asarray(DT), jnp.int32(3)
-    varied = {"initial.q": scenario.initial.q + jnp.asarray([[0.0], [0.01], [-0.02]])}
+    starts = scenario.initial.q + jnp.asarray([[0.0], [0.01], [-0.02]])
+    varied = {"initial.q": starts, "plant.mass[1]": jnp.asarray([0.9, 0.7, 0.8])}
     whole, step = Inputs(scenario, STANDARD, dt, jnp.asarray(10.0)), TimeStep("heun")
     run, carries = Batch.of(whole, varied), carry_of(whole, varied, "heun")
     carry = jax.tree.map(lambda x: np.asarray(x)[0], carries)
