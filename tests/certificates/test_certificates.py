@@ -6,7 +6,6 @@ from __future__ import annotations
 import dataclasses
 import json
 from functools import partial
-from types import SimpleNamespace
 from typing import ClassVar
 
 import jax
@@ -25,9 +24,12 @@ from iblf_jax.certificates.eigenvalues import eigenvalues_over
 from iblf_jax.certificates.lines import Role, Statement
 from iblf_jax.certificates.summary import restarts, summarise
 from iblf_jax.certificates.terms import rounding
-from iblf_jax.simulation.closed_loop import LoopState, initial_state
+from iblf_jax.simulation.closed_loop import initial_state
 from iblf_jax.simulation.scenario import canonical
 from iblf_jax.studies.perturbation_cube import unit_cube
+
+OWN = {"duration": 0.08, "dt": 1e-3, "method": "euler"}
+"""A run whose length does not matter; so few steps need one kernel, not two."""
 
 
 def between(low, high):
@@ -35,22 +37,15 @@ def between(low, high):
     return ij.value(ij.uniform(low, high))
 
 
-VARIANTS = (
-    ("corrected", "momentum", "float64"),
-    ("printed", "printed", "float32"),
-    ("corrected", "printed", "float32"),
-    ("printed", "momentum", "float64"),
-)
+VARIANTS = (("corrected", "printed", "float32"), ("printed", "momentum", "float64"))
 BARRIERS = {
     "integral": ij.barriers.Integral(),
-    "log_p2": pytest.param(ij.barriers.Log(p=2), marks=pytest.mark.slow),
+    "log_p2": ij.barriers.Log(p=2),
     "tan": ij.barriers.Tan(),
-    "state": pytest.param(ij.barriers.StateBarrier(), marks=pytest.mark.slow),
-    "prescribed_performance": pytest.param(
-        ij.barriers.PrescribedPerformance(), marks=pytest.mark.slow
-    ),
-    "mapping": pytest.param(ij.barriers.TransformedError(), marks=pytest.mark.slow),
-    "quadratic": pytest.param(ij.barriers.Quadratic(), marks=pytest.mark.slow),
+    "state": ij.barriers.StateBarrier(),
+    "prescribed_performance": ij.barriers.PrescribedPerformance(),
+    "mapping": ij.barriers.TransformedError(),
+    "quadratic": ij.barriers.Quadratic(),
 }
 
 
@@ -154,14 +149,12 @@ def test_inequality_is_an_equality_where_the_proof_leaves_nothing():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name", [x if x == "integral" else pytest.param(x, marks=pytest.mark.slow) for x in BARRIERS]
-)
+@pytest.mark.parametrize("name", ["integral", "tan", "quadratic"])
 def test_the_claim_with_weights_holds_at_every_state_for_every_positive_gain(name):
     """(W.1) with any a, b and w_f, at gains far below Theorem 2's conditions and at any weights of
     the barriers."""
-    rng, barrier = np.random.default_rng(5), getattr(BARRIERS[name], "values", [BARRIERS[name]])[0]
-    batch, t, state = random_loops(loop(barrier=barrier), 5, states=1024, speed=30.0, weighted=True)
+    rng, scenario = np.random.default_rng(5), loop(barrier=BARRIERS[name])
+    batch, t, state = random_loops(scenario, 5, states=1024, speed=30.0, weighted=True)
     proof = jax.tree.map(np.asarray, terms_of(batch, t, state))
     K2, kf = np.asarray(batch.controller.K2), np.asarray(batch.observer.kf)
     assert np.mean(np.any(K2 < 0.5, axis=1) & np.any(kf < 0.5, axis=1)) > 0.4
@@ -328,8 +321,6 @@ CALM = {"disturbance.acceleration_amplitude": 0.0, "disturbance.velocity_amplitu
 @pytest.mark.parametrize(
     "changes",
     [
-        {"controller.K2": 0.6, "observer.kf": 1.1, "initial.dq": [2.0, -2.0]},
-        {"plant.mass": [2.6, 0.5], "plant.payload": 0.4},
         {
             "plant.mass[1]": 1.2,
             "controller.k1": 8.0,
@@ -338,7 +329,7 @@ CALM = {"disturbance.acceleration_amplitude": 0.0, "disturbance.velocity_amplitu
         },
         CALM | {"initial.dq": [3.0, 1.0]},
     ],
-    ids=["low gains", "another plant", "several", "no disturbance"],
+    ids=["several", "no disturbance"],
 )
 def test_corrected_holds_on_other_runs(corrected_run, changes):
     scenario = ij.with_parameters(corrected_run.scenario, changes)
@@ -404,12 +395,6 @@ def test_with_the_papers_weights_its_own_conditions_decide(corrected_run):
     assert alone.headline == 'fails in "K2"'
 
 
-def test_the_claim_with_weights_is_about_the_corrected_law_with_a_momentum_observer(
-    paper_certificate,
-):
-    assert not [line.name for line in paper_certificate.lines if line.name.startswith("weighted")]
-
-
 def test_a_broken_claim_with_weights_is_seen(corrected_run, monkeypatch):
     """With a rate that is too large the inequality fails where the right one holds."""
     best = weighted.best_constants
@@ -425,10 +410,10 @@ def test_a_broken_claim_with_weights_is_seen(corrected_run, monkeypatch):
     assert "the claim with weights holds" not in certificate.headline
 
 
-@pytest.mark.parametrize("weight", [[0.3, 2.5], [40.0, 7.0]])
-def test_the_papers_claim_scales_with_the_weights(corrected_run, weight):
+def test_the_papers_claim_scales_with_the_weights(corrected_run):
     """V1 = sum w_i V1_i in every line: the inequality, the envelope, and xi by the barrier of its
     own joint."""
+    weight = [0.3, 2.5]
     scenario = ij.with_parameters(corrected_run.scenario, {"controller.weight": weight})
     run = ij.simulate(scenario, **SHORT)
     certificate = certify(scenario, run)
@@ -637,37 +622,14 @@ def test_f_is_constant_only_where_nothing_that_changes_is_left_in_it(changes, st
     assert not there.claims["torque"].steady
 
 
-def pendulum(**changes):
-    """An arm of one joint."""
-    body = {
-        "mass": [1.3],
-        "centre": [[0.2, 0, 0]],
-        "inertia": [[0.01, 0.02, 0.02, 0, 0, 0]],
-        "position": [[0, 0, 0]],
-    }
-    return ij.robots.Arm(**body, tip_position=[0.4, 0, 0], g=[0, -9.81, 0], **changes)
-
-
-LOAD = {"carried": ij.robots.Payload(mass=0.5, start=0.1, rise=0.2)}
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "changes",
-    [{"damping": 0.5, "friction": 0.3}, pytest.param(LOAD, marks=pytest.mark.release)],
-    ids=["friction", "load"],
-)
-def test_one_arm_with_friction_or_a_load_is_case_2(changes):
-    scenario = one_joint(pendulum(**changes))
-    certificate = certify(scenario, duration=0.5, method="euler")
+def test_friction_of_one_robot_is_case_2():
+    scenario = one_joint(Growing(mass=[1.3], damping=0.5))
+    certificate = certify(scenario, **OWN)
     assert certificate.holds
     assert certificate.numbers["case"] == 2
-    apart = certify(
-        dataclasses.replace(scenario, model=pendulum(**changes)), duration=0.5, method="euler"
-    )
-    assert_alike(apart, certificate)
-    # The same physics with a model that has neither.
-    bare = certify(dataclasses.replace(scenario, model=pendulum()), duration=0.5, method="euler")
+    # The same physics with a model that has none.
+    bare = certify(ij.with_parameters(scenario, {"model.damping": 0.0}), **OWN)
     assert bare.numbers["F_d"] == pytest.approx(certificate.numbers["F_d"], rel=1e-9)
     assert bare.holds
 
@@ -676,17 +638,11 @@ def test_one_arm_with_friction_or_a_load_is_case_2(changes):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["PDGravity", pytest.param("NoObserver", marks=pytest.mark.slow)])
-def test_no_claim_is_not_applicable(paper, name):
-    law = ij.controllers.PDGravity(Kp=60.0, Kd=20.0) if name == "PDGravity" else paper.controller
-    certificate = certify(
-        dataclasses.replace(paper, controller=law, observer=ij.observers.NoObserver()),
-        duration=0.5,
-        method="euler",
-    )
+def test_no_claim_is_not_applicable(paper):
+    certificate = certify(dataclasses.replace(paper, observer=ij.observers.NoObserver()), **OWN)
     assert certificate.verdict == "not applicable"
     assert not certificate.holds
-    assert name in certificate["inequality, case 2"].note
+    assert "NoObserver" in certificate["inequality, case 2"].note
     assert {line.verdict for line in certificate.lines} == {"holds", "not applicable"}
     json.dumps(certificate.to_dict(), allow_nan=False)
 
@@ -735,9 +691,6 @@ class Passive:
         return self.share * jnp.sum(self.K * (de**2 + (self.slope * e) ** 2)) + jnp.where(
             t > 0.05, self.late, 0.0
         )
-
-
-OWN = {"duration": 0.1, "dt": 1e-3, "method": "euler"}
 
 
 @pytest.fixture(scope="module")
@@ -926,8 +879,9 @@ class PassiveWithTerms(PassiveOfLevels):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("is_limited", [False, True])
-@pytest.mark.parametrize("kind", [PassiveOfLevels, PassiveWithTerms])
+@pytest.mark.parametrize(
+    ("kind", "is_limited"), [(PassiveOfLevels, True), (PassiveWithTerms, False)]
+)
 def test_a_law_of_x_on_a_robot_has_its_uncertain_term_in_the_rates(own, kind, is_limited):
     law = kind(own.controller)
     if is_limited:
@@ -937,8 +891,6 @@ def test_a_law_of_x_on_a_robot_has_its_uncertain_term_in_the_rates(own, kind, is
     assert line.verdict == "holds"
     assert abs(line.margin) <= line.tolerance < 1e-10
     assert ("what the law states" in line.statement) == (kind is PassiveWithTerms)
-    if not is_limited:
-        ij.testing.check_law(law, scenario=scenario)
 
 
 @pytest.mark.release
@@ -953,7 +905,7 @@ def test_where_an_own_claim_is_not_made(own):
         dataclasses.replace(own, controller=ij.controllers.Saturated(law=law, limit=[8.0, 1.0])),
         **OWN,
     )
-    assert 0 < cut.numbers["samples_left_out"] < 101
+    assert 0 < cut.numbers["samples_left_out"] < 81
     assert cut["inequality, own V"].verdict == "holds"
     lagging = certify(dataclasses.replace(own, actuator=ij.actuators.Motor(bandwidth=200.0)), **OWN)
     assert lagging.verdict == "not applicable"
@@ -986,13 +938,6 @@ def test_saturated_samples_are_left_out(corrected_run):
     assert certificate["inequality, case 2"].verdict == "holds"
     assert f"{left_out} of 2001 samples are excluded" in certificate["inequality, case 2"].note
     assert np.all(np.isnan(certificate.traces.envelope[certificate.traces.excluded]))
-
-
-def test_a_run_that_failed_is_not_judged(corrected_run):
-    run = dataclasses.replace(corrected_run, status=jnp.int32(int(ij.Status.STEP_TOO_LARGE)))
-    certificate = certify(run.scenario, run)
-    assert certificate["inequality, case 2"].verdict == "not applicable"
-    assert "too large" in certificate["inequality, case 2"].note
 
 
 def test_wrong_arguments_are_named(paper, corrected_run):
@@ -1045,50 +990,21 @@ def test_batch_reports_the_worst_run(corrected_run, batch, corrected_certificate
     assert f"worst {sound.worst_run}" in repr(sound)
 
 
-class Study(ij.Study):
-    """A study of known runs."""
-
-    duration = dt = 1.0
-
-    def __init__(self, scenario, known):
-        members = {"scenario": scenario, "metrics": known.metrics, "status": known.status}
-        vars(self).update(members, known=known, replayed=[])
-
-    def __len__(self):
-        return len(self.known)
-
-    def replay(self, index):
-        self.replayed.append(index)
-        return self.known[index]
-
-
 @pytest.mark.slow
-def test_study_is_judged_at_its_worst_runs(corrected_run, batch):
-    study = Study(corrected_run.scenario, batch)
-    nearest = int(np.argmin(np.min(np.asarray(batch.metrics.xi_margin), axis=1)))
-    certificate = certify(corrected_run.scenario, study, worst=1)
-    assert study.replayed == [nearest]
-    assert certificate.runs == (nearest,)
-    assert certify(study.scenario, study, worst=None).runs == (0, 1, 2)
-
-
-@pytest.mark.slow
-def test_study_of_another_scenario_is_refused(corrected_run):
+def test_a_study_is_judged_at_its_worst_runs_under_its_own_scenario(corrected_run):
     scenario = corrected_run.scenario
     perturbed = {"plant.mass": ij.factor(ij.uniform(0.9, 1.1))}
-    study = ij.monte_carlo(scenario, perturbed, runs=2, duration=0.01)
-    assert certify(scenario, study, worst=1).runs
+    study = ij.monte_carlo(scenario, perturbed, runs=3, duration=0.08)
+    nearest = int(np.argmin(np.min(np.asarray(study.metrics.xi_margin), axis=1)))
+    assert certify(scenario, study, worst=1).runs == (nearest,)
+    assert certify(scenario, study, worst=None).runs == (0, 1, 2)
+    with pytest.raises(ValueError, match=r"got 'Study'.*certify\(scenario, study\)"):
+        certify(study)
     stiffer = ij.with_parameters(scenario, {"controller.K2": 2 * scenario.controller.K2})
     with pytest.raises(ValueError, match="a run of a scenario with other numbers"):
         certify(stiffer, study)
     with pytest.raises(ValueError, match="a run of another kind of scenario"):
         certify(ij.presets.zhang_yan_2024(law="log"), study)
-
-
-def test_a_study_in_place_of_the_scenario_is_refused_with_the_right_call():
-    no_runs = SimpleNamespace(metrics={}, status=())
-    with pytest.raises(ValueError, match=r"got 'Study'.*certify\(scenario, study\)"):
-        certify(Study(None, no_runs))
 
 
 # --- the gap --------------------------------------------------------------------------------------
@@ -1138,26 +1054,22 @@ def test_search_finds_the_gap_of_the_printed_law_only():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "perturbations",
-    [
-        {"initial.q": between(0.2, 1.2), "initial.dq": between(-4.0, 4.0)},
-        {"robot.mass": between(-1.0, 2.0)},
-    ],
-)
-def test_search_returns_what_can_be_run(perturbations):
+def test_search_returns_what_can_be_run():
+    """Of a cube with starts outside the bounds and with masses that are not positive."""
+    perturbations = {
+        "initial.q": between(0.2, 1.2),
+        "initial.dq": between(-4.0, 4.0),
+        "robot.mass": between(-1.0, 2.0),
+    }
     found = counterexample(ij.presets.printed_gap(), perturbations, starts=3)
     assert np.isfinite(found.growth)
-    assert not certify(found.scenario, ij.simulate(found.scenario, **SHORT)).traces.excluded[0]
+    assert not certify(found.scenario, ij.simulate(found.scenario, **OWN)).traces.excluded[0]
 
 
 def test_search_refuses_perturbations_without_a_start(paper):
     cases = (
         ({"initial.q": between(1.1, 1.2)}, "start inside the bounds"),
-        (
-            {"robot.mass": between(-2.0, -1.0)},
-            "positive",
-        ),
+        ({"robot.mass": between(-2.0, -1.0)}, "positive"),
     )
     for perturbations, words in cases:
         with pytest.raises(
@@ -1196,23 +1108,9 @@ def test_a_tuple_in_place_of_a_perturbation_is_refused_with_the_perturbation(pap
 
 @pytest.mark.slow
 def test_certificate_shows_itself(paper_certificate):
-    text = repr(paper_certificate)
-    assert text.startswith("Certificate: holds")
-    for words in (
-        "(3.17)",
-        "(3.25)",
-        "(3.27)",
-        "(3.26)",
-        "(3.28)",
-        "(3.31)",
-        "Assumption 2",
-        "t = 7.629 s",
-    ):
-        assert words in text
+    assert repr(paper_certificate).startswith("Certificate: holds")
     assert "<table>" in paper_certificate._repr_html_()
-    assert (
-        json.loads(json.dumps(paper_certificate.to_dict(), allow_nan=False))["verdict"] == "holds"
-    )
+    assert paper_certificate.to_dict()["verdict"] == "holds"
     with pytest.raises(KeyError, match="envelope, case 1"):
         paper_certificate["envelopes"]
 
@@ -1224,9 +1122,3 @@ def test_certificate_draws_itself(paper_certificate):
     assert len(figure.axes) == 6
     with pytest.raises(ValueError, match="until"):
         paper_certificate.plot(until=1e-6)
-
-
-def test_state_is_all_that_the_terms_need(paper_run):
-    state = LoopState(paper_run.x[7], (), paper_run.observer_state[7])
-    seen = jax.jit(terms_at)(paper_run.scenario, paper_run.t[7], state)
-    np.testing.assert_allclose(seen.V, paper_run.V[7], rtol=1e-10)

@@ -23,20 +23,8 @@ from iblf_jax.simulation.closed_loop import evaluate
 from iblf_jax.world import plants
 
 MAPPING, PERFORMANCE = ij.barriers.TransformedError(), ij.barriers.PrescribedPerformance()
-DESIGNS = {
-    "mapping, order 2": (2, MAPPING),
-    "mapping, order 3": (3, MAPPING),
-    "mapping, order 4": (4, MAPPING),
-    "prescribed performance, order 2": (2, PERFORMANCE),
-    "prescribed performance, order 3": (3, PERFORMANCE),
-    "prescribed performance, order 4": (4, PERFORMANCE),
-}
-SLOW, RELEASE = pytest.mark.slow, pytest.mark.release
-MARKS = {
-    "mapping, order 2": (),
-    "prescribed performance, order 2": SLOW,
-}
-"""The others compile for minutes and run before a release."""
+RUN = {"duration": 0.4, "dt": 5e-3}
+"""A run whose length does not matter; so few steps need one kernel, not two."""
 
 
 def lyapunov(scenario, t, x, d_hat):
@@ -108,11 +96,14 @@ def both_sides(scenario, seed):
     return left, right, terms
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("design", [pytest.param(x, marks=MARKS.get(x, RELEASE)) for x in DESIGNS])
-def test_both_sides_of_the_claim_are_equal(design):
-    order, barrier = DESIGNS[design]
-    scenario = random_scenario(order, (barrier,) * order, seed=order)
+@pytest.mark.parametrize(
+    "order",
+    [pytest.param(2, marks=pytest.mark.slow)]
+    + [pytest.param(order, marks=pytest.mark.release) for order in (3, 4)],
+)
+def test_both_sides_of_the_claim_are_equal(order):
+    barriers = (MAPPING, PERFORMANCE, MAPPING, PERFORMANCE)[:order]
+    scenario = random_scenario(order, barriers, seed=order)
     left, right, terms = both_sides(scenario, order)
     claim, estimate = terms.claims["levels"], terms.claims["estimate"]
     assert np.all(np.abs(left - right) <= 1e-10 * np.max(np.abs(left)))
@@ -131,15 +122,17 @@ def test_both_sides_of_the_claim_are_equal(design):
     )
 
 
-def state_sides(points, nearest, widths=None, monkeypatch=None):
-    """V' of a law with `StateBarrier` on both levels of a plant with coupled gains: by compiled
-    differentiation, by the same operations one by one, and by the claim with the exact decay
-    k e s; and whether alpha_1 is outside the bounds of level 2."""
-    if widths is not None:
-        monkeypatch.setattr(random_plants, "tube_widths", lambda order: np.array(widths))
-    monkeypatch.setattr(random_plants, "STATES", points)
+@pytest.mark.slow
+def test_an_alpha_outside_its_bounds_is_the_only_cause_of_wrong_digits(monkeypatch):
+    """A width of 1e-6 replaces that of the tube there, and rounding decides the derivative: a
+    compiled one and that of single operations differ, as was once reported for 12 of 400 points.
+    Elsewhere both are those of the claim, which for this barrier has the exact decay k e s.
+    """
+    narrow = np.array([(1.5, 2.5), (4.0, 6.0)])
+    monkeypatch.setattr(random_plants, "tube_widths", lambda order: narrow)
+    monkeypatch.setattr(random_plants, "STATES", 2000)
     scenario = random_scenario(2, (ij.barriers.StateBarrier(),) * 2, seed=2)
-    t, state = random_states(scenario, 2, nearest=nearest)
+    t, state = random_states(scenario, 2, nearest=0.6)
     law = scenario.controller
 
     def exact(t, state):
@@ -161,29 +154,12 @@ def state_sides(points, nearest, widths=None, monkeypatch=None):
     claim, outside = jax.tree.map(np.asarray, jax.jit(jax.vmap(exact))(t, state))
     with jax.disable_jit():
         one_by_one = np.asarray(jax.vmap(derivative)(t, state))
-    return compiled, one_by_one, claim, outside
-
-
-@pytest.mark.slow
-def test_the_derivative_with_state_on_all_levels_is_right_where_alpha_is_inside(monkeypatch):
-    compiled, one_by_one, claim, outside = state_sides(4000, 0.9, monkeypatch=monkeypatch)
-    assert not np.any(outside)
-    size = np.abs(claim) + np.median(np.abs(claim))
-    assert np.max(np.abs(compiled - one_by_one) / size) < 1e-11
-    assert np.max(np.abs(compiled - claim) / size) < 1e-10
-
-
-@pytest.mark.slow
-def test_an_alpha_outside_its_bounds_is_the_only_cause_of_wrong_digits(monkeypatch):
-    """A width of 1e-6 replaces that of the tube there, and rounding decides the derivative: a
-    compiled one and that of single operations differ, as was once reported for 12 of 400 points.
-    """
-    narrow = [(1.5, 2.5), (4.0, 6.0)]
-    compiled, one_by_one, _, outside = state_sides(2000, 0.6, narrow, monkeypatch)
     assert 10 < np.sum(outside) < 1900
     difference = np.abs(compiled - one_by_one) / np.abs(one_by_one)
     assert np.max(difference[~outside]) < 1e-9
     assert np.max(difference[outside]) > 1e-9
+    size = np.abs(claim) + np.median(np.abs(claim[~outside]))
+    assert np.max((np.abs(compiled - claim) / size)[~outside]) < 1e-9
 
 
 @pytest.mark.slow
@@ -193,46 +169,12 @@ def test_an_integral_barrier_gives_an_inequality():
     assert np.all(left < right)
 
 
-@pytest.mark.release
-def test_a_mixed_design_of_order_three_keeps_the_inequality():
-    # The kink of the slope at e_1 = 0 makes u jump there, so that the law refuses this barrier in a
-    # scenario; at other states its functions have the claim.
-    scenario = random_scenario(3, (MAPPING,) * 3, seed=6)
-    law = scenario.controller
-    width = 1.5 * 2.5
-    mixed = ij.controllers.BarrierBackstepping(
-        k=law.k,
-        barriers=(ij.barriers.Integral(), MAPPING, MAPPING),
-        c=law.c,
-        weights=law.weights.at[0].multiply(width),
-    )
-    with pytest.raises(ValueError, match=r"barriers\[0\]"):
-        mixed.check_start(scenario.context)
-    scenario = replaced(scenario, controller=mixed)
-    left, right, _ = both_sides(scenario, 6)
-    assert np.all(left < right)
-
-
-def replaced(scenario, **parts):
-    """A scenario with other parts, unchecked."""
-    copy = object.__new__(type(scenario))
-    for field in dataclasses.fields(scenario):
-        object.__setattr__(copy, field.name, parts.get(field.name, getattr(scenario, field.name)))
-    return copy
-
-
 # --- runs -----------------------------------------------------------------------------------------
 
 
 def drift(t, x):
     """A pendulum with a motor."""
-    return jnp.stack(
-        [
-            -0.3 * jnp.sin(x[0]),
-            -x[1] - 2.0 * jnp.sin(x[0]),
-            -0.5 * x[2] - 0.2 * x[1],
-        ]
-    )
+    return jnp.stack([-0.3 * jnp.sin(x[0]), -x[1] - 2.0 * jnp.sin(x[0]), -0.5 * x[2] - 0.2 * x[1]])
 
 
 def gain(t, x):
@@ -298,7 +240,7 @@ def test_without_disturbance_V_decays_at_its_rate(undisturbed):
 @pytest.mark.slow
 @pytest.mark.parametrize("signal", ["e", "level_lower", "level_upper"])
 def test_a_run_with_an_altered_signal_of_the_third_level_is_refused(signal):
-    run = ij.simulate(pendulum(), duration=0.1, dt=2e-3)
+    run = ij.simulate(pendulum(), **RUN)
     altered = getattr(run, signal).at[7, 2, 0].add(1e-3)
     with pytest.raises(ValueError, match=rf"^run.*{signal} of sample 7.*Simulate it again"):
         certify(run.scenario, dataclasses.replace(run, **{signal: altered}))
@@ -326,12 +268,12 @@ def test_a_disturbed_run_has_the_true_terms():
 @pytest.mark.slow
 def test_an_observer_states_kappa_and_a_wrong_one_fails():
     observer = ij.observers.LevelObserver(gain=(20.0, 20.0, 20.0))
-    certificate = certify(pendulum(disturbance=DISTURBANCES, observer=observer), duration=1.0)
+    certificate = certify(pendulum(disturbance=DISTURBANCES, observer=observer), **RUN)
     assert certificate.holds
     assert certificate["estimate"].verdict == "holds"
     assert np.all(certificate.numbers["d_tilde_largest"] < certificate.numbers["d_largest"])
     wrong = pendulum(disturbance=DISTURBANCES, observer=WrongObserver(gain=20.0))
-    certificate = certify(wrong, duration=1.0)
+    certificate = certify(wrong, **RUN)
     assert certificate["estimate"].verdict == "fails"
     assert not certificate.holds
     # (S.3) is evaluated with the true rate of the estimate.
@@ -367,18 +309,9 @@ class WithoutExchange(ij.controllers.BarrierBackstepping):
         return [*levels[:-1], levels[-1]._replace(alpha=u)], tubes
 
 
-@ij.component
-class WithWrongFeedback(WithoutExchange):
-    """A law that feeds the slope of the last level back with the wrong sign."""
-
-    def _added(self, plant, t, x, levels, tubes):
-        return 2.0 * self.c[-1] * levels[-1].slope / self.weights[-1]
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("law", [WithoutExchange, WithWrongFeedback])
-def test_a_wrong_law_fails(law):
-    certificate = certify(pendulum(law(**GAINS)), duration=0.5, dt=2e-3)
+def test_a_wrong_law_fails():
+    certificate = certify(pendulum(WithoutExchange(**GAINS)), **RUN)
     assert certificate["inequality, levels"].verdict == "fails"
     assert certificate["inequality, levels"].margin < -1e-3
     assert certificate["equality"].verdict == "fails"
@@ -388,7 +321,7 @@ def test_a_wrong_law_fails(law):
 @pytest.mark.slow
 def test_a_dynamic_surface_claims_ultimate_boundedness():
     law = ij.controllers.BarrierBackstepping(filter=0.01, **GAINS)
-    certificate = certify(pendulum(law, disturbance=DISTURBANCES), duration=1.0)
+    certificate = certify(pendulum(law, disturbance=DISTURBANCES), **RUN)
     assert certificate.holds
     assert certificate["equality"].verdict == "holds"
     assert "ultimate boundedness" in certificate["envelope"].note
@@ -451,18 +384,18 @@ def double_integrator(law, **parts):
 
 @pytest.mark.slow
 def test_a_users_law_on_levels_states_its_own_claim():
-    certificate = certify(double_integrator(WithClaim()), duration=1.0, dt=5e-3)
+    certificate = certify(double_integrator(WithClaim()), **RUN)
     assert certificate.holds
     assert certificate.is_of_own_claim
     assert "dV/dx . d_tilde" in certificate["inequality, own V"].statement
     assert "TwoLevels" not in certificate.omitted
-    wrong = certify(double_integrator(WithClaim(factor=1.2)), duration=1.0, dt=5e-3)
+    wrong = certify(double_integrator(WithClaim(factor=1.2)), **RUN)
     assert wrong["inequality, own V"].verdict == "fails"
 
 
 @pytest.mark.slow
 def test_a_law_without_a_claim_is_not_applicable():
-    certificate = certify(double_integrator(TwoLevels()), duration=0.5, dt=5e-3)
+    certificate = certify(double_integrator(TwoLevels()), **RUN)
     assert certificate.verdict == "not applicable"
     assert "TwoLevels has no claim of this kind" in certificate["inequality, levels"].note
     assert certificate["level 1 inside"].margin > 0
@@ -493,7 +426,7 @@ def robot_scenario(plant, order, robot_law=None, **parts):
 
 def check_torque_observer(plant, order):
     """The claim with the observer of the robot inside a plant."""
-    certificate = certify(robot_scenario(plant, order), duration=0.5)
+    certificate = certify(robot_scenario(plant, order), **RUN)
     assert certificate.holds
     assert certificate["equality"].verdict == "holds"
     assert certificate["estimate"].verdict == "holds"
@@ -516,21 +449,9 @@ def test_a_robot_with_drives_is_certified_with_the_observer_of_the_robot():
 
 
 @pytest.mark.slow
-def test_levels_of_a_robot_are_observed():
-    rates = ij.disturbances.Levels((ij.disturbances.Sinusoids(0.1, 2.0),))
-    observer = ij.observers.LevelObserver(gain=20.0)
-    certificate = certify(
-        robot_scenario(LINK, 2, disturbance=rates, observer=observer), duration=0.3
-    )
-    assert certificate.holds
-    assert certificate["estimate"].verdict == "holds"
-    assert certificate["equality"].verdict == "holds"
-
-
-@pytest.mark.slow
 def test_a_disturbance_of_q_has_no_torque_observer():
     rates = ij.disturbances.Levels((ij.disturbances.Sinusoids(0.1, 2.0),))
-    certificate = certify(robot_scenario(LINK, 2, disturbance=rates), duration=0.3)
+    certificate = certify(robot_scenario(LINK, 2, disturbance=rates), **RUN)
     assert certificate["estimate"].verdict == "not applicable"
     assert "without d_1" in certificate["estimate"].note
     assert certificate["equality"].verdict == "holds"
@@ -557,41 +478,27 @@ def test_the_rigid_law_on_a_flexible_arm_has_the_flexibility_in_f():
     flexible = ij.plants.FlexibleJoint(LINK, stiffness=300.0, motor_inertia=0.01)
     law = ij.controllers.Backstepping(k1=2.0, K2=5.0, barrier=ij.barriers.Integral())
     scenario = robot_scenario(flexible, 2, law, model=LINK)
-    certificate = certify(scenario, duration=0.05, dt=5e-4)
+    certificate = certify(scenario, duration=0.04, dt=5e-4)
     assert certificate["inequality, case 2"].verdict == "holds"
     assert certificate.numbers["case"] == 2
     # The spring's torque less the motor's is a part of f.
-    rigid = certify(robot_scenario(LINK, 2, law), duration=0.05, dt=5e-4)
+    rigid = certify(robot_scenario(LINK, 2, law), duration=0.04, dt=5e-4)
     assert certificate.numbers["F_d"] > 3 * rigid.numbers["F_d"]
 
 
 # --- many runs, other loops -----------------------------------------------------------------------
 
 
-@pytest.mark.release
-def test_many_runs_name_the_worst():
-    scenario = pendulum(disturbance=DISTURBANCES)
-    gains = {"controller.k": ij.factor(ij.uniform(0.8, 1.2))}
-    study = ij.monte_carlo(scenario, gains, runs=3, duration=0.4, dt=2e-3)
-    certificate = certify(scenario, study, worst=None)
-    assert certificate.holds
-    assert certificate.runs == (0, 1, 2)
-    assert certificate["rho"].run is not None
-    assert "3 runs" in certificate.subject
-    assert certificate.to_dict()["verdict"] == "holds"
-    certificate.plot()
-
-
 @pytest.mark.slow
 def test_limits_of_the_input_and_the_guard_are_excluded():
     law = ij.controllers.BarrierBackstepping(**GAINS)
     limited = pendulum(ij.controllers.Saturated(law, limit=5.0))
-    certificate = certify(limited, duration=0.3)
+    certificate = certify(limited, **RUN)
     assert 0 < certificate.numbers["samples_left_out"] < certificate.numbers["samples"]
     assert "a limit of the input was active" in certificate["inequality, levels"].note
     assert certificate["equality"].verdict == "holds"
     always = pendulum(ij.controllers.Saturated(law, limit=1e-3))
-    certificate = certify(always, duration=0.1)
+    certificate = certify(always, **RUN)
     assert "all the time" in certificate["inequality, levels"].note
     assert certificate.verdict == "not applicable"
 
@@ -617,13 +524,13 @@ def test_alpha_outside_the_bounds_of_its_level_fails():
 @pytest.mark.slow
 def test_a_sampled_loop_and_an_actuator_have_no_claim():
     sampled = pendulum(sampling=ij.Sampling(period=4e-3))
-    certificate = certify(sampled, duration=0.2, dt=2e-3)
+    certificate = certify(sampled, duration=0.1, dt=2e-3)
     assert certificate.verdict == "not applicable"
     assert "sampled" in certificate["inequality, levels"].note
     assert certificate["V2, sampled less continuous"].value is not None
     certificate.plot()
     lag = pendulum(actuator=ij.actuators.Motor(bandwidth=100.0))
-    certificate = certify(lag, duration=0.2, dt=2e-3)
+    certificate = certify(lag, **RUN)
     assert certificate.verdict == "not applicable"
     assert "Motor has no claim" in certificate["inequality, levels"].note
 
@@ -646,6 +553,7 @@ def test_a_search_for_counterexamples_finds_one_of_a_wrong_law_only():
         counterexample(double_integrator(TwoLevels()), start)
 
 
+@pytest.mark.slow
 def test_the_figure_has_a_panel_for_every_level(undisturbed):
     figure = undisturbed.plot(until=1.5)
     labels = [axes.get_ylabel() for axes in figure.axes]

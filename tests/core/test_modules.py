@@ -12,12 +12,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import SHORT
 from module_cases import Learned, NetworkLaw, NetworkObserver
 
 import iblf_jax as ij
 from iblf_jax.core import modules
 from iblf_jax.studies.store_config import describe_component, structure
+
+FEW = {"duration": 0.05, "dt": 1e-3}
+"""A run whose length does not matter; so few steps of a run and of a batch are one kernel."""
 
 
 @ij.component
@@ -153,7 +155,7 @@ def numpy_torque(net, x):
 
 @pytest.mark.slow
 def test_the_torque_of_a_run_is_that_of_numpy(scenario):
-    run = ij.simulate(scenario, **SHORT)
+    run = ij.simulate(scenario, **FEW)
     for k in (0, 7, len(run.t) - 1):
         x = np.concatenate([run.q[k], run.dq[k]])
         expected = numpy_torque(scenario.disturbance.net, x)
@@ -164,7 +166,7 @@ def test_the_torque_of_a_run_is_that_of_numpy(scenario):
 def test_a_compiled_batch_over_weights_is_its_single_runs(paper):
     deep = ij.with_parts(paper, disturbance=Plain(weights_of(1, jnp.tanh)))
     spread = {"disturbance.net[layers][0][0]": ij.factor(ij.uniform(0.5, 1.5))}
-    batch = ij.monte_carlo(deep, spread, runs=3, seed=2, **SHORT)
+    batch = ij.monte_carlo(deep, spread, runs=3, seed=2, **FEW)
     assert len({*np.asarray(batch.metrics.rmse)[:, 0].tolist()}) == 3
     again = batch.replay(1)
     assert np.allclose(again.metrics.rmse, batch.metrics.rmse[1], rtol=1e-10, atol=0)
@@ -178,15 +180,15 @@ def test_gradient_by_a_weight_and_single_precision(scenario):
     start = scenario.disturbance.net.layers[1].bias
 
     def position(bias):
-        return ij.simulate(ij.with_parameters(scenario, {path: bias}), **SHORT).q[-1, 0]
+        return ij.simulate(ij.with_parameters(scenario, {path: bias}), **FEW).q[-1, 0]
 
     slope = jax.grad(position)(start)
     step = jnp.asarray([1e-4, 0.0])
     difference = (position(start + step) - position(start - step)) / 2e-4
     assert np.isclose(slope[0], difference, rtol=1e-6)
-    single = ij.simulate(ij.astype(scenario, "float32"), **SHORT)
+    single = ij.simulate(ij.astype(scenario, "float32"), **FEW)
     assert single.q.dtype == jnp.float32
-    assert np.allclose(single.q, ij.simulate(scenario, **SHORT).q, atol=1e-5)
+    assert np.allclose(single.q, ij.simulate(scenario, **FEW).q, atol=1e-5)
 
 
 @pytest.mark.release
@@ -201,13 +203,13 @@ def test_the_checkers_accept_members_with_networks():
 def test_studies_over_weights(scenario, tmp_path):
     path = "disturbance.net.layers[1].bias[0]"
     points = {path: [0.0, 1.0]}
-    table = ij.sweep(scenario, points, store=tmp_path / "s.zarr", **SHORT)
+    table = ij.sweep(scenario, points, store=tmp_path / "s.zarr", **FEW)
     fresh = ij.with_parts(scenario, disturbance=Learned(mlp()))
-    again = ij.sweep(fresh, points, store=tmp_path / "s.zarr", **SHORT)
+    again = ij.sweep(fresh, points, store=tmp_path / "s.zarr", **FEW)
     assert np.array_equal(table.rmse, again.rmse)
     assert float(table.rmse[0, 0]) != float(table.rmse[1, 0])
     result = ij.tune(
-        scenario, [ij.tunable(path, -1.0, 1.0)], ij.objectives.tracking(), effort="quick", **SHORT
+        scenario, [ij.tunable(path, -1.0, 1.0)], ij.objectives.tracking(), effort="quick", **FEW
     )
     assert result.scenario.disturbance.net.activation is jnp.tanh
 
@@ -281,13 +283,13 @@ def test_what_is_no_module_is_refused_by_name(case):
 @pytest.mark.parametrize("value", [Unregistered(), lambda x: x], ids=["object", "function"])
 def test_an_object_that_jax_does_not_know_is_refused_with_a_remedy(paper, value):
     with pytest.raises(ValueError, match=r"disturbance\.net: .*register_dataclass"):
-        ij.simulate(ij.with_parts(paper, disturbance=Learned(value)), **SHORT)
+        ij.simulate(ij.with_parts(paper, disturbance=Learned(value)), **FEW)
 
 
 def test_weights_that_are_not_finite_are_refused_with_their_path(paper):
     net = eqx.tree_at(lambda n: n.layers[0].bias, mlp(), jnp.full(3, jnp.nan))
     with pytest.raises(ValueError, match=r"disturbance\.net\.layers\[0\]\.bias: .*finite"):
-        ij.simulate(ij.with_parts(paper, disturbance=Learned(net)), **SHORT)
+        ij.simulate(ij.with_parts(paper, disturbance=Learned(net)), **FEW)
 
 
 def test_arrays_of_integers_are_structure():

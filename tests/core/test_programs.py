@@ -58,20 +58,6 @@ def test_it_may_be_transformed_and_called_in_another_program():
     np.testing.assert_allclose(by_rows, np.sin(2.0 * x))
 
 
-def maps_of_programs(number: int, size: int) -> int:
-    """Memory maps that so many programs take, of which so many are kept."""
-
-    def iterated(x):
-        A = jnp.outer(x, jnp.cos(x))
-        return jax.lax.fori_loop(0, 9, lambda i, y: jnp.tanh(A @ y + jnp.sin(y) * i), x)
-
-    function = programs.StructuredFunction(iterated, programs.Programs(size))
-    before = programs.count_maps()
-    for length in range(5, 5 + number):
-        function(np.ones(length))
-    return programs.count_maps() - before
-
-
 def test_a_program_that_is_not_optimised_may_be_a_part_of_another():
     """JAX accepts options of the compiler for a whole program only."""
     doubled = programs.jit(lambda x: 2 * x, optimised=False)
@@ -79,13 +65,6 @@ def test_a_program_that_is_not_optimised_may_be_a_part_of_another():
     assert float(jax.jit(doubled)(3.0)) == 6.0
     assert float(jax.jit(lambda: doubled(3.0))()) == 6.0
     assert float(jax.grad(doubled)(3.0)) == 2.0
-
-
-@pytest.mark.slow
-@needs_maps
-def test_the_number_of_memory_maps_stops_growing():
-    maps_of_programs(4, 4)
-    assert 3 * maps_of_programs(24, 4) < maps_of_programs(24, 24)
 
 
 @pytest.mark.slow

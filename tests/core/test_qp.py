@@ -43,14 +43,7 @@ def elsewhere(H, g, G, h):
 
 
 @pytest.mark.parametrize(
-    ("n", "m", "count"),
-    [
-        (2, 8, 300),
-        *(
-            pytest.param(*x, 1500, marks=pytest.mark.slow)
-            for x in ((1, 4), (2, 8), (3, 12), (7, 30))
-        ),
-    ],
+    ("n", "m", "count"), [(2, 8, 300), pytest.param(7, 30, 500, marks=pytest.mark.slow)]
 )
 def test_random_programs_have_the_solution_of_a_maintained_solver(n, m, count, rng):
     H, G, h = random_programs(rng, count, n, m)
@@ -68,36 +61,8 @@ def test_random_programs_have_the_solution_of_a_maintained_solver(n, m, count, r
     assert np.mean(np.array(active) > 0) > 0.3  # not all of them are free
 
 
-def test_what_has_no_solution_is_the_least_breaking_and_says_so(rng):
-    """Soft rows that exclude each other within a hard box: the squares of their slacks are those of
-    a bounded least-squares problem."""
-    n, count, broken, solved = 2, 60, 0, jax.jit(quadratic_program)
-    for _ in range(count):
-        rows = rng.normal(size=(6, n))
-        rows /= np.linalg.norm(rows, axis=1, keepdims=True)
-        room = rng.uniform(-1.5, 0.5, 6)
-        G, h = np.concatenate([rows, np.eye(n), -np.eye(n)]), np.concatenate([room, np.ones(2 * n)])
-        soft = np.concatenate([np.ones(6), np.zeros(2 * n)])
-        found = solved(jnp.eye(n), jnp.asarray(G), jnp.asarray(h), jnp.asarray(soft))
-        # The same with its slacks as variables: |s|^2 first, and next to nothing for x.
-        P = np.diag([1e-9] * n + [1.0] * 6)
-        wide = np.hstack([G, np.vstack([-np.eye(6), np.zeros((2 * n, 6))])])
-        other = elsewhere(P, np.zeros(n + 6), wide, h)
-        least = float(np.sum(np.maximum(rows @ other[:n] - room, 0.0) ** 2))
-        assert np.max(np.abs(found.x)) <= 1 + 1e-9  # the box is never broken
-        assert float(jnp.sum(found.slack**2)) == pytest.approx(least, rel=1e-5, abs=1e-8)
-        np.testing.assert_allclose(
-            found.slack[:6], np.maximum(rows @ found.x - room, 0.0), atol=1e-6
-        )
-        assert (float(jnp.max(found.slack)) > 0) == (least > 1e-8)
-        broken += least > 1e-8
-    assert 0.2 * count < broken < count
-
-
-@pytest.mark.parametrize(
-    ("n", "rows"), [(2, 6), *(pytest.param(*x, marks=pytest.mark.slow) for x in ((3, 9), (7, 16)))]
-)
-def test_many_without_a_solution_meet_the_conditions_of_the_least(n, rows, rng):
+@pytest.mark.parametrize(("n", "rows"), [(2, 6), pytest.param(7, 16, marks=pytest.mark.slow)])
+def test_what_has_no_solution_is_the_least_breaking_and_says_so(n, rows, rng):
     """Soft rows near and far within a hard box: no point breaks the same rows less (by bounded
     least squares)."""
     from scipy.optimize import lsq_linear
@@ -108,9 +73,11 @@ def test_many_without_a_solution_meet_the_conditions_of_the_least(n, rows, rng):
     box = np.broadcast_to(np.concatenate([np.eye(n), -np.eye(n)]), (200, 2 * n, n))
     G, h = np.concatenate([A, box], axis=1), np.concatenate([room, np.ones((200, 2 * n))], axis=1)
     soft = np.broadcast_to(np.r_[np.ones(rows), np.zeros(2 * n)], h.shape)
-    x = np.asarray(SOLVED(np.broadcast_to(np.eye(n), (200, n, n)), G, h, soft).x)
-    assert np.max(np.abs(x)) <= 1 + 1e-9
+    found = SOLVED(np.broadcast_to(np.eye(n), (200, n, n)), G, h, soft)
+    x = np.asarray(found.x)
+    assert np.max(np.abs(x)) <= 1 + 1e-9  # the box is never broken
     broken = np.einsum("bij,bj->bi", A, x) - room
+    np.testing.assert_allclose(found.slack[:, :rows], np.maximum(broken, 0.0), atol=1e-6)
     lost = 0
     for k in np.flatnonzero(np.any(broken > 1e-6, axis=1)):
         active = broken[k] > 1e-9

@@ -88,7 +88,7 @@ def test_the_guard_alone_is_not_a_failure(paper):
     )  # xi is 0.9505, for an instant
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        run = ij.simulate(near, **SHORT)
+        run = ij.simulate(near, duration=0.05, dt=1e-3)
     assert int(run.status) == Status.GUARD_ACTIVE
     assert not Status(int(run.status)) & FAILED
     assert all_finite(run)

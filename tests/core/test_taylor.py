@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from members import ROBOTS
 
-import iblf_jax as ij
 from iblf_jax.core import taylor
 from iblf_jax.core.linalg import solve_gain, solve_spd
 
@@ -79,14 +79,14 @@ def test_solutions_of_equations(solver):
 
 @pytest.mark.slow
 def test_the_dynamics_of_an_arm():
-    robot = ij.presets.iiwa14().plant
+    robot = ROBOTS["arm"]
     rng = np.random.default_rng(3)
 
     def acceleration(q, v):
         rest = -robot.coriolis(q, v, v) - robot.gravity(q)
         return solve_spd(robot.mass_matrix(q), rest)
 
-    points = [tuple(jnp.asarray(rng.normal(size=(2, 7)))) for _ in range(3)]
+    points = [tuple(jnp.asarray(rng.normal(size=(2, robot.n)))) for _ in range(3)]
     found = jax.jit(lambda x: taylor.along(acceleration, x))(points)
     expected = jax.jit(lambda x: taylor._by_nested_jvp(acceleration, x))(points)
     for x, y in zip(found, expected, strict=True):

@@ -12,10 +12,7 @@ from iblf_jax.files.earlier import fields_of_line
 from iblf_jax.simulation.paths import get
 
 EARLIER = Path(__file__).parents[1] / "data" / "earlier"
-PRESETS = {
-    "robot": ij.presets.zhang_yan_2024_full_state,
-    "plant": ij.presets.motor_driven_two_link,
-}
+PRESETS = {"robot": ij.presets.zhang_yan_2024_full_state, "plant": ij.presets.motor_driven_two_link}
 VARIED = {
     "robot": ("velocity_bounds.upper.offset", "bounds[1].upper.offset"),
     "plant": ("state_bounds[1].upper.value", "bounds[2].upper.value"),

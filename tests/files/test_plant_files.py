@@ -33,18 +33,6 @@ def test_a_level_without_bounds_stays_without(tmp_path):
     assert ij.load_scenario(tmp_path / "scenario.toml").bounds[1] is None
 
 
-def test_a_users_class_is_saved_once_it_has_a_name(tmp_path, monkeypatch):
-    scenario = loops_of_plants.user_class()
-    remedy = r'iblf_jax\.plants\.MEMBERS\["my_name"\] = MotorPendulum'
-    with pytest.raises(ValueError, match=remedy):
-        ij.save_scenario(scenario, tmp_path / "scenario.toml")
-    monkeypatch.setitem(ij.plants.MEMBERS, "motor_pendulum", loops_of_plants.MotorPendulum)
-    ij.save_scenario(scenario, tmp_path / "scenario.toml")
-    loaded = ij.load_scenario(tmp_path / "scenario.toml")
-    np.testing.assert_array_equal(loaded.initial.x, scenario.initial.x)
-    assert isinstance(loaded.plant, loops_of_plants.MotorPendulum)
-
-
 def test_a_plant_of_functions_says_what_can_be_saved(tmp_path):
     with pytest.raises(ValueError, match=r"plant\.drift: got a function.*method of a class"):
         ij.save_scenario(loops_of_plants.user_functions(), tmp_path / "scenario.toml")

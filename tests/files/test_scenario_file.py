@@ -88,7 +88,7 @@ def scenarios(draw) -> ij.Scenario:
 
 
 @pytest.mark.slow
-@hypothesis.settings(max_examples=100)
+@hypothesis.settings(max_examples=40)
 @hypothesis.given(scenarios())
 def test_a_saved_scenario_comes_back_equal(scenario):
     text = scenario_file.scenario_to_toml(scenario, run={"duration": 1.0})
@@ -467,7 +467,7 @@ def paper_file() -> str:
 
 
 @pytest.mark.slow
-@hypothesis.settings(max_examples=300)
+@hypothesis.settings(max_examples=120)
 @hypothesis.given(data=st.data())
 def test_malformed_files_are_value_errors_only(data):
     tables = tomllib.loads(paper_file()) | {"run": {"duration": 1.0}}
@@ -484,7 +484,7 @@ def test_malformed_files_are_value_errors_only(data):
 
 
 @pytest.mark.slow
-@hypothesis.settings(max_examples=300)
+@hypothesis.settings(max_examples=200)
 @hypothesis.given(place=st.integers(0, 10_000), cut=st.integers(0, 20), insert=st.text(max_size=6))
 def test_damaged_texts_are_value_errors_only(place, cut, insert, tmp_path_factory):
     text = paper_file()

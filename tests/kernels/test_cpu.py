@@ -3,10 +3,8 @@ falls back."""
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import shutil
-import stat
 import warnings
 from functools import partial
 
@@ -15,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from fallback import with_fallback
-from made_up_runs import ALWAYS
 from test_toolchain import ZIG_CACHE, ziglang_script
 
 import iblf_jax as ij
@@ -24,27 +21,24 @@ from iblf_jax.engine import RunRequest, compile, execute, loops, native, registr
 from iblf_jax.engine.batch import Batch
 from iblf_jax.engine.carry import Inputs, initial_carry
 from iblf_jax.engine.time_step import TimeStep
-from iblf_jax.kernels import cpu, directory, packed, toolchain
-from iblf_jax.kernels.toolchain import ToolchainError
+from iblf_jax.kernels import cpu, packed
 from iblf_jax.simulation.metrics import as_folds, standard
 from iblf_jax.simulation.scenario import canonical
 from iblf_jax.tuning.quantities import Peak, Quantities, TimeIntegral
 
 needs_compiler = pytest.mark.skipif(native.unavailable() is not None, reason="no C++ compiler")
-TOLERANCE = {"float64": 1e-10, "float32": 1e-4}
 COMPILED = {}
 
 
-def batch(dtype="float64", backend="native", steps=400, values=None, record_every=None, dt=1e-3):
+def batch(backend="native", values=None, record_every=None, dt=1e-3):
     """The outcome of some runs of the paper's scenario; one compilation for each set of options."""
-    scenario = canonical(ij.astype(ij.presets.zhang_yan_2024(), dtype))
-    folds = jax.tree.map(lambda x: jnp.asarray(x, dtype), standard())
-    varied = {k: jnp.asarray(v, dtype) for k, v in (values or draws(5)).items()}
-    key = (dtype, backend, steps, record_every)
+    scenario, varied = canonical(ij.presets.zhang_yan_2024()), values or draws(5)
+    key = (backend, record_every)
     if key not in COMPILED:
-        run = RunRequest(steps, "heun", record_every, backend=backend)
+        run = RunRequest(400, "heun", record_every, backend=backend)
         COMPILED[key] = jax.jit(lambda s, v, f, dt: execute.run_batch(s, v, f, dt, run))
-    return jax.tree.map(np.asarray, COMPILED[key](scenario, varied, folds, jnp.asarray(dt, dtype)))
+    varied = {k: jnp.asarray(v) for k, v in varied.items()}
+    return jax.tree.map(np.asarray, COMPILED[key](scenario, varied, standard(), jnp.asarray(dt)))
 
 
 def draws(runs, seed=0):
@@ -63,15 +57,6 @@ def assert_same(found, expected, tolerance):
         finite = np.isfinite(y)
         scale = 1 + np.max(np.abs(y[finite]), initial=0)
         np.testing.assert_allclose(x, y, rtol=0, atol=tolerance * scale)
-
-
-@pytest.mark.slow
-@needs_compiler
-@pytest.mark.parametrize("dtype", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
-def test_native_agrees_with_the_reference(dtype):
-    found, expected = batch(dtype), batch(dtype, "vmap")
-    assert_same(found, expected, TOLERANCE[dtype])
-    np.testing.assert_array_equal(found.status, expected.status)
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +78,9 @@ def recorded_steps():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("family", ["g++", "clang++", "ziglang"])
+@pytest.mark.parametrize(
+    "family", ["g++", "clang++", pytest.param("ziglang", marks=pytest.mark.release)]
+)
 def test_every_compiler_gives_the_same_numbers(tmp_path, monkeypatch, recorded_steps, family):
     """Flags and pragmas suit GCC and Clang; the compilers optimise here, as a user's do."""
     if family == "ziglang":
@@ -116,55 +103,11 @@ def test_every_compiler_gives_the_same_numbers(tmp_path, monkeypatch, recorded_s
 
 @pytest.mark.slow
 @needs_compiler
-def test_a_spline_is_looked_up():
-    times = np.linspace(0.0, 0.04, 9)
-    spline = ij.references.WaypointSpline(
-        tuple(times.tolist()), 0.5 + 0.1 * np.sin(20 * np.stack([times, times + 1], axis=1))
-    )
-    scenario, dt = (
-        canonical(dataclasses.replace(ij.presets.zhang_yan_2024(), reference=spline)),
-        jnp.asarray(1e-3),
-    )
-    varied = {k: jnp.asarray(v) for k, v in draws(3).items()}
-    request = RunRequest(1, "heun", backend="native")
-    assert execute.compile_batch(request, scenario, varied, (), dt).backend == "native"
-    requests = [RunRequest(50, "heun", 10, backend=backend) for backend in ("native", "vmap")]
-    found, expected = (
-        jax.jit(lambda s, v, request=request: execute.run_batch(s, v, (), dt, request))(
-            scenario, varied
-        )
-        for request in requests
-    )
-    assert_same(jax.tree.map(np.asarray, found), jax.tree.map(np.asarray, expected), 1e-10)
-
-
-@pytest.mark.slow
-@needs_compiler
-def test_native_records_what_simulate_records():
-    steps, every = 50, 7
-    found = batch(steps=steps, record_every=every)
-    arrays, controller, observer, actuator, measured = found.records
-    scenario = ij.presets.zhang_yan_2024()
-    for i in range(2):
-        changed = ij.with_parameters(scenario, {k: v[i] for k, v in draws(5).items()})
-        run = ij.simulate(
-            changed, duration=steps * 1e-3, dt=1e-3, method="heun", record_every=every
-        )
-        for name in ALWAYS:
-            np.testing.assert_allclose(
-                arrays[name][i], getattr(run, name), rtol=1e-9, atol=1e-9, err_msg=name
-            )
-        np.testing.assert_allclose(observer[i], run.observer_state, rtol=1e-9, atol=1e-9)
-    assert controller == () and actuator == () and measured == ()
-
-
-@pytest.mark.slow
-@needs_compiler
 def test_results_do_not_depend_on_place_or_number_of_runs():
     values = draws(83)
-    together = batch("float32", values=values)
+    together = batch(values=values)
     for few in (slice(0, 5), slice(40, 45), slice(78, 83)):
-        alone = batch("float32", values={k: v[few] for k, v in values.items()})
+        alone = batch(values={k: v[few] for k, v in values.items()})
         for x, y in zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True):
             np.testing.assert_array_equal(x[few], y)
 
@@ -183,27 +126,6 @@ def test_a_run_that_fails_does_not_touch_the_others():
     assert ij.Status.NOT_FINITE in ij.Status(int(found.status[1]))
     assert ij.Status.BOUND_VIOLATED in ij.Status(int(found.status[3]))
     np.testing.assert_array_equal(found.status, batch(backend="vmap", values=broken).status)
-
-
-@pytest.mark.slow
-@needs_compiler
-def test_a_sine_of_any_size_is_finite_in_a_batch():
-    scenario = canonical(ij.presets.zhang_yan_2024())
-    varied = {
-        "disturbance.phase": jnp.asarray([0.3, 1e7, 1e18]),
-        "disturbance.velocity_phase": jnp.asarray([[0.1, 0.2]] * 2 + [[3e17, 1.0]]),
-    }
-
-    def run(backend):
-        request = RunRequest(3, "euler", backend=backend)
-        f = jax.jit(
-            lambda v: execute.run_batch(scenario, v, standard(), jnp.asarray(1e-3), request)
-        )
-        return jax.tree.map(np.asarray, f(varied))
-
-    found = run("native")
-    assert not np.any(found.status & ij.Status.NOT_FINITE)
-    assert_same(found, run("vmap"), TOLERANCE["float64"])
 
 
 @needs_compiler
@@ -239,9 +161,7 @@ def test_one_run_and_threads():
 
 @pytest.mark.slow
 @needs_compiler
-@pytest.mark.parametrize(
-    ("runs", "dtype"), [(1, "float32"), (64, "float64"), (65, "float32"), (200, "float64")]
-)
+@pytest.mark.parametrize(("runs", "dtype"), [(1, "float64"), (65, "float32")])
 def test_leaves_become_rows_and_leaves_again(runs, dtype):
     """As by JAX's own operations, for every type and shape that a carry may have."""
     rng, leaves = np.random.default_rng(runs), []
@@ -286,22 +206,18 @@ def forget_kernels():
 
 @pytest.mark.slow
 @needs_compiler
-@pytest.mark.parametrize(
-    ("parts", "record_every"), [("functions", 100), ("calls", None), ("both", 100)]
-)
+@pytest.mark.parametrize(("parts", "record_every"), [("functions", 100), ("both", 100)])
 def test_a_long_step_is_cut_into_functions(monkeypatch, parts, record_every):
-    """Cut into pieces of fifty operations, or with its stages as calls, the numbers stay: the
+    """Cut into pieces of fifty operations, and with its stages as calls, the numbers stay: the
     places of some products with sums differ."""
     whole = batch(record_every=record_every)
-    if parts != "calls":
-        monkeypatch.setattr(thresholds, "MAX_C_FUNCTION_NODES", 0)
-        monkeypatch.setattr(thresholds, "SEGMENT_NODES", 50)
-    if parts != "functions":
+    monkeypatch.setattr(thresholds, "MAX_C_FUNCTION_NODES", 0)
+    monkeypatch.setattr(thresholds, "SEGMENT_NODES", 50)
+    if parts == "both":
         limits = thresholds.LOWERING_LIMITS._replace(written_out=10)
         monkeypatch.setattr(thresholds, "LOWERING_LIMITS", limits)
     forget_kernels()
-    monkeypatch.setitem(COMPILED, ("float64", "native", 400, record_every), None)
-    del COMPILED["float64", "native", 400, record_every]
+    monkeypatch.delitem(COMPILED, ("native", record_every))
     cut = batch(record_every=record_every)
     forget_kernels()
     # The mode comes from differences of rates, which magnify the last digit.
@@ -363,39 +279,6 @@ def test_without_a_compiler_it_runs_on_vmap_with_one_warning(monkeypatch):
         warnings.simplefilter("error")
         with_fallback("auto", called.append, lambda: called.append("vmap"))
     assert called == ["vmap"] * 2
-
-
-@needs_compiler
-def test_a_compiler_that_fails_is_reported_in_one_line():
-    with pytest.raises(ToolchainError, match=r"failed: .*error") as error:
-        toolchain.built("this is not C;")
-    assert "\n" not in str(error.value)
-
-
-@needs_compiler
-def test_the_cache_is_private_and_found_again(monkeypatch, tmp_path):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    library, key = toolchain.built('extern "C" int one(void) { return 1; }')
-    folder = tmp_path / "iblf_jax"
-    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
-    assert library.name == f"{key}.so"
-    assert [p.name for p in folder.iterdir()] == [library.name], "nothing temporary stays"
-    made = library.stat().st_mtime_ns
-    assert toolchain.built('extern "C" int one(void) { return 1; }')[0].stat().st_mtime_ns == made
-    library.chmod(0o777)
-    toolchain.built('extern "C" int one(void) { return 1; }')
-    assert stat.S_IMODE(library.stat().st_mode) & 0o022 == 0, (
-        "what others could have written is built anew"
-    )
-
-
-def test_a_cache_of_someone_else_is_refused(monkeypatch, tmp_path):
-    target = tmp_path / "elsewhere"
-    target.mkdir()
-    (tmp_path / "iblf_jax").symlink_to(target)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    with pytest.raises(OSError, match="not a directory of this user"):
-        directory()
 
 
 @pytest.mark.slow

@@ -207,10 +207,7 @@ def all_operations(dtype, runs=256):
 
 @pytest.mark.parametrize(
     "executor",
-    [
-        pytest.param("native", marks=needs_compiler),
-        pytest.param("gpu", marks=needs_compiler),
-    ],
+    [pytest.param("native", marks=needs_compiler), pytest.param("gpu", marks=needs_compiler)],
 )
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_every_operation_is_the_same_everywhere(executor, dtype):
@@ -232,11 +229,7 @@ def test_every_operation_is_the_same_everywhere(executor, dtype):
         found = next(rows["f" if kind == "f" else "i"])
         if kind == "f":
             np.testing.assert_allclose(
-                found,
-                exact,
-                rtol=16 * np.finfo(dtype).eps,
-                atol=np.finfo(dtype).tiny,
-                err_msg=name,
+                found, exact, rtol=16 * np.finfo(dtype).eps, atol=np.finfo(dtype).tiny, err_msg=name
             )
         else:
             np.testing.assert_array_equal(found, exact, name)

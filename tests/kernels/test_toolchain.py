@@ -83,7 +83,7 @@ def damages():
     """Ways in which a file comes to hold something else, as functions of the folder and the
     file."""
     draw = random.Random(0)
-    cuts, bits = [0.0, *(draw.random() for _ in range(4)), -1.0], [draw.random() for _ in range(8)]
+    cuts, bits = [0.0, draw.random(), -1.0], [draw.random() for _ in range(3)]
     ways = {
         f"cut at {x:.3f}": lambda _, f, x=x: f.write_bytes(
             f.read_bytes()[: int(x * f.stat().st_size) if x >= 0 else -1]
@@ -126,10 +126,9 @@ def test_a_damaged_kernel_is_built_again(library, damage):
     assert toolchain._checked(library) is None, "the damage is seen"
     assert value() == 41
     assert toolchain._checked(library) is not None
-    assert sorted(x.suffix for x in library.parent.iterdir()) == [
-        ".so",
-        ".so",
-    ], "nothing temporary stays"
+    assert sorted(x.suffix for x in library.parent.iterdir()) == [".so", ".so"], (
+        "nothing temporary stays"
+    )
     assert stat.S_IMODE(library.stat().st_mode) == 0o700
 
 
@@ -493,16 +492,16 @@ import jax.numpy as jnp
 jnp.ones(3) + 1.0  # something of the user's that JAX has compiled before
 import iblf_jax as ij
 print(repr(jax.config.jax_compilation_cache_dir), end=" ")
-ij.simulate(ij.presets.zhang_yan_2024(), duration=0.1, dt=1e-3)
+ij.simulate(ij.presets.zhang_yan_2024(), duration=0.05, dt=1e-3)
 print(repr(jax.config.jax_compilation_cache_dir), [sum(e.endswith(x) for e in events) for x in ("cache_hits", "cache_misses")])
 """
 
 
-def fresh(tmp_path, **more: str) -> list[str]:
+def fresh(tmp_path) -> list[str]:
     """What a user's script prints in a process of its own: JAX's folder at the import and after a
     run, hits and misses."""
     environment = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
-    environment |= {"XDG_CACHE_HOME": str(tmp_path), "PYTHONPATH": str(ROOT), **more}
+    environment |= {"XDG_CACHE_HOME": str(tmp_path), "PYTHONPATH": str(ROOT)}
     done = subprocess.run(
         [sys.executable, "-c", FRESH],
         env=environment,
@@ -526,11 +525,13 @@ def test_a_script_keeps_its_programs_without_being_told(tmp_path):
         assert (misses == 0 < hits) if again else (misses > hits)
 
 
-@pytest.mark.slow
-def test_who_told_jax_is_obeyed(tmp_path):
-    own = str(tmp_path / "own")
-    assert fresh(tmp_path, JAX_COMPILATION_CACHE_DIR=own)[:2] == [repr(own), repr(own)]
-    assert fresh(tmp_path, JAX_ENABLE_COMPILATION_CACHE="0")[:2] == ["None", "None"]
+@pytest.mark.parametrize(("folder", "enabled"), [("own", True), (None, False)])
+def test_who_told_jax_is_obeyed(programs, folder, enabled):
+    jax.config.update("jax_compilation_cache_dir", folder)
+    jax.config.update("jax_enable_compilation_cache", enabled)
+    keep_programs.cache_clear()
+    keep_programs()
+    assert jax.config.jax_compilation_cache_dir == folder
 
 
 # --------------------------------------------- an unusable cache
@@ -539,6 +540,11 @@ def test_who_told_jax_is_obeyed(tmp_path):
 def a_file_in_its_place(base, monkeypatch):
     base.mkdir()
     (base / "iblf_jax").write_text("")
+
+
+def a_link_in_its_place(base, monkeypatch):
+    base.mkdir()
+    (base / "iblf_jax").symlink_to(base)
 
 
 def under_a_file(base, monkeypatch):
@@ -589,13 +595,13 @@ def no_room_to_write(base, monkeypatch):
 
 UNUSABLE = {
     "a file in its place": a_file_in_its_place,
+    "a link in its place": a_link_in_its_place,
     "under a file": under_a_file,
     "in /proc": in_proc,
     "no home": no_home,
     "a name too long": a_name_too_long,
     "read-only": nothing_fits(30),
     "no inodes": nothing_fits(28),
-    "quota": nothing_fits(122),
     "full at the last write": no_room_to_write,
 }
 
@@ -869,9 +875,7 @@ def test_drafts_of_other_machines_go_by_age(tmp_path, monkeypatch):
 # --------------------------------------------- threads
 
 
-@pytest.mark.parametrize(
-    "wanted", ["99999999999", "9" * 5000, "257", "²", "0", "000", "-1", "abc", "1.5", " 2", "٣"]
-)
+@pytest.mark.parametrize("wanted", ["9" * 5000, "257", "²", "000", "-1", "1.5", " 2"])
 def test_a_number_of_threads_that_is_none_is_one_line(monkeypatch, wanted):
     monkeypatch.delenv("IBLF_JAX_THREADS", raising=False)
     usual = devices.threads()
@@ -884,7 +888,7 @@ def test_a_number_of_threads_that_is_none_is_one_line(monkeypatch, wanted):
     assert len(str(said[0].message)) < 200
 
 
-@pytest.mark.parametrize(("wanted", "threads"), [("1", 1), ("007", 7), ("256", 256)])
+@pytest.mark.parametrize(("wanted", "threads"), [("007", 7), ("256", 256)])
 def test_a_number_of_threads(monkeypatch, wanted, threads):
     monkeypatch.setenv("IBLF_JAX_THREADS", wanted)
     with warnings.catch_warnings():

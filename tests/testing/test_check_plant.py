@@ -67,9 +67,7 @@ BROKEN = {
     ),
     "singular-matrix": (
         lambda: plant_of(
-            drift=lambda t, x: -x,
-            gain=lambda t, x: jnp.ones((2, 2, 2), x.dtype),
-            n=2,
+            drift=lambda t, x: -x, gain=lambda t, x: jnp.ones((2, 2, 2), x.dtype), n=2
         ),
         ["row 0 of gain(t, x) is singular"],
     ),
