@@ -15,7 +15,6 @@ from claim_terms import terms_at
 
 import iblf_jax as ij
 from iblf_jax import barriers, controllers
-from iblf_jax.files.scenario import load_scenario, save_scenario
 from iblf_jax.simulation.closed_loop import LoopState, rate
 
 PAPER = ij.presets.zhang_yan_2024(variant="corrected")
@@ -177,20 +176,6 @@ def test_the_vector_field_is_that_of_an_independent_program(name, rng):
         np.testing.assert_allclose(flat(found, i), expected, rtol=1e-12, atol=1e-12 * scale)
 
 
-@pytest.mark.release
-@pytest.mark.parametrize("name", CASES)
-def test_a_run_is_that_of_an_independent_program(name):
-    make, program, _ = CASES[name]
-    changed = {"parameters": {"plant.payload": 0.4}, "parameters of order 3": {"plant.H": 7.0}}
-    scenario = ij.with_parameters(make(), changed.get(name, {}))
-    run = ij.simulate(scenario, duration=1.0, dt=2.5e-4, record_every=4000)
-    start = ij.simulation.closed_loop.initial_state(run.scenario)
-    expected = independent.end(program(run.scenario), flat(start), 1.0)
-    last = jax.tree.map(lambda x: x[-1], run.controller_state)
-    found = np.concatenate([np.ravel(x) for x in [run.x[-1], *jax.tree.leaves(last)]])
-    np.testing.assert_allclose(found, expected, atol=1e-7)
-
-
 # ------------------------------------------------------------------------- the claim (R.3)
 
 
@@ -230,14 +215,13 @@ class PassOn(controllers.Law):
 @pytest.mark.parametrize(
     ("make", "paths"),
     [
-        (lambda: ARM, ("plant.mass", "plant.payload", "model.mass")),
         (
             lambda: dataclasses.replace(ARM, controller=adapting(PassOn(ARM.controller.law))),
             ("plant.mass", "plant.payload", "model.mass"),
         ),
         (chain, ("plant.H", "plant.Km", "model.H")),
     ],
-    ids=["arm", "law of x around one of robots", "order 3"],
+    ids=["law of x around one of robots", "order 3"],
 )
 def test_the_rate_of_the_lyapunov_function_is_what_is_claimed(make, paths, rng):
     scenario = ij.simulation.scenario.canonical(make())
@@ -280,28 +264,6 @@ def test_without_an_error_the_law_is_the_wrapped_one_and_nothing_adapts():
     leak_free = dataclasses.replace(law, sigma=0.0)
     _, rates = leak_free.command(t, x, jnp.ones(2), context, state)
     np.testing.assert_array_equal(rates.theta, 0.0)
-
-
-@pytest.mark.release
-def test_true_parameters_stay_and_slow_adaptation_tends_to_the_wrapped_law():
-    quiet = dataclasses.replace(ARM, disturbance=ij.disturbances.Nothing())
-    tube = quiet.context.tube(jnp.zeros(()))
-    on_reference = {"initial.q": tube.q_d, "initial.dq": tube.dq_d, "controller.sigma": 0.0}
-    started = ij.with_parameters(quiet, on_reference)
-    run = ij.simulate(started, duration=1.0, dt=5e-4, record_every=100)
-    theta = run.controller_state.theta
-    np.testing.assert_allclose(theta - theta[0], 0.0, atol=1e-9)
-    heavier = ij.with_parameters(quiet, {"plant.mass": [2.4, 1.0]})
-    plain = ij.simulate(
-        dataclasses.replace(heavier, controller=MAPPED), duration=1.0, dt=1e-3, record_every=10
-    )
-    errors = []
-    for factor in (1e-3, 1e-5):
-        slow = ij.with_parameters(heavier, {"controller.Gamma": factor})
-        found = ij.simulate(slow, duration=1.0, dt=1e-3, record_every=10)
-        errors.append(float(jnp.max(jnp.abs(found.q - plain.q))))
-    assert errors[1] < 1e-5
-    assert errors[1] < 0.02 * errors[0]
 
 
 def test_one_rule_is_the_integral_of_the_velocity_error_with_a_leak(rng):
@@ -358,17 +320,6 @@ def test_both_layers_descend_the_lyapunov_function(rng):
         np.testing.assert_allclose(effect + adapted, e2 @ r - leak, rtol=1e-8, atol=1e-8)
 
 
-@pytest.mark.release
-def test_weights_of_both_layers_stay_below_their_bounds():
-    law = controllers.AdaptiveNetwork(k1=2.0, K2=20.0, sigma=0.5)
-    strong = {"disturbance.acceleration_amplitude": 20.0}
-    disturbed = dataclasses.replace(PAPER, controller=law)
-    run = ij.simulate(ij.with_parameters(disturbed, strong), duration=5.0, dt=1e-3, record_every=10)
-    norms = jnp.sqrt(jnp.sum(run.controller_state.output**2, axis=1))
-    largest = jnp.max(jnp.abs(run.e2), axis=0)
-    assert bool(jnp.all(norms <= np.sqrt(law.nodes) * largest / 0.5))
-
-
 # ------------------------------------------------------------------------- what is refused
 
 
@@ -422,14 +373,6 @@ def test_units_of_the_adaptation_are_those_of_the_parameters():
     assert units["controller.Gamma"] == "kg^2/(N m rad)"
 
 
-def test_a_scenario_file_keeps_the_parameters(tmp_path):
-    path = tmp_path / "adapting.toml"
-    save_scenario(ARM, path)
-    loaded = load_scenario(path)
-    assert loaded.controller.parameters == NAMES
-    jax.tree.map(np.testing.assert_array_equal, loaded, ARM)
-
-
 @pytest.mark.release
 def test_operations_are_at_most_half_more_than_those_of_the_law_that_is_extended():
     def cost(scenario):
@@ -471,8 +414,8 @@ def test_a_figure_shows_the_parameters_with_their_names_and_units():
     loaded = ij.with_parameters(ARM, {"plant.payload": 0.4})
     law = controllers.Saturated(loaded.controller, limit=15.0, auxiliary=5.0)
     limited = dataclasses.replace(loaded, controller=law)
-    run = ij.simulate(loaded, duration=0.1, dt=1e-3)
-    runs = {"free": run, "limited": ij.simulate(limited, duration=0.1, dt=1e-3)}
+    run = ij.simulate(loaded, duration=0.01, dt=1e-3)
+    runs = {"free": run, "limited": ij.simulate(limited, duration=0.01, dt=1e-3)}
     figure = ij.plotting.adaptation(runs)
     labels = [axes.get_ylabel() for axes in figure.axes[::2]]
     assert labels == [f"{name}\n$\\hat\\theta$ [kg]" for name in NAMES]

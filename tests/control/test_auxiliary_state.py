@@ -177,22 +177,6 @@ def test_a_certificate_covers_the_limited_torque():
     )
 
 
-@pytest.mark.release
-@pytest.mark.parametrize("decay", [ij.decays.FiniteTime(k_a=2.0), ij.decays.PrescribedTime(T=0.5)])
-def test_a_certificate_covers_the_limited_torque_of_a_law_that_settles(decay):
-    law = controllers.Backstepping(
-        k1=2.0, K2=20.0, barrier=barriers.TransformedError(), variant="corrected", decays=decay
-    )
-    scenario = ij.with_parts(LIMITED, controller=_limited(law))
-    run = ij.simulate(scenario, duration=0.6, dt=5e-4)
-    certificate = ij.certify(scenario, run)
-    assert np.max(np.abs(run.auxiliary)) > 0.1
-    assert certificate["inequality, limited torque"].verdict == "holds"
-    # Without the auxiliary state (D.2) is about the torque of the law itself.
-    note = certificate["inequality, decays"].note
-    assert "the auxiliary state of Saturated changed the input of Backstepping" in note
-
-
 # --- limits ---------------------------------------------------------------------------------------
 
 

@@ -15,6 +15,7 @@ import iblf_jax as ij
 from iblf_jax import barriers, bounds, controllers, plants, references
 from iblf_jax.engine.switching import surfaces
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
+from iblf_jax.simulation.scenario import canonical
 
 DATA = np.load(other.FILE)
 
@@ -72,10 +73,6 @@ def test_a_torque_estimate_is_held_and_not_the_acceleration_that_it_causes():
     )
     found, _ = law.command(t, x, f_hat, scenario.context, ())
     np.testing.assert_allclose(found.tau, expected.tau, rtol=1e-9)
-
-
-def flexible(**parts):
-    return chain_cases.scenario("flexible", **parts)
 
 
 def law(**fields):
@@ -164,51 +161,16 @@ ALLOWED = {
 }
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("what", ALLOWED)
-def test_allowed(what):
-    run = ij.simulate(third_order(controller=ALLOWED[what]), duration=0.3, dt=1e-3)
-    assert run.ok, run
-
-
-@pytest.mark.slow
-def test_a_symmetric_tube_needs_no_smooth_barrier():
+def test_allowed():
     """Integral has no kink where both sides are at the same distance."""
-    tube = ij.Bounds(lower=bounds.Funnel(-0.6, -0.6, 0.0), upper=bounds.Funnel(0.6, 0.6, 0.0))
-    wide = ij.Bounds(lower=bounds.Funnel(-60.0, -60.0, 0.0), upper=bounds.Funnel(60.0, 60.0, 0.0))
-    narrow = ij.Bounds(lower=bounds.Funnel(-5.0, -5.0, 0.0), upper=bounds.Funnel(5.0, 5.0, 0.0))
-    integral = barriers.Integral()
-    scenario = third_order(
-        bounds=(tube, narrow, wide),
-        controller=law(barriers=(integral, integral, integral), weights=(1.0, 10.0, 1000.0)),
-    )
-    run = ij.simulate(scenario, duration=0.5, dt=1e-3)
-    assert run.ok, run
-
-
-@pytest.mark.slow
-def test_a_gain_that_becomes_singular_is_flagged():
-    """The gain of the last level, cos(t), is zero at t = pi/2."""
-
-    def gain(t, x):
-        one = jnp.ones_like(x[0])
-        return jnp.stack([one, one, jnp.where(t < 0.2, 1.0, 0.0) * one])
-
-    plant = plants.StrictFeedback(lambda t, x: jnp.zeros_like(x), gain, n=1, order=3)
-    with pytest.warns(ij.SimulationWarning):
-        run = ij.simulate(third_order(plant=plant), duration=0.4, dt=1e-3)
-    assert int(run.status) & ij.Status.SINGULAR_GAIN
-
-
-@pytest.mark.slow
-def test_a_virtual_control_outside_the_bounds_of_its_level_is_flagged():
-    scenario = third_order(
-        bounds=(within(1.0), within(0.3), within(50.0)),
-        controller=law(barriers=(MAPPING, MAPPING, MAPPING)),
-    )
-    with pytest.warns(ij.SimulationWarning):
-        run = ij.simulate(scenario, duration=1.0, dt=1e-3)
-    assert int(run.status) & ij.Status.ALPHA_INFEASIBLE
+    for allowed in ALLOWED.values():
+        canonical(third_order(controller=allowed))
+    sides = [
+        ij.Bounds(lower=bounds.Funnel(-x, -x, 0.0), upper=bounds.Funnel(x, x, 0.0))
+        for x in (0.6, 5.0, 60.0)
+    ]
+    integral = law(barriers=(barriers.Integral(),) * 3, weights=(1.0, 10.0, 1000.0))
+    canonical(third_order(bounds=sides, controller=integral))
 
 
 @pytest.mark.slow

@@ -67,7 +67,7 @@ def random_state(scenario, rng):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("order", [2, 3, 4])
+@pytest.mark.parametrize("order", [2, 4])
 def test_each_level_of_a_level_observer_obeys_its_equation(order, rng):
     """d_hat_j' = kappa_j d_tilde_j, with the true d along the run: then d_tilde_j' = d_j' - kappa_j
     d_tilde_j."""
@@ -80,15 +80,14 @@ def test_each_level_of_a_level_observer_obeys_its_equation(order, rng):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("order", [3, 4])
 @pytest.mark.parametrize(
-    "observer",
+    ("order", "observer"),
     [
-        ij.observers.Momentum(kf=[20.0, 12.0]),
-        ij.observers.AsPublished(kf=[20.0, 12.0]),
-        ij.observers.ExtendedState(bandwidth=[40.0, 30.0]),
+        (3, ij.observers.Momentum(kf=[20.0, 12.0])),
+        (4, ij.observers.AsPublished(kf=[20.0, 12.0])),
+        (3, ij.observers.ExtendedState(bandwidth=[40.0, 30.0])),
     ],
-    ids=lambda observer: type(observer).__name__,
+    ids=["Momentum", "AsPublished", "ExtendedState"],
 )
 def test_an_observer_of_robots_serves_level_2(order, observer, rng):
     """With f = M d_2: f_hat' = kf f_tilde (momentum), less kf M' q' as printed, and with

@@ -150,25 +150,15 @@ def test_the_error_on_the_surface_settles_within_the_stated_time():
         assert 0.3 * stated < time < stated
 
 
-ESTIMATED = ij.observers.StateObserver(bandwidth=100.0, offset=(0.0, 0.3))
-
-
-@pytest.mark.parametrize(
-    ("observer", "term"),
-    [
-        pytest.param(ij.observers.Momentum(kf=20.0), "f_tilde", marks=pytest.mark.slow),
-        pytest.param(ESTIMATED, "tau(x_hat)", marks=pytest.mark.release),
-    ],
-    ids=["measured velocity", "estimated velocity"],
-)
-def test_certify_checks_the_claim_of_the_law(observer, term):
-    """(T.2) is an equality; with estimated velocities the error of the estimates is a part of T."""
+@pytest.mark.slow
+def test_certify_checks_the_claim_of_the_law():
+    """(T.2) is an equality."""
     pushed = ij.disturbances.Sinusoids(amplitude=[0.3, 0.1], frequency=3.0)
-    scenario = loop(LAW, observer=observer, disturbance=pushed)
+    scenario = loop(LAW, observer=ij.observers.Momentum(kf=20.0), disturbance=pushed)
     certificate = ij.certify(scenario, duration=0.1, dt=2e-4)
     line = {line.name: line for line in certificate.lines}["inequality, own V"]
     assert line.verdict == "holds" and abs(line.margin) < 1e-10
-    assert term in line.statement
+    assert "f_tilde" in line.statement
 
 
 def test_an_exponent_without_a_law_is_refused():
@@ -203,12 +193,11 @@ def test_a_sampled_loop_is_assessed_with_the_slope_of_the_layer():
 @pytest.mark.parametrize(
     "wrapped",
     [
-        lambda law: ij.controllers.Saturated(law, limit=1e4),
         lambda law: ij.controllers.Saturated(law, limit=1e-3),
         lambda law: ij.controllers.Saturated(law, limit=1e-3, auxiliary=5.0, edge="smooth"),
         lambda law: ij.controllers.SafetyFilter(law, limit=30.0),
     ],
-    ids=["unreached limit", "limit", "auxiliary state", "filter"],
+    ids=["limit", "auxiliary state", "filter"],
 )
 def test_limits_of_laws_within_others_are_left_out_of_the_linearisation(wrapped):
     """Wherever a limit is active the radius would be at least 1, that of an open loop."""
