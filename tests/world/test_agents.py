@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import iblf_jax as ij
-from iblf_jax import barriers, bounds, controllers, plants, references
+from iblf_jax import bounds, controllers, plants, references
 from iblf_jax.core import sparse
 
 
@@ -83,6 +83,7 @@ def test_vector_field_and_trajectory_of_the_independent_program(distributed, rng
     assert run.ok
 
 
+@pytest.mark.slow
 def test_the_filtered_law_tends_to_neighbours_velocities_with_mu():
     """The filters' error is of the first order in mu, as the M-matrix (D + B)^-1 H promises."""
     poles = np.linalg.eigvals(other.H / other.DEGREES[:, None])
@@ -158,25 +159,6 @@ def test_friction_of_the_agents_robots_acts_on_the_plant(rng):
     difference = acceleration(robots) - acceleration([pendulum(0), pendulum(1)])
     expected = -np.asarray(damping) * [0.4, -0.6] / other.M[:2]
     np.testing.assert_allclose(difference, expected, rtol=1e-10)
-
-
-@pytest.mark.slow
-def test_studies_and_files(tmp_path):
-    one = scenario()
-    file = tmp_path / "agents.toml"
-    ij.save_scenario(one, file)
-    loaded = ij.load_scenario(file)
-    field, same = ij.vector_field(one), ij.vector_field(loaded)
-    np.testing.assert_array_equal(field(0.0, field.start), same(0.0, same.start))
-    study = ij.monte_carlo(
-        one,
-        {"plant.agents[1].robot.mass": ij.factor(ij.uniform(0.9, 1.1))},
-        runs=8,
-        duration=0.2,
-        dt=2e-3,
-        progress=False,
-    )
-    assert not np.any(study.failed)
 
 
 @pytest.mark.release
@@ -270,15 +252,3 @@ def test_refused_with_a_remedy(what):
     make, message = REFUSED[what]
     with pytest.raises(ValueError, match=message):
         ij.simulate(make(), duration=0.1, dt=1e-2)
-
-
-@pytest.mark.slow
-def test_bounds_of_the_agents_velocities_are_kept():
-    limits = ij.Bounds(lower=bounds.Constant(-1.5), upper=bounds.Constant(1.5))
-    one = scenario(
-        bounds=(TUBE, limits),
-        controller=law(barriers=(barriers.TransformedError(), barriers.TransformedError())),
-    )
-    run = ij.simulate(one, duration=1.0, dt=1e-3, record_every=10)
-    assert run.ok
-    assert np.max(np.abs(run.dq)) < 1.5

@@ -188,16 +188,6 @@ def test_margins_are_those_by_hand_and_what_the_status_says(alone):
 
 
 @pytest.mark.slow
-def test_the_loop_does_not_know(alone):
-    free = ij.simulate(stepping(regions=()), **RUN)
-    for name in ("q", "tau", "V"):
-        np.testing.assert_allclose(
-            getattr(free, name), getattr(alone, name), rtol=1e-12, atol=1e-13
-        )
-    assert free.region_margin == () and "region_margin" not in free.metrics
-
-
-@pytest.mark.slow
 def test_the_filter_keeps_what_the_law_breaks(kept):
     assert not int(kept.status) & int(ij.status.FAILED | ij.Status.FILTER_INFEASIBLE)
     margin = np.asarray(kept.metrics.region_margin)
