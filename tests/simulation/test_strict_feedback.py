@@ -37,6 +37,7 @@ def test_equal_to_the_independent_program(name):
     np.testing.assert_allclose(found.V, run["V"], rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_errors_and_uncertain_terms_of_the_levels():
     """e_i = x_i - alpha_{i-1}, and d_i is the disturbance where plant and model agree."""
     run = ij.simulate(closed_loop("coupled"), duration=1.0, dt=1e-3, record_every=50)
