@@ -285,41 +285,6 @@ def test_a_fuzzy_system_is_a_mean_of_its_rules_far_from_all_of_them():
         assert float(jnp.sum(S)) == pytest.approx(1.0, rel=1e-6)
 
 
-def test_both_layers_descend_the_lyapunov_function(rng):
-    # (H.1) and (H.2): what remains of V' beside e2 . r is the leak, for any ideal weights.
-    law = controllers.AdaptiveNetwork(k1=2.0, K2=[20.0, 10.0], nodes=3, Gamma=[5.0, 7.0])
-    scenario, nodes = network(law), 3
-    first = law.init(scenario.initial.q, scenario.initial.dq, scenario.context)
-    for _ in range(10):
-        W, ideal_W = rng.normal(size=(2, nodes, 2))
-        V, ideal_V = rng.normal(size=(2, 9, nodes))
-        q, dq = np.array([0.5, 0.6]) + 0.05 * rng.normal(size=2), rng.normal(size=2)
-        state = type(first)(jnp.asarray(W), jnp.asarray(V))
-        t = jnp.asarray(0.3)
-        command, rates = law.command(t, jnp.asarray(q), jnp.asarray(dq), q, scenario.context, state)
-        e2 = np.asarray(dq - command.alpha)
-        slope = np.asarray(law.barrier.slope(scenario.context.tube(t), jnp.asarray(q)))
-        learned = np.asarray(command.tau) + np.asarray(law.K2) * e2 + slope
-        z = -(
-            np.asarray(rates.hidden) / float(law.Gamma_h)
-            + float(law.sigma_h) * (V - np.asarray(first.hidden))
-        )
-        # z is known from the rate of V up to a factor; its last entry, the threshold's, is 1.
-        back = z[-1]
-        z = z[:, 0] / back[0]
-        phi, D = np.tanh(V.T @ z), np.diag(1.0 - np.tanh(V.T @ z) ** 2)
-        np.testing.assert_allclose(learned, W.T @ phi, rtol=1e-9)
-        error_W, error_V = W - ideal_W, V - ideal_V
-        ideal_phi = np.tanh(ideal_V.T @ z)
-        r = error_W.T @ D @ ideal_V.T @ z - ideal_W.T @ (ideal_phi - phi + D @ error_V.T @ z)
-        effect = e2 @ (W.T @ phi - ideal_W.T @ ideal_phi)
-        adapted = np.sum(error_W * np.asarray(rates.output) / np.asarray(law.Gamma))
-        adapted += np.sum(error_V * np.asarray(rates.hidden)) / float(law.Gamma_h)
-        leak = np.sum(error_W * W * np.asarray(law.sigma))
-        leak += float(law.sigma_h) * np.sum(error_V * (V - np.asarray(first.hidden)))
-        np.testing.assert_allclose(effect + adapted, e2 @ r - leak, rtol=1e-8, atol=1e-8)
-
-
 # ------------------------------------------------------------------------- what is refused
 
 
@@ -383,14 +348,11 @@ def test_operations_are_at_most_half_more_than_those_of_the_law_that_is_extended
 
     plain = operations(dataclasses.replace(UNDISTURBED, controller=PAPER.controller))
     two = controllers.AdaptiveParameters(
-        law=PAPER.controller, parameters=NAMES[:2], Gamma=1.0, lower=0.0, upper=4.0
+        law=PAPER.controller, parameters=NAMES[:2], Gamma=1.0, lower=-1.0, upper=4.0
     )
     assert operations(network(two)) < 1.5 * plain
     # Each parameter has a state of its own: beyond two, the limit is one of vector instructions.
-    names = (*NAMES, "inertia[1]")
-    four = controllers.AdaptiveParameters(
-        law=PAPER.controller, parameters=names, Gamma=1.0, lower=-1.0, upper=4.0
-    )
+    four = dataclasses.replace(two, parameters=(*NAMES, "inertia[1]"))
     assert cost(network(four)).slots < 1.5 * cost(UNDISTURBED).slots
     gaussian = operations(network(controllers.AdaptiveRBF(k1=2.0, K2=20.0)))
     fuzzy = controllers.AdaptiveRBF(k1=2.0, K2=20.0, normalised=True)

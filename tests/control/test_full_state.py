@@ -72,22 +72,12 @@ class FullLoop(Loop):
             name: rng.uniform(low, high, 2)
             for name, low, high in (("k1", 1, 3), ("K2", 8, 25), ("c", 0.3, 2), ("o", 0.05, 0.3))
         }
-        slowest = (
-            -rng.uniform(1.5, 2.0, 2),
-            rng.uniform(-0.1, 0.1, 2),
-            rng.uniform(0.5, 2.0),
-            rng.uniform(0, 6, 2),
-        )
+        sizes = -rng.uniform(1.5, 2.0, 2), rng.uniform(-0.1, 0.1, 2)
+        slowest = (*sizes, rng.uniform(0.5, 2.0), rng.uniform(0, 6, 2))
         fastest = (rng.uniform(0.9, 1.5, 2), rng.uniform(-0.1, 0.1, 2), 1.0, rng.uniform(0, 6, 2))
         lower = (rng.uniform(0.1, 0.2, 2), 0.14, 1.0, (H, 0.0))
-        return cls(
-            **gains,
-            kf=rng.uniform(10, 25, 2),
-            slowest=slowest,
-            fastest=fastest,
-            lower=lower,
-            **given,
-        )
+        speeds = {"slowest": slowest, "fastest": fastest}
+        return cls(**gains, kf=rng.uniform(10, 25, 2), lower=lower, **speeds, **given)
 
     @property
     def scenario(self):
@@ -127,11 +117,7 @@ def states_at(scenario, t, xi, xi2, eta):
 def random_states(scenario, count=64, seed=0):
     """Times and states of the loop inside both pairs of bounds, e1 and e2 up to 0.95 of theirs."""
     rng = np.random.default_rng(seed)
-    t, xi, xi2 = (
-        rng.uniform(0, 10, count),
-        rng.uniform(-0.95, 0.95, (count, 2)),
-        rng.uniform(-0.95, 0.95, (count, 2)),
-    )
+    t, (xi, xi2) = rng.uniform(0, 10, count), rng.uniform(-0.95, 0.95, (2, count, 2))
     states, room = states_at(scenario, t, xi, xi2, rng.normal(size=(count, 2)))
     keep = np.min(room, axis=1) > 0.05
     return jnp.asarray(t[keep]), jax.tree.map(lambda x: x[keep], states)
@@ -151,12 +137,8 @@ def test_the_torque_is_the_independent_one_at_random_gains_bounds_and_states(rng
         scenario = loop.scenario
         t, states = random_states(scenario, seed=int(rng.integers(1 << 30)))
         tau, V1 = torque(scenario, t, states)
-        others = [
-            loop.full(*x)
-            for x in zip(
-                np.asarray(t), np.hstack([states.q, states.dq, states.observer]), strict=True
-            )
-        ]
+        rows = np.hstack([states.q, states.dq, states.observer])
+        others = [loop.full(*x) for x in zip(np.asarray(t), rows, strict=True)]
         np.testing.assert_allclose(tau, [x[1] for x in others], rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(V1, [x[2] for x in others], rtol=1e-9)
 
@@ -240,62 +222,19 @@ class _WithoutCrossTerm(controllers.BarrierBackstepping):
         return command._replace(tau=command.tau + added), rate
 
 
-@pytest.fixture(scope="module")
-def certificate():
-    return ij.certify(ij.presets.zhang_yan_2024_full_state(), duration=3.0, dt=5e-4)
-
-
 @pytest.mark.slow
-def test_the_certificate_holds_line_by_line(certificate):
+def test_rate_gain_and_envelope_of_the_certificate():
+    """Its lines are among the texts of `test_certificate_texts.py`."""
+    certificate = ij.certify(ij.presets.zhang_yan_2024_full_state(), duration=1.0, dt=1e-3)
     lines = {line.name: line for line in certificate.lines}
     assert certificate.verdict == "holds"
-    for name in (
-        "alpha inside",
-        "start speed inside",
-        "barriers",
-        "inequality, case 2",
-        "envelope, case 2",
-        "xi2, by phi",
-        "velocities inside",
-    ):
-        assert lines[name].verdict == "holds", name
-    assert lines["inequality, case 1"].verdict == "not applicable"
     rho, smallest = lines["rho, case 2"].value, certificate.numbers["lambda_min_run"]
     assert rho == pytest.approx(min(4.0, 40.0, 2 * (100.0 - 0.5 - 0.25 / (8.0 * smallest**2))))
     assert lines["kf and c, case 2"].margin == pytest.approx(99.5 - 0.25 / (8.0 * smallest**2))
     assert np.all(certificate.traces.e2 <= certificate.traces.e2_bound)
-
-
-@pytest.mark.slow
-def test_the_envelope_is_the_one_that_the_inequality_gives(certificate):
     V, t, F_d = certificate.traces.V, certificate.traces.t, certificate.numbers["F_d"]
     expected = V[0] * np.exp(-4.0 * t) + 0.5 * F_d**2 / 4.0
     np.testing.assert_allclose(certificate.traces.envelope, expected, rtol=1e-9)
-
-
-@pytest.mark.slow
-def test_without_disturbance_case_1_counts():
-    quiet = {"disturbance.acceleration_amplitude": 0.0, "disturbance.velocity_amplitude": 0.0}
-    certificate = ij.certify(
-        ij.with_parameters(ij.presets.zhang_yan_2024_full_state(), quiet), duration=0.5, dt=5e-4
-    )
-    lines = {line.name: line for line in certificate.lines}
-    assert certificate.verdict == "holds"
-    assert lines["inequality, case 1"].verdict == lines["envelope, case 1"].verdict == "holds"
-
-
-@pytest.mark.slow
-def test_too_small_a_c_is_told_with_the_one_that_would_do():
-    certificate = ij.certify(
-        ij.presets.zhang_yan_2024_full_state(kf=20.0, c=1.0), duration=0.3, dt=1e-3
-    )
-    lines = {line.name: line for line in certificate.lines}
-    assert lines["kf and c, case 2"].verdict == "fails"
-    assert "would do" in lines["kf and c, case 2"].note
-    assert lines["barriers"].verdict == "holds"
-    assert (
-        lines["envelope, case 2"].verdict == lines["velocities inside"].verdict == "not applicable"
-    )
 
 
 @pytest.mark.slow
@@ -322,22 +261,18 @@ def test_no_velocity_bound_is_violated_from_random_feasible_starts():
         "initial.dq": ij.value(ij.uniform([-1.55, -1.35], [0.65, 0.45])),
     }
     # The torque jumps where e2 changes its sign; what is judged is no trajectory.
+    how = {"duration": 2.0, "dt": 2.5e-4, "progress": False}
     with pytest.warns(UserWarning, match="inaccurate"):
-        study = ij.monte_carlo(
-            scenario, perturbations, runs=28 * starts // 10, duration=2.0, dt=2.5e-4, progress=False
-        )
+        study = ij.monte_carlo(scenario, perturbations, runs=28 * starts // 10, **how)
     law, context, zero = scenario.controller, scenario.context, jnp.zeros(())
 
     def start(q, dq):
         inner = tubes_of(law, zero, q, dq, context)[1]
-        return jnp.min(jnp.minimum(inner.q_d - inner.lower, inner.upper - inner.q_d)), jnp.max(
-            jnp.abs(inner.xi(dq))
-        )
+        room = jnp.minimum(inner.q_d - inner.lower, inner.upper - inner.q_d)
+        return jnp.min(room), jnp.max(jnp.abs(inner.xi(dq)))
 
-    room, xi2 = (
-        np.asarray(x)
-        for x in jax.vmap(start)(study.samples["initial.q"], study.samples["initial.dq"])
-    )
+    starts_of_runs = (study.samples[f"initial.{name}"] for name in ("q", "dq"))
+    room, xi2 = (np.asarray(x) for x in jax.vmap(start)(*starts_of_runs))
     feasible = (room > 0.05) & (xi2 < 0.95)
     assert feasible.sum() >= starts
     status = np.asarray(study.status)[feasible]
@@ -405,15 +340,9 @@ class Pieces:
                 event(lambda t, x: self.rate(t, x, mode)[1] - 1.0, 1, joint, True)
             else:
                 event(lambda t, x, i=joint: self.e2(t, x)[i], -1 if side else 1, joint, not side)
-        how = {"method": "DOP853", "rtol": 1e-10, "atol": 1e-12}
-        found = solve_ivp(
-            lambda t, x: self.rate(t, x, mode)[0],
-            (t, duration),
-            x,
-            events=[e[0] for e in events],
-            max_step=0.02,
-            **how,
-        )
+        how = {"method": "DOP853", "rtol": 1e-10, "atol": 1e-12, "max_step": 0.02}
+        how["events"] = [e[0] for e in events]
+        found = solve_ivp(lambda t, x: self.rate(t, x, mode)[0], (t, duration), x, **how)
         t, x = found.t[-1], found.y[:, -1]
         if t == duration:
             return t, x
@@ -421,23 +350,15 @@ class Pieces:
             if len(times):
                 after = [*mode[:joint], new, *mode[joint + 1 :]]
                 onwards = self.approach(t, x, self.rate(t, x, after)[0])[joint]
-                self.mode = (
-                    after
-                    if mode[joint] is None or (onwards > 0) == new
-                    else [*mode[:joint], None, *mode[joint + 1 :]]
-                )
+                slides = mode[joint] is not None and (onwards > 0) != new
+                self.mode = [*mode[:joint], None, *mode[joint + 1 :]] if slides else after
                 self.passed.append((joint, self.mode[joint]))
         beyond = min(t + 1e-7, duration)  # off the surface, where the event would be found again
         return beyond, x + (beyond - t) * self.rate(t, x, self.mode)[0]
 
 
 GAINS = {"k1": 2.0, "K2": 12.0, "c": 1.0, "kf": 100.0}
-PATHS = {
-    "k1": "controller.k[0]",
-    "K2": "controller.k[1]",
-    "c": "controller.c[1]",
-    "kf": "observer.kf",
-}
+PATHS = ("controller.k[0]", "controller.k[1]", "controller.c[1]", "observer.kf")
 
 
 def pieces(duration, **gains):
@@ -463,11 +384,10 @@ def outcome_by(duration, dt):
     scenario = FullLoop(q0=(0.62, 0.55), dq0=(-0.3, 0.2)).scenario
 
     def outcome(gains):
-        values = {path: jnp.full(2, x) for path, x in zip(PATHS.values(), gains, strict=True)}
+        values = {path: jnp.full(2, x) for path, x in zip(PATHS, gains, strict=True)}
         run = ij.simulate(ij.with_parameters(scenario, values), duration=duration, dt=dt)
-        return jnp.array(
-            [jnp.trapezoid(jnp.sum(run.e1**2, axis=1), dx=dt), run.metrics["effort"], *run.q[-1]]
-        )
+        ise = jnp.trapezoid(jnp.sum(run.e1**2, axis=1), dx=dt)
+        return jnp.array([ise, run.metrics["effort"], *run.q[-1]])
 
     return outcome
 
@@ -551,19 +471,3 @@ def test_a_barrier_states_whether_its_ratio_jumps(name):
         x = jnp.stack([scenario.initial.q, scenario.initial.dq])
         found = each.switching(jnp.zeros(()), x, jnp.zeros(2), scenario.context, ())
         assert (found is not None) == FAMILY[name].ratio_jumps
-
-
-@pytest.mark.slow
-def test_it_stands_beside_other_laws_with_the_margin_of_the_velocities():
-    scenario = ij.presets.zhang_yan_2024_full_state()
-    plain = controllers.Backstepping(k1=2.0, K2=20.0, o=0.1, variant="corrected")
-    compared = ij.compare(
-        scenario, {"full state": scenario.controller, "plain": plain}, duration=0.5, dt=5e-4
-    )
-    rows = {row.law: row for row in compared.table["gains"]}
-    for name, run in compared.rollouts.items():
-        assert rows[name].velocity_margin == pytest.approx(
-            float(jnp.min(run.metrics.velocity_margin))
-        )
-    assert "velocity margin" in repr(compared)
-    assert "velocity_margin" in compared.to_pandas()

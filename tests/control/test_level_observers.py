@@ -172,25 +172,6 @@ def test_a_period_of_a_level_observer_is_exact():
     np.testing.assert_allclose(step + shift, after, atol=1e-8)
 
 
-@pytest.mark.slow
-def test_a_law_of_robots_receives_the_torque():
-    """M0 d_hat_2 of a LevelObserver is the f_hat of a Momentum observer in the continuous loop,
-    where M is constant only; here the loops agree in their estimates of a slow disturbance."""
-    slow = ij.disturbances.Step(size=[0.5, -0.3], time=0.0)
-    estimates = []
-    for observer in (
-        ij.observers.LevelObserver(gain=(0.0, 30.0)),
-        ij.observers.Momentum(kf=30.0, start="matched"),
-    ):
-        run = ij.simulate(
-            ij.with_parts(PAPER, observer=observer, disturbance=slow), duration=0.5, dt=1e-3
-        )
-        assert run.disturbance_estimate.shape == run.q.shape
-        estimates.append(run.disturbance_estimate[-1])
-    np.testing.assert_allclose(estimates[0], [0.5, -0.3], atol=1e-3)
-    np.testing.assert_allclose(estimates[1], [0.5, -0.3], atol=1e-3)
-
-
 # --- StateObserver --------------------------------------------------------------------------------
 
 

@@ -50,9 +50,8 @@ def test_what_is_watched_is_what_the_samples_say(watched):
     np.testing.assert_allclose(run.dq_upper, high, atol=1e-15)
     assert run.ok
     for name, signal in (("velocity_margin", run.dq), ("alpha_margin", run.alpha)):
-        np.testing.assert_allclose(
-            run.metrics[name], np.minimum(signal - low, high - signal).min(axis=0), rtol=1e-12
-        )
+        expected = np.minimum(signal - low, high - signal).min(axis=0)
+        np.testing.assert_allclose(run.metrics[name], expected, rtol=1e-12)
     assert np.isinf(run.metrics.first_velocity_violation_time)
     assert int(run.metrics.first_velocity_violation_joint) == -1
 
@@ -112,44 +111,29 @@ def test_a_dataset_has_them(watched):
 def test_requirements_on_velocities():
     scenario = paper(speeds((-0.6, -0.6)))
     objective = ij.objectives.tracking() + ij.objectives.velocity_margin_above(0.02)
-    result = ij.tune(
-        scenario,
-        ["controller.k1"],
-        objective,
-        duration=0.3,
-        dt=1e-3,
-        effort=ij.tuning.Effort(iterations=12),
-        progress=False,
-    )
+    short = {"duration": 0.3, "dt": 1e-3, "progress": False}
+    effort = ij.tuning.Effort(iterations=12)
+    result = ij.tune(scenario, ["controller.k1"], objective, effort=effort, **short)
     line = result.report.verdicts[0]
     assert (line.name, line.unit, line.verdict) == ("velocity margin > 0.02 rad/s", "rad/s", "pass")
     run = result.nominal[1]
     assert float(np.min(run.metrics.velocity_margin)) == pytest.approx(line.value)
     assert float(np.min(result.nominal[0].metrics.velocity_margin)) < 0.02
     with pytest.raises(ValueError, match="bounds of the second level"):
-        ij.tune(
-            paper(None),
-            ["controller.k1"],
-            objective,
-            duration=0.3,
-            dt=1e-3,
-            progress=False,
-        )
+        ij.tune(paper(None), ["controller.k1"], objective, **short)
 
 
 @pytest.mark.slow
 def test_figures(watched, violated):
     figure = plotting.velocities({"wide": watched, "narrow": violated})
     assert len(figure.axes) == 4
-    drawn = [
-        line.get_ydata() for line in figure.axes[0].get_lines() if line.get_label() == "bounds"
-    ]
-    np.testing.assert_allclose(drawn[0][0], watched.dq_lower[0, 0])
-    box = next(
-        line
-        for line in plotting.velocity_portrait(watched, 1).axes[0].get_lines()
-        if line.get_label() == "bounds"
-    )
+
+    def drawn(figure):
+        lines = figure.axes[0].get_lines()
+        return next(line for line in lines if line.get_label() == "bounds")
+
+    np.testing.assert_allclose(drawn(figure).get_ydata()[0], watched.dq_lower[0, 0])
+    box = drawn(plotting.velocity_portrait(watched, 1))
     np.testing.assert_allclose(box.get_ydata(), [-1.4, -1.4, 0.5, 0.5, -1.4])
     np.testing.assert_allclose(box.get_xdata()[:2], [watched.lower[0, 1], watched.upper[0, 1]])
     free = ij.simulate(paper(None), **SHORT)
@@ -190,9 +174,7 @@ def test_limits_of_a_robot():
     np.testing.assert_allclose(found.lower.value, -np.asarray(found.upper.value))
     with pytest.raises(ValueError, match="speed limits"):
         bounds.from_speed_limits(ij.presets.customary_two_link())
+    zero, inertia = [[0, 0, 0]], [[1, 1, 1, 0, 0, 0]]
+    fast = ij.robots.Arm(mass=[1.0], centre=zero, inertia=inertia, position=zero)
     with pytest.raises(ValueError, match="unlimited"):
-        bounds.from_speed_limits(
-            ij.robots.Arm(
-                mass=[1.0], centre=[[0, 0, 0]], inertia=[[1, 1, 1, 0, 0, 0]], position=[[0, 0, 0]]
-            )
-        )
+        bounds.from_speed_limits(fast)

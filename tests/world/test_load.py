@@ -399,9 +399,10 @@ def test_bad_files_are_refused_by_name(name, file):
     text, message = {**BAD, **BAD_MJCF}[name]
     path = file(text)
     start = time.perf_counter()
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=message) as caught:
         ij.robots.load(path)
     assert time.perf_counter() - start < 1.0
+    assert str(caught.value).count(str(path)) == 1
 
 
 STRANGE_NUMBERS = (
@@ -437,23 +438,6 @@ def test_decimal_numbers_are_read(text, file):
     np.testing.assert_array_equal(arm.mass, [2.5])
 
 
-def test_every_refusal_of_a_field_names_the_file(file):
-    for name, (text, _) in {**BAD, **BAD_MJCF}.items():
-        path = file(text)
-        with pytest.raises(ValueError, match=r"arm\.urdf") as caught:
-            ij.robots.load(path)
-        assert str(caught.value).count(str(path)) == 1, name
-    for arguments in (
-        {"base": "bases"},
-        {"tip": "tool", "gravity": 9.81},
-        {"tip": "tool", "locked": {"elbows": 0.0}},
-    ):
-        with pytest.raises(
-            ValueError, match=rf"^{list(arguments)[-1]}: got .* The file is .*arm\.urdf"
-        ):
-            ij.robots.load(file(robot(*GRIPPER)), **arguments)
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -470,8 +454,9 @@ def test_every_refusal_of_a_field_names_the_file(file):
     ],
 )
 def test_bad_arguments_are_refused(arguments, message, file):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=message) as caught:
         ij.robots.load(file(robot(*GRIPPER)), **arguments)
+    assert "arm.urdf" in str(caught.value)
 
 
 def test_paths_that_are_no_files(tmp_path):
