@@ -121,38 +121,6 @@ def test_fault_between_two_instants_against_scipy():
     np.testing.assert_allclose(run.disturbance_estimate[-1], expected["f_hat"], atol=1e-5)
 
 
-@pytest.mark.slow
-def test_levels_in_a_sampled_loop_against_scipy():
-    step, period, samples = np.array([0.5, 0.2]), 5e-3, 20
-    law = ij.controllers.PDGravity(Kp=20.0, Kd=2.0)
-    scenario = ij.with_parts(
-        SLOW,
-        controller=law,
-        observer=ij.observers.NoObserver(),
-        sampling=ij.Sampling(period=period),
-        actuator=ij.actuators.Quantiser(step),
-    )
-    run = ij.simulate(scenario, duration=samples * period, dt=period / 10)
-    x = np.concatenate([LOOP.q0, LOOP.dq0, np.zeros(2)])
-    levels = []
-    for k in range(samples):
-        gravity = LOOP.arm(x[:2])[2]
-        desired, rate_desired, _ = sine(*LOOP.reference)(k * period)
-        u = gravity - 20.0 * (x[:2] - desired) - 2.0 * (x[2:4] - rate_desired)
-        tau = step * np.round(u / step)
-        levels.append(tau)
-        x = solve_ivp(
-            lambda t, x, tau=tau: moved(t, x, lambda _: tau)[0],
-            (k * period, (k + 1) * period),
-            x,
-            "DOP853",
-            rtol=1e-11,
-            atol=1e-13,
-        ).y[:, -1]
-    np.testing.assert_allclose(end_of(run), x[:4], rtol=0, atol=1e-7)
-    assert len(np.unique(np.round(levels, 9)[:, 0])) > 5
-
-
 # --- delay ----------------------------------------------------------------------------------------
 
 
@@ -293,9 +261,20 @@ def test_delays_beyond_the_history_or_below_a_step_are_flagged(delays):
 # --- what is refused, and what is reported --------------------------------------------------------
 
 
-def noisy_delayed_run(noise):
-    scenario = ij.with_parts(with_actuator(ij.actuators.Delay(0.01)), process_noise=noise)
-    return ij.simulate(scenario, duration=0.1, dt=1e-3, method="euler_maruyama")
+DELAYED = with_actuator(ij.actuators.Delay(0.01))
+
+
+def run_delayed(scenario=DELAYED, **options):
+    return ij.simulate(scenario, **({"duration": 0.1, "dt": 1e-3} | options))
+
+
+def noisy(noise):
+    noisy = ij.with_parts(DELAYED, process_noise=noise)
+    return run_delayed(noisy, method="euler_maruyama")
+
+
+def end_by(delay):
+    return run_delayed(with_actuator(ij.actuators.Delay(delay))).q[-1].sum()
 
 
 @pytest.mark.parametrize(
@@ -307,47 +286,17 @@ def noisy_delayed_run(noise):
             lambda: with_actuator(ij.actuators.Ideal(), ij.actuators.Delay(0.01)),
             "a Delay as the first part only",
         ),
+        (lambda: ij.with_parts(DELAYED, sampling=ij.Sampling(period=1e-3)), "Sampling"),
+        (lambda: ij.vector_field(DELAYED), "past states"),
+        (lambda: run_delayed(dt=0.02), "at least one time step"),
+        (lambda: run_delayed(method="euler"), "heun"),
+        (lambda: ij.recommended_dt(DELAYED, duration=0.1, method="euler"), "heun"),
+        (lambda: noisy(ij.process_noise.Additive(0.1)), 'expected "stochastic_heun"'),
         (
-            lambda: ij.with_parts(
-                with_actuator(ij.actuators.Delay(0.01)), sampling=ij.Sampling(period=1e-3)
-            ),
-            "Sampling",
-        ),
-        (lambda: ij.vector_field(with_actuator(ij.actuators.Delay(0.01))), "past states"),
-        (
-            lambda: ij.simulate(with_actuator(ij.actuators.Delay(1e-3)), duration=0.1, dt=2e-3),
-            "at least one time step",
-        ),
-        (
-            lambda: ij.simulate(
-                with_actuator(ij.actuators.Delay(0.01)), duration=0.1, dt=1e-3, method="euler"
-            ),
-            "heun",
-        ),
-        (
-            lambda: ij.recommended_dt(
-                with_actuator(ij.actuators.Delay(0.01)), duration=0.1, method="euler"
-            ),
-            "heun",
-        ),
-        (
-            lambda: noisy_delayed_run(ij.process_noise.Additive(0.1)),
-            'expected "stochastic_heun"',
-        ),
-        (
-            lambda: noisy_delayed_run(ij.process_noise.Proportional(0.1)),
+            lambda: noisy(ij.process_noise.Proportional(0.1)),
             "scenario.process_noise: got 'Proportional'",
         ),
-        (
-            lambda: jax.grad(
-                lambda h: (
-                    ij.simulate(with_actuator(ij.actuators.Delay(h)), duration=0.1, dt=1e-3)
-                    .q[-1]
-                    .sum()
-                )
-            )(0.01),
-            "Delay.history",
-        ),
+        (lambda: jax.grad(end_by)(0.01), "Delay.history"),
     ],
 )
 def test_refusals_name_the_field_and_the_remedy(call, words):

@@ -253,21 +253,6 @@ def test_the_gain_of_prescribed_time_rises_from_the_start_to_the_cap():
     assert np.all(found <= np.minimum(pole, 32.0) + 1e-12)
 
 
-def test_times_to_the_band_are_below_their_closed_forms(rng):
-    """The claims of the docstrings, by quadrature of the smoothed equations."""
-    for _ in range(60):
-        k, k_a, k_b = rng.uniform(0.2, 4.0, 3)
-        a, b = rng.uniform(0.2, 0.9), rng.uniform(1.1, 2.5)
-        delta, z0 = 10.0 ** rng.uniform(-4.0, -0.5), 10.0 ** rng.uniform(-0.2, 1.5)
-        smoothed = k_a * 2.0 ** ((a - 1.0) / 2.0)
-        finite = other.time_to_band(k, other.Powers(((k_a, a),), delta), z0, delta)
-        bound = np.log(1.0 + k * z0 ** (1.0 - a) / smoothed) / (k * (1.0 - a))
-        assert 0.0 < finite <= bound
-        powers = other.Powers(((k_a, a), (k_b, b)), delta)
-        fixed = other.time_to_band(0.0, powers, z0, delta)
-        assert 0.0 < fixed <= 1.0 / (smoothed * (1.0 - a)) + 1.0 / (k_b * (b - 1.0))
-
-
 BARRIERS = (
     barriers.Integral(),
     barriers.Log(p=2),

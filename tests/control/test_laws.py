@@ -281,35 +281,6 @@ def test_saturation_says_what_is_wrong():
 
 
 @pytest.mark.slow
-def test_extended_state_observer_obeys_its_error_equation():
-    scenario = dataclasses.replace(
-        ij.presets.zhang_yan_2024(variant="corrected"),
-        observer=observers.ExtendedState(bandwidth=30.0),
-        initial=ij.Initial(Q, DQ),
-    )
-
-    def f_tilde(t, state):
-        sample = evaluate(scenario, t, state)[1]
-        return sample.disturbance - sample.disturbance_estimate
-
-    def f(t, state):
-        return evaluate(scenario, t, state)[1].disturbance
-
-    def along(g):
-        return lambda t, state: jax.jvp(g, (t, state), (jnp.ones(()), rate(scenario, t, state)))[1]
-
-    t, state = jnp.asarray(0.4), initial_state(scenario)
-    state = state._replace(
-        observer=state.observer._replace(
-            f_hat=jnp.array([0.3, -0.2]), p_hat=state.observer.p_hat + 0.01
-        )
-    )
-    left = along(along(f_tilde))(t, state) + 60.0 * along(f_tilde)(t, state)
-    right = along(along(f))(t, state) + 60.0 * along(f)(t, state)
-    np.testing.assert_allclose(left + 900.0 * f_tilde(t, state), right, rtol=1e-8)
-
-
-@pytest.mark.slow
 def test_gains_of_the_extended_state_observer_have_two_forms():
     scenario = ij.presets.zhang_yan_2024(variant="corrected")
     forms = [observers.ExtendedState(bandwidth=40.0), observers.ExtendedState(l1=80.0, l2=1600.0)]

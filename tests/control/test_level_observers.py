@@ -115,31 +115,6 @@ def test_an_observer_of_robots_serves_level_2(order, observer, rng):
         np.testing.assert_allclose(dot, expected, rtol=1e-8, atol=1e-8)
 
 
-def test_a_level_observer_finds_a_constant_disturbance_of_each_level():
-    """d' = 0: d_tilde decays as exp(-kappa t), without any law."""
-    plant = PLANTS[3]
-    observer = ij.observers.LevelObserver(gain=(5.0, 20.0, 40.0))
-    d = np.array([[0.1, -0.2], [3.0, -1.0], [10.0, 5.0]])
-    kappa = np.array([[5.0], [20.0], [40.0]])
-    shape = (2, 3, 2)
-
-    @jax.jit
-    def rate(t, z):
-        x, eta = z.reshape(shape)
-        u = jnp.stack([3.0 * jnp.sin(5.0 * t), jnp.cos(3.0 * t)])
-        moved = plants.flow(plant, t, x, u) + d
-        observed = observer.derivative(t, x, u, plant, eta)
-        return jnp.stack([moved, observed]).reshape(-1)
-
-    x = jnp.array([[0.3, 0.2], [0.1, -0.1], [1.0, 0.5]])
-    observer = ij.observers.LevelObserver(gain=observer.gain[:, None] * jnp.ones(2))
-    start = jnp.stack([x, observer.init(x, plant)]).reshape(-1)
-    found = solve_ivp(rate, (0.0, 0.2), start, rtol=1e-10, atol=1e-12)
-    end = jnp.asarray(found.y[:, -1]).reshape(shape)
-    d_hat = observer.estimate(0.2, end[0], plant, end[1])
-    np.testing.assert_allclose(d - d_hat, d * np.exp(-kappa * 0.2), atol=1e-7)
-
-
 def test_the_start_of_a_level_observer():
     x, plant = jnp.ones((3, 2)), PLANTS[3]
     for start, expected in (("matched", 0.3), ("zero", np.array([[0.3], [2.3], [4.3]]))):
@@ -201,7 +176,7 @@ def test_a_state_observer_of_a_short_period_is_the_continuous_one():
     np.testing.assert_allclose(rates, [3e2, 3e4, 1e6], rtol=1e-3)
 
 
-@pytest.mark.parametrize("measured", [(1,), (1, 3), (1, 2, 3, 4)])
+@pytest.mark.parametrize("measured", [(1,), (1, 3)])
 def test_a_state_observer_converges_to_the_levels_and_the_disturbance(measured):
     """A flexible joint under an input that no law computes, with a constant disturbance of the last
     level of each segment."""

@@ -10,7 +10,6 @@ import pytest
 from arm_cases import loop_on
 from independent_arm import TwoLinkArm
 from scipy.integrate import solve_ivp
-from scipy.optimize import brentq
 
 import iblf_jax as ij
 from iblf_jax.core import notices
@@ -131,23 +130,6 @@ def test_the_trajectory_and_the_band():
     e, v = found.y[:2, late].T - q_d, found.y[2:, late].T - dq_d
     assert np.all(np.abs(e) <= 1.01 * sigma)
     assert np.all(np.abs(v) <= (2.02 * LAW["beta"] * sigma) ** (1.0 / LAW["p"]))
-
-
-def test_the_error_on_the_surface_settles_within_the_stated_time():
-    """sigma = 0: the time from e0 to the size at which the smoothing acts, by quadrature."""
-    for p, beta, delta, e0 in ((1.5, 1.0, 0.01, 0.5), (1.2, 3.0, 0.05, 1.0), (1.8, 0.5, 0.02, 0.3)):
-
-        def speed(e, p=p, beta=beta, delta=delta):
-            return brentq(
-                lambda v: v * (v * v + delta * delta) ** ((p - 1) / 2) - beta * e, 0.0, 50.0
-            )
-
-        smallest = 2.0 ** ((p - 1) / 2) * delta**p / beta
-        grid = np.geomspace(smallest, e0, 2001)
-        rates = np.array([1.0 / speed(e) for e in grid])
-        time = float(np.sum(0.5 * (rates[1:] + rates[:-1]) * np.diff(grid)))
-        stated = p / (p - 1) * (2.0 ** ((p - 1) / 2) / beta) ** (1.0 / p) * e0 ** (1.0 - 1.0 / p)
-        assert 0.3 * stated < time < stated
 
 
 @pytest.mark.slow

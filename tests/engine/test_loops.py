@@ -16,7 +16,7 @@ import pytest
 import iblf_jax as ij
 from iblf_jax.core import programs
 from iblf_jax.core.status import Status
-from iblf_jax.engine import compile, native, plan, registry, thresholds
+from iblf_jax.engine import native, plan, registry, thresholds
 from iblf_jax.engine.batch import Batch, run_all
 from iblf_jax.engine.carry import Inputs
 from iblf_jax.engine.loops import checkpointed, kernel_stepper, scan
@@ -132,38 +132,6 @@ def test_a_failed_run_is_not_reported_inside_a_transformation(short_loop):
     assert np.all(np.isfinite(slope)) and slope.shape == (2, 2)
     with pytest.raises(ij.SimulationError, match="left its bounds"):
         ij.simulate(fast, **failing)
-
-
-@pytest.mark.slow
-def test_the_stages_of_a_long_loop_are_rolled(paper, monkeypatch):
-    """By its length alone; a batch from outside and derivatives work as ever."""
-    before = ij.simulate(paper, duration=0.011, dt=1e-3, backend="vmap")
-    monkeypatch.setattr(thresholds, "LONG_EVALUATION", 0)
-    compile.plan_of_single_run.cache_clear()
-    try:
-
-        def ise(K2):
-            return ij.simulate(
-                ij.with_parameters(paper, {"controller.K2": K2}),
-                duration=0.011,
-                dt=1e-3,
-                backend="vmap",
-            ).metrics.ise.sum()
-
-        compact = ij.simulate(paper, duration=0.011, dt=1e-3, backend="vmap")
-        K2 = jnp.array([20.0, 30.0])
-        slope = jax.grad(ise)(K2)
-        values = jax.vmap(ise)(K2[:, None] * jnp.ones(2))
-    finally:
-        compile.plan_of_single_run.cache_clear()
-    np.testing.assert_allclose(before.q, compact.q, rtol=0, atol=1e-12)
-    step = 1e-3
-    for i in range(2):
-        move = step * np.eye(2)[i]
-        assert float(slope[i]) == pytest.approx(
-            float(ise(K2 + move) - ise(K2 - move)) / (2 * step), rel=1e-5
-        )
-    assert float(values[0]) == pytest.approx(float(before.metrics.ise.sum()), rel=1e-9)
 
 
 @pytest.mark.parametrize("steps", [1, 2, 7, 100, 501, 4001, 20_001])

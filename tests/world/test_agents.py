@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import independent_agents as other
 import jax
 import jax.numpy as jnp
@@ -172,31 +170,6 @@ def test_the_certificate_of_the_levels_holds(distributed):
         assert any("ultimate boundedness" in note for note in repr(found).splitlines())
 
 
-@pytest.mark.slow
-def test_more_agents_cost_in_proportion_to_their_number():
-    """A chain and an undirected path: the operations of a law grow as N, not as N^2."""
-
-    def operations(count, undirected):
-        adjacency = np.eye(count, k=-1)
-        if undirected:
-            adjacency = adjacency + np.eye(count, k=1)
-        stack = plants.Agents(
-            agents=[pendulum(0)] * count,
-            adjacency=as_rows(adjacency),
-            leader=(1.0,) + (0.0,) * (count - 1),
-        )
-        parts = jnp.zeros((2, count))
-        rate = partial(plants.flow, stack, 0.0)
-        jaxpr = jax.make_jaxpr(lambda y: sparse.solve(stack.matrix, list(y)))(parts[0])
-        assert np.all(np.isfinite(rate(parts, parts[0])))
-        return sum(eqn.primitive.name in ("mul", "add", "sub", "div") for eqn in jaxpr.eqns)
-
-    for undirected in (False, True):
-        counts = [operations(count, undirected) for count in (4, 8, 16)]
-        steps = np.diff(counts) / [4, 8]
-        assert steps[0] == steps[1]
-
-
 def test_a_sparse_solution_is_that_of_numpy(rng):
     adjacency = np.where(rng.uniform(size=(7, 7)) < 0.4, rng.uniform(size=(7, 7)), 0.0)
     np.fill_diagonal(adjacency, 0.0)
@@ -207,31 +180,24 @@ def test_a_sparse_solution_is_that_of_numpy(rng):
 
 
 PAIR = (pendulum(0), pendulum(1))
+
+
+def agents(adjacency=((0, 0), (1, 0)), leader=(1, 0), agents=PAIR):
+    return plants.Agents(agents=agents, adjacency=adjacency, leader=leader)
+
+
 REFUSED = {
     "unreached": (
-        lambda: plants.Agents(agents=PAIR, adjacency=((0, 0), (0, 0)), leader=(1, 0)),
+        lambda: agents(((0, 0), (0, 0))),
         r"no path from the leader to agent 2.*adjacency\[i\]\[j\] > 0 is a path",
     ),
-    "loop": (
-        lambda: plants.Agents(agents=PAIR, adjacency=((1, 0), (1, 0)), leader=(1, 0)),
-        "a zero diagonal",
-    ),
-    "negative": (
-        lambda: plants.Agents(agents=PAIR, adjacency=((0, 0), (-1, 0)), leader=(1, 0)),
-        r"Agents\.adjacency.*numbers >= 0",
-    ),
+    "loop": (lambda: agents(((1, 0), (1, 0))), "a zero diagonal"),
+    "negative": (lambda: agents(((0, 0), (-1, 0))), r"Agents\.adjacency.*numbers >= 0"),
     "sizes": (
-        lambda: plants.Agents(
-            agents=(PAIR[0], ij.presets.customary_two_link()),
-            adjacency=((0, 0), (1, 0)),
-            leader=(1, 0),
-        ),
+        lambda: agents(agents=(PAIR[0], ij.presets.customary_two_link())),
         r"Agents\.agents\[1\]\.n: got 2, expected 1",
     ),
-    "no plant": (
-        lambda: plants.Agents(agents=("arm",), adjacency=((0,),), leader=(1,)),
-        "a plant or a robot",
-    ),
+    "no plant": (lambda: agents(((0,),), (1,), ("arm",)), "a plant or a robot"),
     "weights of the leader": (
         lambda: references.Leader(motion=MOTION, weights=(1.0, -1.0), components=1),
         r"Leader\.weights.*finite numbers >= 0",
