@@ -128,6 +128,3 @@ def _sine_at(parts, t):
     offset, amplitude, frequency, phase = (np.asarray(x, float) * np.ones(2) for x in parts)
     angle = frequency * t + phase
     return offset + amplitude * np.sin(angle), amplitude * frequency * np.cos(angle)
-
-
-QUADRATURE = np.polynomial.legendre.leggauss(80)
