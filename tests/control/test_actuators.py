@@ -195,8 +195,7 @@ def test_delay_and_fault_against_scipy():
 def test_derivative_by_the_delay_and_by_the_time_of_a_fault():
     def end(values, dt=1e-3, history=5):
         scenario = with_actuator(
-            ij.actuators.Delay(values[0], history=history),
-            ij.actuators.Fault(RHO, BIAS, values[1]),
+            ij.actuators.Delay(values[0], history=history), ij.actuators.Fault(RHO, BIAS, values[1])
         )
         return ij.simulate(scenario, duration=0.05, dt=dt).q[-1]
 

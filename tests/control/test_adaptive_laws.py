@@ -176,6 +176,20 @@ def test_the_vector_field_is_that_of_an_independent_program(name, rng):
         np.testing.assert_allclose(flat(found, i), expected, rtol=1e-12, atol=1e-12 * scale)
 
 
+@pytest.mark.release
+@pytest.mark.parametrize("name", CASES)
+def test_a_run_is_that_of_an_independent_program(name):
+    make, program, _ = CASES[name]
+    changed = {"parameters": {"plant.payload": 0.4}, "parameters of order 3": {"plant.H": 7.0}}
+    scenario = ij.with_parameters(make(), changed.get(name, {}))
+    run = ij.simulate(scenario, duration=1.0, dt=2.5e-4, record_every=4000)
+    start = ij.simulation.closed_loop.initial_state(run.scenario)
+    expected = independent.end(program(run.scenario), flat(start), 1.0)
+    last = jax.tree.map(lambda x: x[-1], run.controller_state)
+    found = np.concatenate([np.ravel(x) for x in [run.x[-1], *jax.tree.leaves(last)]])
+    np.testing.assert_allclose(found, expected, atol=1e-7)
+
+
 # ------------------------------------------------------------------------- the claim (R.3)
 
 

@@ -96,10 +96,7 @@ def test_trajectory_of_an_arm():
 
 
 SLOWER = other.Prescribed(2.5, 3.0, 20.0)
-CHAINS = {
-    "surface": (FINITE, SLOWER, FIXED),
-    "flexible": (SLOWER, FIXED, FINITE, SLOWER),
-}
+CHAINS = {"surface": (FINITE, SLOWER, FIXED), "flexible": (SLOWER, FIXED, FINITE, SLOWER)}
 
 
 def chain_with(name, levels):
@@ -362,19 +359,6 @@ def test_prescribed_time_is_refused_above_order_five():
     )
     with pytest.raises(ValueError, match="5 continuous derivatives"):
         ij.simulate(scenario, duration=0.1, dt=1e-2)
-
-
-@pytest.mark.slow
-def test_the_closed_form_of_prescribed_time_on_all_levels_of_order_three():
-    """With one decay and one gain on all levels V(t) = V(0) exp(-2 k t) ((T - t)/T)^(2 gain)."""
-    T, gain, cap, k = 1.0, 3.0, 30.0, 2.0
-    _, scenario = free_pendulum((other.Prescribed(T, gain, cap),) * 3)
-    law = dataclasses.replace(scenario.controller, k=(k,) * 3, c=0.0)
-    scenario = ij.with_parts(scenario, controller=law)
-    run = ij.simulate(scenario, duration=0.8, dt=5e-4, record_every=50)
-    t = np.asarray(run.t)
-    expected = run.V[0] * np.exp(-2.0 * k * t) * (1.0 - t / T) ** (2.0 * gain)
-    np.testing.assert_allclose(run.V, expected, rtol=1e-7)
 
 
 def test_ranges_of_the_powers_end_at_one():

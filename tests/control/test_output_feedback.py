@@ -35,11 +35,7 @@ def reference_rate(w, limit, push, t, z):
     """The rate of (q, q', q_hat, v_hat, d_hat) of this loop, from its equations."""
     q, v, q_hat, v_hat, d_hat = z.reshape(5, 2)
     angle = 1.5 * t + np.array([0.0, 0.4])
-    q_d, dq_d, ddq_d = (
-        0.3 + 0.2 * np.sin(angle),
-        0.3 * np.cos(angle),
-        -0.45 * np.sin(angle),
-    )
+    q_d, dq_d, ddq_d = (0.3 + 0.2 * np.sin(angle), 0.3 * np.cos(angle), -0.45 * np.sin(angle))
     used = np.minimum(np.maximum(d_hat, -limit), limit)
     commanded = ddq_d - KD * (v_hat - dq_d) - KP * (q - q_d) - used
     tau = ARM.inverse_dynamics(q, v_hat, commanded)

@@ -29,11 +29,7 @@ def reference(t):
     """q_d, q_d' and q_d" of the loops here."""
     phase = np.array([0.0, 0.4])
     angle = 1.5 * t + phase
-    return (
-        0.3 + 0.2 * np.sin(angle),
-        0.3 * np.cos(angle),
-        -0.45 * np.sin(angle),
-    )
+    return (0.3 + 0.2 * np.sin(angle), 0.3 * np.cos(angle), -0.45 * np.sin(angle))
 
 
 def surface(law, e, v):

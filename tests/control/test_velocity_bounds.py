@@ -146,10 +146,7 @@ def test_figures(watched, violated):
     ("parts", "words"),
     [
         ({"velocities": 3.0}, r"bounds\[1\]: got 3\.0?, .*a Bounds, or None"),
-        (
-            {"velocities": speeds((-1.6, -1.4), (-1.7, 0.5), (0.0, 0.0))},
-            r"bounds\[1\] of joint 0",
-        ),
+        ({"velocities": speeds((-1.6, -1.4), (-1.7, 0.5), (0.0, 0.0))}, r"bounds\[1\] of joint 0"),
         ({"initial": ij.Initial([0.8, 0.8], [0.0, 0.6])}, r"initial\.dq\[1\]"),
         (
             {"velocities": speeds((-1.6, -1.4, 0.0), (0.6, 0.5, 0.0), (0.1, 0.0, 0.0))},

@@ -122,11 +122,7 @@ def certificate_fields(preset: str) -> Fields:
     return {"certificate": f"{certificate.headline} ({certificate.subject})"} | lines
 
 
-GROUPS = {
-    "structure": structure_fields,
-    "run": run_fields,
-    "certificate": certificate_fields,
-}
+GROUPS = {"structure": structure_fields, "run": run_fields, "certificate": certificate_fields}
 
 
 def as_json(value: Any) -> Any:

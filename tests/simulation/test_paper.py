@@ -92,7 +92,3 @@ def test_the_papers_words_hold(paper_run):
         return np.max(-np.sign(e2[0]) * e2, axis=0)
 
     assert np.all(overshoot(paper_run) > overshoot(log))
-
-
-def test_printed_and_corrected_are_not_the_same(reference_data):
-    assert largest(reference_data["iblf_printed.q"], reference_data["iblf_corrected.q"]) > 1e-5

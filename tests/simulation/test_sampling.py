@@ -206,10 +206,7 @@ def test_a_short_period_is_the_continuous_loop():
     assert 1.7 < errors[0] / errors[1] < 2.3 and 1.7 < errors[1] / errors[2] < 2.3
 
 
-VELOCITIES = [
-    ij.sensors.FilteredDifference(cutoff=700.0),
-    ij.sensors.Tracking(bandwidth=500.0),
-]
+VELOCITIES = [ij.sensors.FilteredDifference(cutoff=700.0), ij.sensors.Tracking(bandwidth=500.0)]
 
 
 @pytest.mark.slow

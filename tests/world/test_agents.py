@@ -202,10 +202,7 @@ REFUSED = {
         lambda: references.Leader(motion=MOTION, weights=(1.0, -1.0), components=1),
         r"Leader\.weights.*finite numbers >= 0",
     ),
-    "no filters": (
-        lambda: scenario(model=STACK.neighbours()),
-        r"controller\.filter.*filter=0\.01",
-    ),
+    "no filters": (lambda: scenario(model=STACK.neighbours()), r"controller\.filter.*filter=0\.01"),
     "as the plant": (
         lambda: ij.simulate(scenario(True, plant=STACK.neighbours()), duration=0.1, dt=1e-2),
         r"row 0 that depends on x\[1\]",

@@ -124,21 +124,6 @@ def test_lumped_parameters_of_the_customary_arm():
     np.testing.assert_allclose(p, [0.226625, 0.0408425, 0.0461125, 0.6475, 0.13175], rtol=1e-12)
 
 
-@pytest.mark.slow
-def test_payload_hangs_at_the_tip(rng):
-    """A payload m adds J^T m J to M and -J^T (0, -m g) to G."""
-    links = random_links(3, rng) | {"payload": 0.0}
-    empty, loaded = PlanarChain(**links), PlanarChain(**(links | {"payload": 0.6}))
-    q = jnp.asarray(rng.uniform(-3, 3, 3))
-    J = np.asarray(empty.jacobian(q))
-    np.testing.assert_allclose(
-        loaded.mass_matrix(q) - empty.mass_matrix(q), 0.6 * J.T @ J, atol=1e-12
-    )
-    np.testing.assert_allclose(
-        loaded.gravity(q) - empty.gravity(q), J.T @ [0, 0.6 * 9.81], atol=1e-12
-    )
-
-
 @pytest.mark.parametrize("n", [2, 7])
 def test_small_algebra_against_numpy(n, rng):
     from iblf_jax.core.linalg import solve_spd
