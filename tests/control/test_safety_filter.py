@@ -191,6 +191,15 @@ def test_backends_agree_and_a_run_alone_is_that_of_a_batch():
 
 
 @pytest.mark.slow
+def test_it_is_sampled():
+    sampling = ij.Sampling(period=2e-3, delay=1e-3)
+    scenario = ij.with_parts(filtered(falling(), nearest="acceleration"), sampling=sampling)
+    run = ij.simulate(scenario, duration=0.08, dt=1e-3)
+    assert float(jnp.min(run.metrics.margin)) > 0
+    assert run.slack.shape == run.q.shape
+
+
+@pytest.mark.slow
 def test_theorem_2_claims_nothing_while_it_works():
     """The certificate of a barrier law within a filter leaves out the samples at which the torque
     was changed."""
