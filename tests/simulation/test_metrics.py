@@ -173,11 +173,11 @@ SLOW = ij.with_parameters(
 )
 STEP = ij.disturbances.Step(size=[8.0, 3.0], time=0.0631)
 LOOPS = {
-    "continuous": {},
-    "sampled and disturbed": {"disturbance": STEP, "sampling": ij.Sampling(1e-2, delay=0.0037)},
+    "sampled": {"sampling": ij.Sampling(period=1e-2, delay=0.0037)},
+    "sampled and disturbed": {"disturbance": STEP, "sampling": ij.Sampling(period=1e-2)},
 }
-"""Parts of scenarios in which nothing jumps, and in which torque, law signals and disturbance
-do."""
+"""Parts of scenarios in which torque and law signals jump, and in which the disturbance does,
+too."""
 INTEGRALS = ("rmse", "ise", "iae", "itae", "effort", "torque_rms", "effort_above_gravity")
 
 
