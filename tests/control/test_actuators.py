@@ -268,8 +268,7 @@ def run_delayed(scenario=DELAYED, **options):
 
 
 def noisy(noise):
-    noisy = ij.with_parts(DELAYED, process_noise=noise)
-    return run_delayed(noisy, method="euler_maruyama")
+    return run_delayed(ij.with_parts(DELAYED, process_noise=noise), method="euler_maruyama")
 
 
 def end_by(delay):

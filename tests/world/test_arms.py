@@ -158,6 +158,14 @@ def test_gains_follow_the_inertia():
     assert float(K2.min()) == arms.MIN_K2
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("law", ["computed_torque", "pd"])
+def test_other_laws_on_the_arm(law):
+    """The yardsticks at gains that suit its wrist, too."""
+    run = ij.simulate(ij.presets.ur5(law=law, payload=0.5), duration=0.08, dt=1e-3)
+    assert run.ok
+
+
 def test_a_scenario_from_an_arm_alone():
     arm = arms.arm("ur5")
     reference = references.Quintic(
@@ -350,11 +358,3 @@ def test_joints_that_move_against_each_other_get_no_fast_mode(name):
 
     assert 50.0 < fastest(taken) < 200.0
     assert fastest(without) > 200.0
-
-
-@pytest.mark.slow
-def test_compare_on_the_arm():
-    """At gains that suit its wrist, too."""
-    laws = ["computed_torque", "pd"]
-    comparison = ij.compare(ij.presets.ur5(payload=0.5), laws, duration=0.08, dt=1e-3)
-    assert all(run.ok for run in comparison.rollouts.values())
