@@ -58,18 +58,21 @@ def random_leaves(rng, n=2):
     }
 
 
-def positions(scenario, varied, dt, steps, method):
-    """Positions of a batch and its verdicts, at the instants of a step dt * FINER."""
+def batches_of(scenario, steps, method):
+    """Leaves and dt -> positions of a batch, widths of the tube, estimates and flags, at the
+    instants of a step dt * FINER if the steps are many."""
+    request = RunRequest(steps, method, FINER if steps > 500 else 1)
     folds = as_folds((), jnp.float64)
-    every = FINER if steps > 500 else 1
-    run = jax.jit(
-        lambda varied, dt: run_batch(scenario, varied, folds, dt, RunRequest(steps, method, every))
-    )
-    found = run({path: jnp.asarray(x) for path, x in varied.items()}, jnp.asarray(dt))
-    arrays = found.records.signals
-    width = arrays["level_upper"] - arrays["level_lower"]
-    signals = (arrays["x"][..., 0, :], width[..., 0, :], found.metrics[RELATIVE], found.status)
-    return tuple(map(np.asarray, signals))
+    run = jax.jit(lambda varied, dt: run_batch(scenario, varied, folds, dt, request))
+
+    def batch(varied, dt):
+        found = run(jax.tree.map(jnp.asarray, varied), jnp.asarray(dt))
+        arrays = found.records.signals
+        width = arrays["level_upper"] - arrays["level_lower"]
+        signals = (arrays["x"][..., 0, :], width[..., 0, :], found.metrics[RELATIVE], found.status)
+        return tuple(map(np.asarray, signals))
+
+    return batch
 
 
 @pytest.mark.slow
@@ -79,9 +82,10 @@ def test_the_estimate_is_about_the_error(shaken, rng, method):
     flag, and good ones are not flagged."""
     scenario, varied, flagged, good = canonical(shaken), random_leaves(rng), 0, 0
     alarms = 0
+    coarse, finer = batches_of(scenario, 400, method), batches_of(scenario, 400 * FINER, "rk4")
     for dt in (1e-3, 2e-3, 5e-3):
-        q, width, estimate, status = positions(scenario, varied, dt, 400, method)
-        fine = positions(scenario, varied, dt / FINER, 400 * FINER, "rk4")[0]
+        q, width, estimate, status = coarse(varied, dt)
+        fine = finer(varied, dt / FINER)[0]
         error = np.max(np.abs(q - fine) / width, axis=(1, 2))
         found = status & int(Status.INACCURATE | Status.STEP_TOO_LARGE) != 0
         assert np.all(found[error > TOLERANCE]), (dt, error[(error > TOLERANCE) & ~found])
