@@ -341,9 +341,10 @@ def test_the_export_refuses(case, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "options", [{"gains": ["controller.K2"]}, {"torque_limits": 5.0}, {"on_fault": "zero"}]
+    ("target", "options"),
+    [("c", {"gains": ["controller.K2"]}), ("fmu", {"torque_limits": 5.0})]
+    + [(target, {"on_fault": "zero"}) for target in ("fmu-loop", "wasm")],
 )
-@pytest.mark.parametrize("target", ["c", "fmu", "fmu-loop", "wasm"])
 def test_other_targets_refuse_options_of_a_node(target, options, tmp_path):
     with pytest.raises(ValueError, match='Only target="ros2" has this option'):
         ij.export(plain(), tmp_path, target=target, period=0.01, **options)
