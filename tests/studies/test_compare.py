@@ -22,19 +22,12 @@ def comparison():
     return ij.compare(ij.presets.zhang_yan_2024(), ["integral", "log", "pd"], **RUN)
 
 
-def effort(run):
-    """RMS torque above gravity from a run with every step recorded."""
-    gravity = np.array([run.scenario.model.gravity(q) for q in run.q])
-    square = np.sum((np.asarray(run.tau) - gravity) ** 2, axis=1)
-    return math.sqrt(np.trapezoid(square, run.t) / float(run.t[-1]))
-
-
 @pytest.mark.slow
 def test_equal_effort_is_equal_effort(comparison):
     assert list(comparison.equal_effort) == ["integral", "log", "pd"]
     efforts = [float(run.metrics.effort_above_gravity) for run in comparison.equal_effort.values()]
     np.testing.assert_allclose(efforts, efforts[0], rtol=1e-5)
-    assert comparison.factors["integral"] == 1.0
+    assert comparison.factors["integral"] == 1.0 < comparison.factors["log"]
     for name, gains in (("log", ("k1", "K2")), ("pd", ("Kp", "Kd"))):
         for gain in gains:
             before, after = (
@@ -42,14 +35,6 @@ def test_equal_effort_is_equal_effort(comparison):
                 for runs in (comparison.rollouts, comparison.equal_effort)
             )
             np.testing.assert_allclose(after, before * comparison.factors[name], rtol=1e-12)
-
-
-@pytest.mark.slow
-def test_the_fold_measures_the_torque_above_gravity():
-    run = ij.simulate(
-        ij.presets.zhang_yan_2024(), duration=0.5, dt=1e-3, metrics=(ij.metrics.AboveGravity(),)
-    )
-    assert float(run.metrics.effort_above_gravity) == pytest.approx(effort(run), rel=1e-9)
 
 
 @pytest.mark.slow
@@ -119,24 +104,14 @@ def test_a_metric_replaces_the_standard_one_of_its_class(comparison):
     folds = (ij.metrics.Settling(tolerance=[0.02, 0.04]), ij.metrics.LyapunovValue())
     options = RUN | {"record_every": 1}
     found = ij.compare(comparison.scenario, ["log"], metrics=folds, equal_effort=False, **options)
+    with pytest.raises(ValueError, match=r"metrics.*Put one fold into brackets"):
+        ij.compare(comparison.scenario, ["log"], metrics=folds[0], **RUN)
     run = found.rollouts["log"]
     inside = np.abs(run.e1) < np.array([0.02, 0.04])
     settled = [np.flatnonzero(~inside[:, i])[-1] + 1 for i in range(2)]
     np.testing.assert_allclose(run.metrics.settling_time, run.t[np.array(settled)])
     assert set(ij.metrics.LyapunovValue.units) <= set(run.metrics)
     assert found.table["gains"][0].settling_time < comparison.table["gains"][1].settling_time
-
-
-def test_metrics_are_a_sequence(comparison):
-    with pytest.raises(ValueError, match=r"metrics.*Put one fold into brackets"):
-        ij.compare(comparison.scenario, ["log"], metrics=ij.metrics.Settling(), **RUN)
-
-
-def test_at_equal_gains_the_integral_form_works_harder_than_the_logarithmic_one(comparison):
-    integral, log = comparison.table["gains"][:2]
-    assert integral.settling_time < log.settling_time
-    assert integral.effort_above_gravity > log.effort_above_gravity
-    assert comparison.factors["log"] > 1.0
 
 
 @pytest.mark.slow
@@ -239,30 +214,10 @@ def test_laws_of_a_users_own():
     assert "no gains (Bang, Bang 2)" in repr(comparison)
 
 
-@pytest.mark.parametrize(
-    "laws", [[], "integral", ["nonsense"], [3.0], {"x": None}, 7, [controllers.PDGravity]]
-)
+@pytest.mark.parametrize("laws", [["nonsense"], [3.0], {"x": None}, [controllers.PDGravity]])
 def test_wrong_laws_are_value_errors(laws):
     with pytest.raises(ValueError, match="laws"):
         ij.compare(ij.presets.zhang_yan_2024(), laws, duration=0.1)
-
-
-@pytest.mark.parametrize(
-    ("effort", "target", "expected"),
-    [
-        (lambda c: c, 3.0, 3.0),
-        (lambda c: c, 0.2, 0.2),
-        (lambda c: c, 1.0, 1.0),
-        (lambda c: (c - 0.5) * (c - 1.1) + 2.0, 2.0, 1.1),  # two roots: the one nearest 1
-        (lambda c: (c - 0.9) * (c - 1.3) + 2.0, 2.0, 0.9),
-        (lambda c: c if c < 2.0 else math.nan, 1.9, 1.9),  # failing runs beyond
-        (lambda c: c if c < 2.0 else math.nan, 3.0, math.nan),
-        (lambda c: 1.0 + 0.1 * math.tanh(c), 5.0, math.nan),
-        (lambda c: math.nan, 1.0, math.nan),
-    ],
-)
-def test_the_factor_is_the_one_nearest_one(effort, target, expected):
-    np.testing.assert_allclose(factor_nearest_one(effort, target), expected, rtol=1e-6)
 
 
 # ----------------------------------------------------------------------- figure and command line
@@ -295,39 +250,20 @@ def test_the_figure_shows_every_law_in_the_same_colour_on_both_sides(comparison)
 @pytest.mark.slow
 def test_command_line(tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    words = [
-        "--laws",
-        "integral",
-        "log",
-        "--duration",
-        "2",
-        "--record-every",
-        "10",
-        "--out",
-        str(tmp_path / "out"),
-    ]
+    words = ["--laws", "integral", "log", "--out", str(tmp_path / "out")]
+    words += ["--duration", "2", "--record-every", "10"]
     assert cli.main(["compare", *words]) == 0
     out = capsys.readouterr().out
     assert "Equal effort" in out
     assert "twice the logarithmic" in out
     names = {path.name for path in (tmp_path / "out").iterdir()}
-    assert names >= {
-        "comparison.txt",
-        "comparison.csv",
-        "comparison.json",
-        "comparison_joint_0.png",
-        "comparison_joint_1.pdf",
-        "rollouts.nc",
-    }
+    tables = {f"comparison.{ending}" for ending in ("txt", "csv", "json")}
+    figures = {"comparison_joint_0.png", "comparison_joint_1.pdf"}
+    assert names >= tables | figures | {"rollouts.nc"}
     report = json.loads((tmp_path / "out" / "comparison.json").read_text())
     assert report["factors"]["integral"] == 1.0
     assert report["factors"]["log"] == pytest.approx(1.1, abs=0.1)
     assert set(ij.load(tmp_path / "out" / "rollouts.nc")) == {"integral", "log"}
-
-
-def test_command_line_refuses_an_unknown_law(capsys):
-    assert cli.main(["compare", "zhang_yan_2024", "--laws", "nonsense", "--duration", "0.1"]) == 2
-    assert "one of 'integral'" in capsys.readouterr().err
 
 
 # ------------------------------------------------------ efforts that do not grow with the factor
@@ -455,25 +391,20 @@ def test_inaccurate_trials_count_only_where_the_given_runs_are_inaccurate_too():
 @pytest.mark.parametrize(
     ("effort", "target", "expected"),
     [
+        (lambda c: c, 1.0, 1.0),
+        (lambda c: 1.0 / c, 0.3, 1.0 / 0.3),
+        # of two factors the nearest to 1
+        (lambda c: (c - 0.5) * (c - 1.1) + 2.0, 2.0, 1.1),
         (lambda c: 2.0 + math.sin(12.0 * math.log(c)), 2.5, math.exp(math.asin(0.5) / 12.0)),
-        (
-            lambda c: 2.0 - (c - 0.71) ** 2,
-            2.0 - 1e-4,
-            0.72,
-        ),  # turns back just beyond the target, between grid points
+        # turns back just beyond the target, between grid points
+        (lambda c: 2.0 - (c - 0.71) ** 2, 2.0 - 1e-4, 0.72),
         (lambda c: math.nan if 1.1 < c < 1.3 else c, 1.35, 1.35),
         (lambda c: math.nan if 1.1 < c < 1.3 else c, 1.2, math.nan),
-        (
-            lambda c: math.nan if 1.03 < c < 1.3 else c + 3.0 * (c < 0.2),
-            1.2,
-            math.nan,
-        ),  # a jump over the target is no factor
-        (lambda c: 1.0 / c, 0.3, 1.0 / 0.3),
-        (
-            lambda c: abs(math.log(c)) + 0.1,
-            1.1,
-            math.exp(-1.0),
-        ),  # 1/e and e are equally near: the first one
+        (lambda c: 1.0 + 0.1 * math.tanh(c), 5.0, math.nan),
+        # a jump over the target is no factor
+        (lambda c: math.nan if 1.03 < c < 1.3 else c + 3.0 * (c < 0.2), 1.2, math.nan),
+        # 1/e and e are equally near: the first one
+        (lambda c: abs(math.log(c)) + 0.1, 1.1, math.exp(-1.0)),
     ],
 )
 def test_efforts_of_any_shape(effort, target, expected):

