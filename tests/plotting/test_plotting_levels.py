@@ -14,12 +14,12 @@ from iblf_jax.presets.paper import customary_two_link
 
 @pytest.fixture(scope="module")
 def run():
-    return ij.simulate(pendulum(), duration=1.0, dt=1e-3)
+    return ij.simulate(pendulum(), duration=0.8, dt=1e-2)
 
 
 @pytest.fixture(scope="module")
 def body_run():
-    return ij.simulate(body(), duration=5.0, dt=1e-2)
+    return ij.simulate(body(), duration=0.8, dt=1e-2)
 
 
 @pytest.fixture(scope="module")
