@@ -29,7 +29,6 @@ CALM = SWEEP.replace("std = 0.05", "std = 0.001").replace("300", "3")
 def command(capsys, monkeypatch, tmp_path):
     """Runs the CLI in a folder of its own; returns exit code, stdout and stderr."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     for name, text in (("study.toml", STUDY), ("sweep.toml", SWEEP), ("calm.toml", CALM)):
         (tmp_path / name).write_text(text)
 

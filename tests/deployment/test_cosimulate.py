@@ -11,7 +11,6 @@ from arm_cases import ARMS
 import iblf_jax as ij
 
 mujoco = pytest.importorskip("mujoco")
-from iblf_jax.deployment.film import has_shapes
 from iblf_jax.deployment.mujoco_plant import MujocoPlant
 
 TIMING = {"duration": 0.4, "dt": 5e-4}
@@ -132,24 +131,6 @@ FINGER = (
     '<body name="finger" pos="0.1 0 0"><joint name="grip" type="slide" axis="0 1 0"/><geom'
     ' size="0.01" mass="0.2"/></body>'
 )
-
-
-@pytest.mark.release
-def test_what_else_moves_on_the_arm_is_locked_and_what_stands_apart_is_free():
-    ball = '<body name="ball" pos="9 9 9"><freejoint/><geom size="0.1"/></body>'
-    named = ij.robots.load(_written("arm.xml", two_link(PAPER.plant, inside=FINGER)), tip="fore")
-    scenario = ij.with_parts(PAPER, robot=named, sampling=ij.Sampling(1e-3))
-    expected = ij.simulate(scenario, **TIMING)
-    spec = spec_of(PAPER.plant, inside=FINGER, outside=ball)
-    found = ij.cosimulate(scenario, spec, **TIMING)
-    assert largest_difference(found.q, expected.q) < 1e-9
-    elsewhere = ij.robots.load(
-        _written("arm.xml", two_link(PAPER.plant, inside=FINGER)), tip="fore", locked={"grip": 0.2}
-    )
-    away = ij.simulate(ij.with_parts(scenario, plant=elsewhere, model=named), **TIMING)
-    found = ij.cosimulate(scenario, spec, locked={"grip": 0.2}, **TIMING)
-    assert largest_difference(found.q, away.q) < 1e-9
-    assert largest_difference(found.q, expected.q) > 1e-5
 
 
 @pytest.mark.slow
@@ -279,17 +260,6 @@ def test_records(tmp_path):
     np.testing.assert_array_equal(some.metrics.rmse, every.metrics.rmse)
     some.to_xarray()
     ij.save_rollouts(some, tmp_path / "run.nc")
-
-
-def test_an_arm_without_shapes_is_drawn_as_its_skeleton():
-    shapes = spec_of(PAPER.plant)
-    bare = mujoco.MjModel.from_xml_path(str(ARMS / "iiwa14.urdf"))
-    assert has_shapes(shapes.compile())
-    assert not has_shapes(bare)
-    shapes.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.1, 0.1, 0.1])
-    for geom in shapes.geoms:
-        geom.group = 0 if geom.parent == shapes.worldbody else 3
-    assert not has_shapes(shapes.compile()), "a table does not move, and other groups are not drawn"
 
 
 @pytest.mark.slow

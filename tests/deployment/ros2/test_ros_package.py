@@ -202,15 +202,6 @@ def test_the_own_test_of_the_package_passes(package):
     assert "4 passed" in done.stdout
 
 
-def test_the_self_test_of_the_c_law_passes(package, tmp_path):
-    sources = [str(package.source / "c" / f"{name}.c") for name in (NAME, "selftest")]
-    program = tmp_path / "selftest"
-    flags = ["-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-O2"]
-    subprocess.run(["cc", *flags, *sources, "-lm", "-o", str(program)], check=True)
-    done = subprocess.run([str(program)], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout
-
-
 def test_the_parameter_file_has_the_exported_values(package):
     text = (package.source / "config" / f"{NAME}.yaml").read_text()
     content = yaml.safe_load(text)
@@ -274,21 +265,6 @@ def test_the_launch_file_starts_the_node(package, monkeypatch):
     names = ["joint_states", "efforts", "diagnostics"]
     assert [(x[1][0], x[2]["default_value"]) for x in topics] == [(x, x) for x in names]
     assert node[2]["remappings"] == [(x, ("configuration", (x,), {})) for x in names]
-
-
-def test_the_description_is_read_as_it_was_written(package):
-    found = read_description(package.modules / NAME / "law.json")
-    assert found.joints == ("joint_1", "joint_2")
-    assert found.has_joint_names is False
-    assert found.reads_velocity is True
-    assert [gain.path for gain in found.gains] == [
-        "controller.K2",
-        "controller.k1",
-        "observer.kf[1]",
-    ]
-    assert [len(gain.offsets) for gain in found.gains] == [2, 1, 1]
-    assert len(found.gains[1].offsets[0]) == 2
-    assert found.gains[0].high == (4.0, 3.5)
 
 
 def plain() -> ij.Scenario:

@@ -167,13 +167,6 @@ def test_joints_are_found_by_name_in_any_order(order):
         assert sample == JointSample(5, 7, (0.0, 0.1, 0.2), (0.0, 1.0, 2.0))
 
 
-def test_the_order_may_change_from_message_to_message():
-    reader = JointReader(("a", "b"), True)
-    first = reader.read(["a", "b"], (1.0, 2.0), (3.0, 4.0), 0, 0)
-    second = reader.read(["b", "a"], (2.0, 1.0), (4.0, 3.0), 1, 1)
-    assert first[2:] == second[2:] == ((1.0, 2.0), (3.0, 4.0))
-
-
 BAD_STATES = {
     "NaN in a position": ({"q": (0.1, math.nan, 0.3)}, FaultKind.NOT_FINITE, "elbow"),
     "infinity in a velocity": ({"dq": (0.0, 0.0, math.inf)}, FaultKind.NOT_FINITE, "wrist"),
@@ -514,15 +507,6 @@ def test_a_period_without_a_new_state_repeats_the_torques():
     assert bench.supervisor.repeated == 2
 
 
-def test_repeated_torques_keep_their_limits():
-    bench = Bench().running()
-    bench.law.torque = [11.0, -6.0, 1.0]
-    bench.period()
-    bench.now += T
-    assert bench.command().torque == [10.0, -5.0, 1.0]
-    assert bench.supervisor.repeated == 1
-
-
 def test_a_new_start_does_not_repeat_torques_of_the_earlier_run():
     bench = Bench().running()
     bench.supervisor.stop()
@@ -564,12 +548,6 @@ def test_an_automatic_start_needs_no_service_and_does_not_leave_a_fault():
     bench.now += 3 * T
     _, message = bench.supervisor.hold(bench.now, bench.clock)
     assert "in fault (the position of shoulder is nan); no valid state has arrived for" in message
-
-
-def test_an_automatic_start_that_is_refused_is_reported():
-    bench = Bench(start_automatically=True, time_origin=EPOCH + 1000 * T)
-    assert bench.period().mode is Mode.STOPPED
-    assert "time_origin" in bench.supervisor.note
 
 
 def test_a_torque_that_is_not_finite_is_a_fault():
