@@ -137,48 +137,6 @@ def test_the_command_has_the_environment_of_the_copy(machine, tmp_path, monkeypa
     assert seen["PATH"].split(os.pathsep)[:2] == first
 
 
-def end_of(monkeypatch, machine, tmp_path, *command):
-    """The exit code of a call whose environment is there."""
-
-    def prepare(options, stack):
-        stack.callback(tool.is_removed, tmp_path / "copy")
-        return machine, tmp_path / "packages", tmp_path / "copy"
-
-    (tmp_path / "copy" / "tree").mkdir(parents=True)
-    handler = signal.getsignal(signal.SIGTERM)
-    monkeypatch.setattr(tool, "prepare", prepare)
-    monkeypatch.setattr(sys, "argv", ["newest_python", *command])
-    try:
-        return tool.main()
-    finally:
-        signal.signal(signal.SIGTERM, handler)
-
-
-def test_a_command_that_is_not_there_is_no_missing_environment(
-    machine, tmp_path, monkeypatch, capfd
-):
-    assert end_of(monkeypatch, machine, tmp_path, "pyhton", "-m", "pytest") == tool.NOT_STARTED
-    assert "the command did not start: " in capfd.readouterr().err
-    assert not (tmp_path / "copy").exists()
-
-
-def test_a_copy_that_cannot_be_removed_does_not_change_the_exit_code(
-    machine, tmp_path, monkeypatch, capfd
-):
-    def stays(folder):
-        raise tool.UnavailableError(f"removing {folder} failed")
-
-    monkeypatch.setattr(tool, "_remove", stays)
-    command = [sys.executable, "-c", "raise SystemExit(3)"]
-    assert end_of(monkeypatch, machine, tmp_path, *command) == 3
-    assert f"removing {tmp_path / 'copy'} failed" in capfd.readouterr().err
-    left = tmp_path / "copies" / "left"
-    left.mkdir(parents=True)
-    tool.lock_of(left).touch()
-    tool.remove_unused(machine)
-    assert tool.lock_of(left).exists()
-
-
 # --- calls at the same time, and calls that were interrupted -------------------------------------
 
 

@@ -462,61 +462,37 @@ def depth_left(n: int) -> bool:
     return n == 0 or depth_left(n - 1)
 
 
-@pytest.mark.parametrize(
-    ("call", "words"),
-    [
-        (lambda s: ij.monte_carlo(s, WAYS, runs=2**31, duration=0.01), ("runs", "at most", "GiB")),
-        (
-            lambda s: ij.sweep(
-                s,
-                {"controller.K2": ij.uniform(1.0, 2.0)},
-                design=ij.studies.Design("random", points=2**31),
-                duration=0.01,
-            ),
-            ("points", "GiB"),
-        ),
-        (
-            lambda s: ij.sensitivity(s, WAYS, points=2**30, duration=0.01),
-            ("points", "at most", "GiB"),
-        ),
-        (
-            lambda s: ij.tune(
-                s, ["controller.K2"], GOAL, solver=ij.tuning.SQP(starts=2**40), duration=0.01
-            ),
-            ("starts", "at most", "GiB"),
-        ),
-        (lambda s: ij.falsify(s, WAYS, starts=2**40, duration=0.01), ("GiB",)),
-        (
-            lambda s: ij.monte_carlo(
-                s, WAYS, runs=2, executor=ij.studies.LocalExecutor(devices=[]), duration=0.01
-            ),
-            ("devices", "at least one"),
-        ),
-        (
-            lambda s: ij.monte_carlo(
-                s, WAYS, runs=2, executor=ij.studies.LocalExecutor(devices=["cpu"]), duration=0.01
-            ),
-            ("devices", "cpu"),
-        ),
-        (
-            lambda s: ij.simulate(
-                s, metrics=[metrics.Settling(tolerance=[0.1] * 3)], duration=0.01
-            ),
-            ("metrics[0].tolerance", "2"),
-        ),
-        (
-            lambda s: ij.tune(
-                s, ["controller.K2"], ij.objectives.effort(weights=[1.0] * 3), duration=0.01
-            ),
-            ("weights", "(3,)"),
-        ),
-        (lambda s: ij.objectives.margin_above(0.1, allowed=5.0), ("allowed", "0 to 1")),
-    ],
-)
-def test_sizes_devices_and_shapes(paper, call, words):
+SEARCHED = {"parameters": ["controller.K2"], "objective": GOAL}
+TOO_MUCH = {
+    "runs": (ij.monte_carlo, {"perturbations": WAYS, "runs": 2**31}, "at most", "GiB"),
+    "points": (ij.sensitivity, {"perturbations": WAYS, "points": 2**30}, "at most", "GiB"),
+    "points of a design": (with_a_design, {"kind": "random", "points": 2**31}, "GiB"),
+    "starts": (ij.tune, SEARCHED | {"solver": ij.tuning.SQP(starts=2**40)}, "at most", "GiB"),
+    "starts of an attack": (ij.falsify, {"perturbations": WAYS, "starts": 2**40}, "GiB"),
+    "metrics[0].tolerance": (
+        ij.simulate,
+        {"metrics": [metrics.Settling(tolerance=[0.1] * 3)]},
+        "2",
+    ),
+    "weights": (ij.tune, SEARCHED | {"objective": ij.objectives.effort(weights=[1.0] * 3)}, "(3,)"),
+    "allowed": (ij.objectives.margin_above, {"limit": 0.1, "allowed": 5.0}, "0 to 1"),
+} | {
+    f"devices {devices}": (
+        ij.monte_carlo,
+        {"perturbations": WAYS, "runs": 2, "executor": ij.studies.LocalExecutor(devices=devices)},
+        word,
+    )
+    for devices, word in (([], "at least one"), (["cpu"], "cpu"))
+}
+"""Field -> function, arguments besides the scenario and the duration, and words of the message."""
+
+
+@pytest.mark.parametrize("case", TOO_MUCH)
+def test_sizes_devices_and_shapes(case):
+    function, arguments, *words = TOO_MUCH[case]
     with pytest.raises(ValueError, match=": got ") as caught:
-        call(paper)
-    for word in words:
+        call((function, arguments))
+    for word in words if "attack" in case else (case.split()[0], *words):
         assert word in str(caught.value), str(caught.value)
 
 
@@ -587,14 +563,8 @@ def results(paper, no_runs, monkeypatch):
         {"margin": np.full((4, 2), 0.1), "rmse": np.full((4, 2), 0.01)},
         (("margin", "rad"), ("rmse", "rad")),
     )
-    study = ij.Study(
-        paper,
-        found,
-        np.zeros(4, np.int32),
-        np.ones(4),
-        {"controller.K2": np.full((4, 2), 20.0)},
-        setup,
-    )
+    samples = {"controller.K2": np.full((4, 2), 20.0)}
+    study = ij.Study(paper, found, np.zeros(4, np.int32), np.ones(4), samples, setup)
     history = {
         "valid": np.ones((1, 1), bool),
         "x": np.full((1, 1, 2), 20.0),
@@ -610,19 +580,9 @@ def results(paper, no_runs, monkeypatch):
         limits=((1.0, 100.0), (1.0, 100.0)),
     )
     names = ("controller.K2[0]", "controller.K2[1]")
-    tuned = ij.TuneResult(
-        paper,
-        paper,
-        {"controller.K2": np.full(2, 20.0)},
-        names,
-        history,
-        0,
-        "done",
-        "newton",
-        "forward",
-        1.0,
-        setup,
-    )
+    best = {"controller.K2": np.full(2, 20.0)}
+    words = ("done", "newton", "forward", 1.0)
+    tuned = ij.TuneResult(paper, paper, best, names, history, 0, *words, setup)
     vars(tuned)["nominal"] = (run, run)
     twos, (blocks, _) = np.ones((2, 2)), layout(paper, ["controller.K2"], 1e-3, "rk4")
     front = ij.ParetoFront(("a", "b"), twos, twos, names, twos, twos[0], paper, blocks, twos, 1.0)
@@ -630,16 +590,8 @@ def results(paper, no_runs, monkeypatch):
         paper, {}, 0.1, 0.1, 0, np.ones((2, 2)), 4, {"duration": 0.01, "dt": 1e-3, "method": "rk4"}
     )
     compared = ij.Comparison({"log": run}, {}, {}, {}, {"log": "K2 = 20"})
-    matters = ij.Sensitivity(names, np.ones(2), np.ones(2), twos, twos, "margin", 8, 0)
-    return {
-        "run": run,
-        "study": study,
-        "tuning": tuned,
-        "front": front,
-        "attack": attack,
-        "comparison": compared,
-        "sensitivity": matters,
-    }
+    results = {"run": run, "study": study, "tuning": tuned}
+    return results | {"front": front, "attack": attack, "comparison": compared}
 
 
 METHODS = {
