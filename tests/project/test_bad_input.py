@@ -85,52 +85,25 @@ def test_numbers_that_are_fine(value):
     np.testing.assert_array_equal(k1, 2.0)
 
 
+def made(make: Callable[..., Any], *fixed: Any, **more: Any) -> Callable[..., Any]:
+    """Calls that make a component with other arguments."""
+    return lambda *args, **options: lambda: make(*fixed, *args, **more | options)
+
+
+arm = made(robots.TwoLink, **ARM)
+chain = made(robots.PlanarChain, centre=0.1, inertia=0.1)
+law = made(controllers.Backstepping, 2.0, 20.0)
+spline = made(references.WaypointSpline)
 COMPONENTS = {
-    "two-link-of-three": (
-        lambda: robots.TwoLink(**(ARM | {"mass": [1.0, 1.0, 1.0]})),
-        "TwoLink.mass",
-        "(2,)",
-    ),
-    "chain-sizes": (
-        lambda: robots.PlanarChain(mass=[1.0, 1.0], length=[1.0], centre=0.1, inertia=0.1),
-        "PlanarChain.length",
-        "(2,)",
-    ),
-    "chain-of-scalars": (
-        lambda: robots.PlanarChain(mass=1.0, length=1.0, centre=0.1, inertia=0.1),
-        "PlanarChain.mass",
-        "how many",
-    ),
-    "chain-of-none": (
-        lambda: robots.PlanarChain(mass=[], length=[], centre=[], inertia=[]),
-        "PlanarChain.mass",
-        "at least one",
-    ),
-    "payload-array": (
-        lambda: robots.TwoLink(**ARM, payload=[1.0, 2.0]),
-        "TwoLink.payload",
-        "one number",
-    ),
-    "variant": (
-        lambda: controllers.Backstepping(2.0, 20.0, variant="exact"),
-        "Backstepping.variant",
-        "'printed', 'corrected'",
-    ),
-    "reading-array": (
-        lambda: controllers.Backstepping(2.0, 20.0, variant=np.asarray(["printed"])),
-        "variant",
-        "hashable",
-    ),
-    "barrier-name": (
-        lambda: controllers.Backstepping(2.0, 20.0, barrier="integral"),
-        "Backstepping.barrier",
-        "barriers.Integral()",
-    ),
-    "barrier-class": (
-        lambda: controllers.Backstepping(2.0, 20.0, barrier=barriers.Log),
-        "Backstepping.barrier",
-        "brackets",
-    ),
+    "two-link-of-three": (arm(mass=[1.0] * 3), "TwoLink.mass", "(2,)"),
+    "chain-sizes": (chain(mass=[1.0, 1.0], length=[1.0]), "PlanarChain.length", "(2,)"),
+    "chain-of-scalars": (chain(mass=1.0, length=1.0), "PlanarChain.mass", "how many"),
+    "chain-of-none": (chain(mass=[], length=[]), "PlanarChain.mass", "at least one"),
+    "payload-array": (arm(payload=[1.0, 2.0]), "TwoLink.payload", "one number"),
+    "variant": (law(variant="exact"), "Backstepping.variant", "'printed', 'corrected'"),
+    "reading-array": (law(variant=np.asarray(["printed"])), "variant", "hashable"),
+    "barrier-name": (law(barrier="integral"), "Backstepping.barrier", "barriers.Integral()"),
+    "barrier-class": (law(barrier=barriers.Log), "Backstepping.barrier", "brackets"),
     "guard": (lambda: barriers.Integral(guard=1.5), "Integral.guard", "between 0 and 1"),
     "guard-zero": (lambda: barriers.Log(guard=0.0), "Log.guard", "positive"),
     "p-zero": (lambda: barriers.Log(p=0), "Log.p", ">= 1"),
@@ -143,21 +116,9 @@ COMPONENTS = {
     "friction-width": (lambda: disturbances.Friction(width=0.0), "Friction.width", "> 0"),
     "sum-of-numbers": (lambda: disturbances.Sum((1.0, 2.0)), "Sum.parts", "tuple of disturbances"),
     "sum-of-one": (lambda: disturbances.Sum(disturbances.Friction()), "Sum.parts", "brackets"),
-    "spline-order": (
-        lambda: references.WaypointSpline((0.0, 0.0), [[0.0], [1.0]]),
-        "WaypointSpline.times",
-        "increasing",
-    ),
-    "spline-rows": (
-        lambda: references.WaypointSpline((0.0, 1.0), [[0.0], [1.0], [2.0]]),
-        "WaypointSpline.waypoints",
-        "row",
-    ),
-    "spline-list": (
-        lambda: references.WaypointSpline([0.0, 1.0], [[0.0], [1.0]]),
-        "WaypointSpline.times",
-        "tuple",
-    ),
+    "spline-order": (spline((0.0, 0.0), [[0.0], [1.0]]), "WaypointSpline.times", "increasing"),
+    "spline-rows": (spline((0.0, 1.0), [[0.0], [1.0], [2.0]]), "WaypointSpline.waypoints", "row"),
+    "spline-list": (spline([0.0, 1.0], [[0.0], [1.0]]), "WaypointSpline.times", "tuple"),
     "quintic": (lambda: references.Quintic(0.0, 1.0, duration=-2.0), "Quintic.duration", "> 0"),
     "preset-law": (lambda: ij.presets.zhang_yan_2024(law="tangent"), "law", "'integral', 'log'"),
     "preset-reading": (lambda: ij.presets.zhang_yan_2024(variant=None), "variant", "'printed'"),
@@ -177,6 +138,13 @@ def with_part(**parts):
 
 TUBE = ij.presets.zhang_yan_2024().bounds[0]
 CHAIN3 = robots.PlanarChain(mass=[1.0, 1.0, 1.0], length=0.3, centre=0.1, inertia=0.1)
+funnel = bounds.Funnel
+
+
+def between(lower, upper):
+    return with_part(bounds=bounds.Bounds(lower, upper))
+
+
 SCENARIOS = {
     "plant-none": (with_part(plant=None), "Scenario.plant", "component"),
     "plant-class": (with_part(plant=robots.TwoLink), "Scenario.plant", "brackets"),
@@ -197,30 +165,28 @@ SCENARIOS = {
     ),
     "bounds-one-side": (with_part(bounds=bounds.Constant(0.1)), "Scenario.bounds", "Bounds(lower="),
     "bounds-exchanged": (
-        with_part(bounds=bounds.Bounds(TUBE.upper, TUBE.lower)),
+        between(TUBE.upper, TUBE.lower),
         "bounds of joint 0",
         "lower < upper",
         "Exchange",
     ),
     "lower-funnel-of-the-upper-sign": (
-        with_part(bounds=bounds.Bounds(bounds.Funnel(0.3, 0.1, 1.0), bounds.Funnel(0.3, 0.1, 1.0))),
+        between(funnel(0.3, 0.1, 1.0), funnel(0.3, 0.1, 1.0)),
         "bounds of joint 0",
         "as a lower side it takes negative numbers",
     ),
     "lower-funnel-below-the-upper-one": (
-        with_part(bounds=bounds.Bounds(bounds.Funnel(0.2, 0.1, 1.0), bounds.Funnel(0.3, 0.1, 1.0))),
+        between(funnel(0.2, 0.1, 1.0), funnel(0.3, 0.1, 1.0)),
         "reference of joint 0",
         "as a lower side it takes negative numbers",
     ),
     "upper-funnel-of-the-lower-sign": (
-        with_part(
-            bounds=bounds.Bounds(bounds.Funnel(-0.3, -0.1, 1.0), bounds.Funnel(-0.2, -0.1, 1.0))
-        ),
+        between(funnel(-0.3, -0.1, 1.0), funnel(-0.2, -0.1, 1.0)),
         "reference of joint 0",
         "as an upper side it takes positive numbers",
     ),
     "bounds-wrong-n": (
-        with_part(bounds=bounds.Bounds(bounds.Constant([0.1] * 3), TUBE.upper)),
+        between(bounds.Constant([0.1] * 3), TUBE.upper),
         "bounds[0].lower.value",
         "2 (one a joint)",
     ),
