@@ -167,49 +167,46 @@ def test_names_from_files_stay_in_comments(tmp_path):
     assert text.isascii() and "int main" in text and "??" not in text
 
 
+def law_of(torque):
+    """A class of laws of a user: tau = torque(t, q, dq, gain, context)."""
+
+    @ij.component
+    class Own:
+        gain: ij.Leaf = ij.leaf("N m/rad")
+        uses_observer = False
+
+        def init(self, q, dq, context):
+            return ()
+
+        def command(self, t, q, dq, f_hat, context, state):
+            tau, no = torque(t, q, dq, self.gain, context), jnp.zeros(q.shape, bool)
+            return ij.controllers.Command(tau, dq, 0.0 * q, no, no), ()
+
+    return Own
+
+
+def endless(t, q, dq, gain, context):
+    """Its loop has no fixed length."""
+    return jax.lax.while_loop(lambda x: x[0] < 1.0, lambda x: x + gain, q)
+
+
+def whole(t, q, dq, gain, context):
+    """It computes with whole numbers."""
+    return gain * jnp.abs((9.0 * q).astype(jnp.int32)).astype(q.dtype)
+
+
+def damped(t, q, dq, gain, context):
+    """tau = G0 - gain (q - q_d) - q'."""
+    return context.model.gravity(q) - gain * (q - context.tube(t).q_d) - dq
+
+
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the simulated run")
 def test_what_cannot_be_written_says_why(base, tmp_path):
-    @ij.component
-    class Endless:
-        """A law whose loop has no fixed length."""
-
-        gain: ij.Leaf = ij.leaf("1")
-
-        def init(self, q, dq, context):
-            return ()
-
-        def command(self, t, q, dq, f_hat, context, state):
-            x = jax.lax.while_loop(lambda x: x[0] < 1.0, lambda x: x + self.gain, q)
-            no = jnp.zeros(q.shape, bool)
-            return ij.controllers.Command(x, dq, 0 * q, no, no), ()
-
-    @ij.component
-    class Whole:
-        """A law of whole numbers."""
-
-        gain: ij.Leaf = ij.leaf("1")
-
-        def init(self, q, dq, context):
-            return ()
-
-        def command(self, t, q, dq, f_hat, context, state):
-            no = jnp.zeros(q.shape, bool)
-            return (
-                ij.controllers.Command(
-                    self.gain * jnp.abs((9.0 * q).astype(jnp.int32)).astype(q.dtype),
-                    dq,
-                    0 * q,
-                    no,
-                    no,
-                ),
-                (),
-            )
-
     with pytest.raises(ValueError, match="no fixed length"):
-        ij.export(ij.with_parts(base, controller=Endless(1.0)), tmp_path)
+        ij.export(ij.with_parts(base, controller=law_of(endless)(1.0)), tmp_path)
     with pytest.raises(ValueError, match=r"scenario: got .*no abs of kind"):
-        ij.export(ij.with_parts(base, controller=Whole(1.0)), tmp_path)
+        ij.export(ij.with_parts(base, controller=law_of(whole)(1.0)), tmp_path)
     with pytest.raises(ValueError, match="period"):
         ij.export(ij.presets.zhang_yan_2024(), tmp_path)
     several = jax.tree.map(lambda x: jnp.stack([x, x, x]), base)
@@ -218,49 +215,29 @@ def test_what_cannot_be_written_says_why(base, tmp_path):
             ij.export(several, tmp_path, target=target)
     with pytest.raises(ValueError, match="reference"):
         ij.export(base, tmp_path, target="wasm", reference="given")
+    names = ("int", "a b", "selftest", "Math", "test")
     for wrong in (
-        {"target": "rust"},
-        {"dtype": "half"},
-        {"name": "int"},
-        {"name": "a b"},
-        {"name": "selftest"},
-        {"name": "Math"},
-        {"name": "test"},
-        {"reference": "none"},
+        *({"target": "rust"}, {"dtype": "half"}, {"reference": "none"}),
+        *({"name": name} for name in names),
     ):
         with pytest.raises(ValueError, match=next(iter(wrong))):
             ij.export(base, tmp_path, **wrong)
 
 
-@ij.component
-class Damped:
-    """tau = G0 - gain (q - q_d) - q'."""
-
-    gain: ij.Leaf = ij.leaf("N m/rad")
-    uses_observer = False
-
-    def init(self, q, dq, context):
-        return ()
-
-    def command(self, t, q, dq, f_hat, context, state):
-        tube, no = context.tube(t), jnp.zeros(q.shape, bool)
-        tau = context.model.gravity(q) - self.gain * (q - tube.q_d) - dq
-        return ij.controllers.Command(tau, tube.dq_d, 0.0 * q, no, no), ()
-
-
 def test_a_users_law_in_files_is_registered_before_the_export_is_repeated(tmp_path, monkeypatch):
     monkeypatch.setattr("iblf_jax.deployment.export.VECTORS_DURATION", 0.02)
-    scenario = ij.with_parts(ij.presets.zhang_yan_2024(), controller=Damped([30.0, 20.0]))
+    Own = law_of(damped)
+    scenario = ij.with_parts(ij.presets.zhang_yan_2024(), controller=Own([30.0, 20.0]))
     without = ij.export(scenario, tmp_path / "without", period=2e-3)
     assert "scenario.toml" not in without.files
-    assert "scenario.toml left out: controller: got an object of class Damped" in repr(without)
+    assert "scenario.toml left out: controller: got an object of class Own" in repr(without)
 
-    monkeypatch.setitem(ij.controllers.MEMBERS, "damped", Damped)
+    monkeypatch.setitem(ij.controllers.MEMBERS, "own", Own)
     named = ij.export(scenario, tmp_path / "named", period=2e-3)
     assert "left out" not in repr(named)
     assert "controller.gain" in named.parameters
     readme = (named.folder / "README.md").read_text()
-    assert "in a program that first registers Damped" in readme
+    assert "in a program that first registers Own" in readme
     assert "python -m iblf_jax export scenario.toml" not in readme
     (call,) = re.findall(r"`(ij\.export\(.*?)` repeats", readme)
     first = (named.folder / "iblf_law.c").read_text()
@@ -330,38 +307,22 @@ def test_a_folder_is_complete_and_its_parameters_are_those_of_the_paths(tmp_path
         folder, "-O2", name="arm_law", compiler=(sys.executable, "-m", "ziglang", "cc")
     )
     if shutil.which("cmake"):
-        for command in (
-            ["cmake", "-B", "build"],
-            ["cmake", "--build", "build"],
-            ["build/selftest"],
-        ):
-            subprocess.run(command, cwd=folder, check=True, capture_output=True)
+        for command in ("cmake -B build", "cmake --build build", "build/selftest"):
+            subprocess.run(command.split(), cwd=folder, check=True, capture_output=True)
 
-    subprocess.run(
-        ["gcc", "-std=c99", "-O0", "-fstack-usage", "-c", "arm_law.c"], cwd=folder, check=True
-    )
-    frames = {
-        row.split()[0].split(":")[-1]: int(row.split()[1])
-        for row in (folder / "arm_law.su").read_text().splitlines()
-    }
-    assert (
-        frames["arm_law_step"] + frames["arm_law_sample"]
-        < generated.sizes["stack, without optimisation"]
-        < 2 * sum(frames.values())
-    )
+    gcc = ["gcc", "-std=c99"]
+    subprocess.run([*gcc, "-O0", "-fstack-usage", "-c", "arm_law.c"], cwd=folder, check=True)
+    rows = [row.split() for row in (folder / "arm_law.su").read_text().splitlines()]
+    frames = {row[0].split(":")[-1]: int(row[1]) for row in rows}
+    stack = generated.sizes["stack, without optimisation"]
+    least = frames["arm_law_step"] + frames["arm_law_sample"]
+    assert least < stack < 2 * sum(frames.values())
 
     (folder / "main.c").write_text(MAIN)
-    subprocess.run(
-        ["gcc", "-std=c99", "-O1", "arm_law.c", "main.c", "-lm", "-o", "main"],
-        cwd=folder,
-        check=True,
-    )
-    *tau, status = map(
-        float,
-        subprocess.run(
-            ["./main"], cwd=folder, check=True, capture_output=True, text=True
-        ).stdout.split(),
-    )
+    command = [*gcc, "-O1", "arm_law.c", "main.c", "-lm", "-o", "main"]
+    subprocess.run(command, cwd=folder, check=True)
+    done = subprocess.run(["./main"], cwd=folder, check=True, capture_output=True, text=True)
+    *tau, status = map(float, done.stdout.split())
     assert int(status) & 2, "the second bound was put below the position"
 
     lab = canonical(ij.load_scenario(folder / "scenario.toml"))

@@ -15,6 +15,7 @@ from iblf_jax.studies.compare import factor_nearest_one
 from iblf_jax.studies.equal_effort import Trials, search
 
 RUN = {"duration": 2.0, "dt": 1e-3, "record_every": 10}
+BRIEF = {"duration": 0.08, "dt": 1e-3}
 
 
 @pytest.fixture(scope="module")
@@ -42,9 +43,7 @@ def test_laws_by_name_take_the_gains_the_observer_and_the_limit_of_the_scenario(
     scenario = ij.with_parameters(
         ij.presets.zhang_yan_2024_saturated(), {"controller.k1": [1.5, 2.5], "controller.K2": 15.0}
     )
-    comparison = ij.compare(
-        scenario, ["log", "adaptive_rbf"], duration=0.02, dt=1e-3, equal_effort=False
-    )
+    comparison = ij.compare(scenario, ["log", "adaptive_rbf"], equal_effort=False, **BRIEF)
     for name, run in comparison.rollouts.items():
         law = run.scenario.controller
         assert isinstance(law, controllers.Saturated)
@@ -138,9 +137,7 @@ def test_laws_for_other_constraints_have_names_and_margins():
     wall = ij.regions.HalfSpace(normal=[-1.0, 0.0], offset=-0.245)
     preset = ij.presets.zhang_yan_2024_full_state()
     scenario = ij.with_parts(preset, bounds=(preset.bounds[0], speeds), regions=(wall,))
-    comparison = ij.compare(
-        scenario, ["integral", "full_state", "reference_governor"], duration=0.1, dt=1e-3
-    )
+    comparison = ij.compare(scenario, ["integral", "full_state", "reference_governor"], **BRIEF)
     given = {row.law: row for row in comparison.table["gains"]}
     assert given["integral"].velocity_margin < 0 < given["full_state"].velocity_margin
     for row in given.values():
@@ -164,9 +161,8 @@ def test_a_filter_by_name_is_around_the_unconstrained_law():
     found = ij.compare(
         ij.with_parts(ij.presets.zhang_yan_2024(), controller=law),
         ["pd"],
-        duration=0.02,
-        dt=1e-3,
         equal_effort=False,
+        **BRIEF,
     )
     assert isinstance(
         found.rollouts["pd"].scenario.controller, controllers.PDGravity
@@ -178,7 +174,7 @@ def test_a_law_without_a_factor_is_said_so():
     # A limit far below what the integral form does: no gain makes this one work as hard.
     capped = controllers.Saturated(law=controllers.PDGravity(Kp=60.0, Kd=20.0), limit=[8.0, 1.0])
     comparison = ij.compare(
-        ij.presets.zhang_yan_2024(), {"integral": "integral", "capped": capped}, **RUN
+        ij.presets.zhang_yan_2024(), {"integral": "integral", "capped": capped}, **BRIEF
     )
     assert math.isnan(comparison.factors["capped"])
     assert "capped" not in comparison.equal_effort
@@ -208,7 +204,7 @@ def test_laws_of_a_users_own():
         Bang(),
         Bang(size=0.2),
     ]
-    comparison = ij.compare(ij.presets.zhang_yan_2024(), laws, duration=0.1, dt=1e-3)
+    comparison = ij.compare(ij.presets.zhang_yan_2024(), laws, **BRIEF)
     assert list(comparison.rollouts) == ["Backstepping(Tan)", "Bang", "Bang 2"]
     assert "no gains to scale" in comparison.reasons["Bang"]
     assert "no gains (Bang, Bang 2)" in repr(comparison)
@@ -297,8 +293,7 @@ def test_the_factor_nearest_one_is_found_beyond_trials_that_fail():
     """The effort is the target's at 0.045 and at 1.28; the trials between 1.17 and 1.23 and from
     1.4 to 1.6 fail."""
     laws = {"at 1.28": Wavy(k=1.28), "at 1": Wavy()}
-    run = {"duration": 0.08, "dt": 1e-3, "record_every": 40}
-    wavy = ij.compare(ij.presets.zhang_yan_2024(), laws, **run)
+    wavy = ij.compare(ij.presets.zhang_yan_2024(), laws, **BRIEF)
     assert wavy.factors["at 1"] == pytest.approx(1.28, rel=1e-4)
     found = wavy.searches["at 1"]
     assert found.crossings == pytest.approx([1.28, 0.045], abs=0.002)
