@@ -376,11 +376,7 @@ def test_numbers_as_text():
     assert tables.number(float("inf")) == "-"
     assert tables.for_json(
         {"a": np.array([1.0, np.nan]), "b": np.float32(2.0), "c": (np.inf, True, None)}
-    ) == {
-        "a": [1.0, None],
-        "b": 2.0,
-        "c": [None, True, None],
-    }
+    ) == {"a": [1.0, None], "b": 2.0, "c": [None, True, None]}
     assert _common.assignments("--set", ["a=1", "b = [1, 2]", "c=x y", 'd="q"']) == {
         "a": 1,
         "b": [1, 2],

@@ -70,12 +70,7 @@ def test_a_law_as_an_fmu_receives_all_levels(tmp_path):
     for name, values in levels.items():
         inputs[name] = values
     found = fmpy.simulate_fmu(
-        file,
-        stop_time=0.08,
-        step_size=PERIOD,
-        output_interval=PERIOD,
-        output=["tau"],
-        input=inputs,
+        file, stop_time=0.08, step_size=PERIOD, output_interval=PERIOD, output=["tau"], input=inputs
     )
     np.testing.assert_allclose(found["tau"][1:], run.tau[:-1], atol=1e-9)
     variables = {v.name: v for v in fmpy.read_model_description(file).modelVariables}

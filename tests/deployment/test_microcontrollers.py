@@ -82,8 +82,7 @@ def folder_of(scenario, folder):
 @pytest.fixture(scope="module")
 def sampled():
     scenario = ij.with_parameters(
-        ij.presets.zhang_yan_2024(variant="corrected"),
-        {"controller.K2": 4.0, "observer.kf": 4.0},
+        ij.presets.zhang_yan_2024(variant="corrected"), {"controller.K2": 4.0, "observer.kf": 4.0}
     )
     return ij.with_parts(scenario, sampling=ij.Sampling(1e-3, delay=1e-3))
 

@@ -116,17 +116,11 @@ WORDS_OF_PATHS = (
         *("mass", "K2", "k1", "q", "g", "kf", "phase", "offset", "variant", "barrier"),
         *("__init__",),
     ),
-    (
-        "",
-        *("[0]", "[1]", "[-1]", "[7]", "[0][0]", "[99999999999]", ".real", "[a]"),
-    ),
+    ("", *("[0]", "[1]", "[-1]", "[7]", "[0][0]", "[99999999999]", ".real", "[a]")),
 )
 PATHLIKE = st.one_of(
     st.text(alphabet="plantmscoer.[]0123456789-_K ", max_size=20),
-    st.builds(
-        lambda a, b, i: f"{a}.{b}{i}",
-        *map(st.sampled_from, WORDS_OF_PATHS),
-    ),
+    st.builds(lambda a, b, i: f"{a}.{b}{i}", *map(st.sampled_from, WORDS_OF_PATHS)),
     ANYTHING,
 )
 

@@ -187,10 +187,9 @@ def test_another_scenario_law_or_backend_is_refused(finished):
         )
     with pytest.raises(ij.StoreError, match="backend"):
         ij.sweep(SCENARIO, cases.GRID, perturbations=ways, **options, backend="vmap")
-    assert ij.load_sweep(finished).attrs["backend"] in (
-        "native",
-        "vmap",
-    ), "what it ran on, not what was asked for"
+    assert ij.load_sweep(finished).attrs["backend"] in ("native", "vmap"), (
+        "what it ran on, not what was asked for"
+    )
 
 
 @pytest.mark.skipif(native.unavailable() is not None, reason="no C++ compiler")

@@ -27,13 +27,7 @@ from conftest import ROOT
 import iblf_jax as ij
 from iblf_jax.deployment.control_law import bounds_at, control_law, inputs_at_start
 from iblf_jax.deployment.export import vectors
-from iblf_jax.deployment.ros2.node.c_law import (
-    FLAGS,
-    NOT_FINITE,
-    CLaw,
-    load_law,
-    read_description,
-)
+from iblf_jax.deployment.ros2.node.c_law import FLAGS, NOT_FINITE, CLaw, load_law, read_description
 from iblf_jax.deployment.ros2.package import ros_options, write_package
 from iblf_jax.deployment.write_c import Law, generate
 from iblf_jax.simulation.scenario import canonical
@@ -291,10 +285,7 @@ REFUSED = {
         {"gains": [ij.tunable("controller.K2", -5.0, 60.0, scale="linear")]},
         "controller.K2",
     ),
-    "gains that overlap": (
-        {"gains": ["controller.K2", "controller.K2[0]"]},
-        "gains: got.*overlap",
-    ),
+    "gains that overlap": ({"gains": ["controller.K2", "controller.K2[0]"]}, "gains: got.*overlap"),
     "no list": ({"gains": "controller.K2"}, "gains: got 'controller.K2'"),
     "a number as gain": ({"gains": [1.0]}, r"gains\[0\]: got 1.0"),
     "floats": ({"dtype": "float"}, "dtype: got 'float'"),
