@@ -66,7 +66,7 @@ ANYTHING = st.one_of(
     ),
 )
 MEMBERS = [member for family, (members, _, _) in FAMILIES.items() for member in members.values()]
-many = settings(max_examples=400)
+many = settings(max_examples=200)
 
 
 def accepts_or_value_error(call):
@@ -184,7 +184,7 @@ NUMBERS = st.one_of(
 
 
 @pytest.mark.slow
-@settings(max_examples=300)
+@settings(max_examples=150)
 @given(
     values=st.dictionaries(
         st.sampled_from([p.path for p in ij.parameters(ij.presets.zhang_yan_2024())]),
