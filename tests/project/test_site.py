@@ -45,7 +45,7 @@ ELSEWHERE = {"other_solvers", "ros2_demo"}
 `test_demo` the one about a robot under ROS 2, which needs a law node."""
 FIRST = {"README", "start"}
 """Every run of CI has these pages."""
-LONG = {"guide", "tune_my_robot"}
+LONG = {"guide", "tune_my_robot", "export_a_law", "own_law"}
 """They take more than a minute of a processor each and run before a release. The other pages are
 the short forms of the guide; a notebook goes from the paper to a tuned robot."""
 
