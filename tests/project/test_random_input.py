@@ -274,11 +274,19 @@ def with_a_design(scenario, kind, points):
 ENTRIES = {
     name: GOOD[name]
     for name in (
-        *("simulate", "compare", "monte_carlo", "sweep", "LocalExecutor", "StoreOptions"),
-        *("sensitivity", "tune", "SQP", "LBFGS", "Adam", "Optax", "Effort", "Report"),
-        *("pareto", "falsify", "failure_probability", "certify", "explain", "tunable"),
+        *("simulate", "compare", "monte_carlo", "sweep", "sensitivity", "tune", "SQP"),
+        *("LBFGS", "Adam", "Optax", "Effort", "Report", "pareto", "falsify"),
+        *("failure_probability", "certify", "explain", "tunable"),
     )
 } | {
+    "LocalExecutor": (
+        lambda **options: ij.studies.LocalExecutor(**options).checked(),
+        {"devices": None, "memory": 1e9, "chunk": 8},
+    ),
+    "StoreOptions": (
+        lambda **options: ij.studies.StoreOptions(**options).checked(),
+        {"path": "sweep.zarr", "unit": None, "writer": "client", "shared": False},
+    ),
     "prove": (ij.prove, {"level": 1.0, "parameters": INTERVAL, "runs": 0}),
     "Design": (with_a_design, {"kind": "random", "points": 4}),
     "load_scenario": (ij.load_scenario, {"path": "x.toml"}),

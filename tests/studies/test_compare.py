@@ -137,7 +137,9 @@ def test_laws_for_other_constraints_have_names_and_margins():
     wall = ij.regions.HalfSpace(normal=[-1.0, 0.0], offset=-0.245)
     preset = ij.presets.zhang_yan_2024_full_state()
     scenario = ij.with_parts(preset, bounds=(preset.bounds[0], speeds), regions=(wall,))
-    comparison = ij.compare(scenario, ["integral", "full_state", "reference_governor"], **BRIEF)
+    comparison = ij.compare(
+        scenario, ["integral", "full_state", "reference_governor"], duration=0.1, dt=1e-3
+    )
     given = {row.law: row for row in comparison.table["gains"]}
     assert given["integral"].velocity_margin < 0 < given["full_state"].velocity_margin
     for row in given.values():
