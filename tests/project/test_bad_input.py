@@ -671,7 +671,16 @@ CALLS_THAT_ADVISE = {
 """Function -> a call that checks its scenario, most of them more than once."""
 
 
-@pytest.mark.parametrize("name", CALLS_THAT_ADVISE)
+LONG_CALLS = {"recommended_period", "compare"}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[pytest.mark.slow] * (name in LONG_CALLS))
+        for name in CALLS_THAT_ADVISE
+    ],
+)
 def test_every_function_gives_a_warning_once_at_the_callers_line(name, monkeypatch):
     from iblf_jax.certificates import _certify
     from iblf_jax.deployment import live

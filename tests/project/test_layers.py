@@ -113,15 +113,6 @@ def test_every_module_has_a_layer():
 
 def test_imports_go_down_only():
     found = {
-        str(path.relative_to(PACKAGE)): upward(module_of(path), text)
-        for path, text in SOURCES.items()
-        if module_of(path)
-    }
-    assert not {path: names for path, names in found.items() if names}
-
-
-def test_no_function_imports_from_above():
-    found = {
         str(path.relative_to(PACKAGE)): upward(module_of(path), text, at_the_top=False)
         for path, text in SOURCES.items()
         if module_of(path)
@@ -232,7 +223,7 @@ def test_the_session_is_left_alone():
 def test_no_prints_and_no_star_imports():
     for path, text in SOURCES.items():
         assert "import *" not in text, path
-        if module_of(path) != "cli":
+        if module_of(path) != "cli" and "print(" in text:
             called = [n.func for n in ast.walk(ast.parse(text)) if isinstance(n, ast.Call)]
             assert not [f for f in called if isinstance(f, ast.Name) and f.id == "print"], path
 

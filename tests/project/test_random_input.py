@@ -736,7 +736,7 @@ def test_any_word_in_the_place_of_any_other_on_the_command_line(
     )
     words, fine, lines = itertools.cycle(WORDS), COMMANDS[command], [COMMANDS[command]]
     for action in commands[command]._actions[1:]:
-        for word in itertools.islice(words, 4):
+        for word in itertools.islice(words, 2):
             if not action.option_strings:
                 lines.append([word, *fine[1:]])
             elif action.nargs == 0:
