@@ -23,7 +23,7 @@ LAYER_OF = {
 """Module or folder at the root of the package -> its layer."""
 
 UPWARD: dict[str, set[str]] = {}
-"""File -> the higher modules that it imports inside a function: none. Results reach figures,
+"""File -> the higher modules that it imports, inside functions too: none. Results reach figures,
 reports and files through `core/presentation.py`."""
 
 ONLY_IN = {
