@@ -17,8 +17,11 @@ FOLDER = Path(__file__).parents[2] / "benchmarks"
 OF_THEIR_OWN = ("gpu.py", "monte_carlo.py", "throughput.py")
 """They choose JAX's type and devices, of which a process has one; the others spare themselves
 another start."""
-BEFORE_A_RELEASE = {"armour.py", "constraints.py", "tuning.py"}
-"""Their quick sizes compile for a quarter of a minute."""
+BEFORE_A_RELEASE = {
+    *("armour.py", "constraints.py", "laws.py", "monte_carlo.py", "proofs.py"),
+    *("robust_tuning.py", "throughput.py", "tuning.py"),
+}
+"""Their quick sizes take more than a quarter of a minute."""
 
 NO_BENCHMARK = {"comparison.py", "losses.py", "withdrawn.py"}
 """One compares the results of the others, and `test_release.py` tests it; one compares commits, and

@@ -66,6 +66,7 @@ def test_losses_of_more_than_5_percent_are_named_and_large_ones_fail(losses):
     assert losses.verdict(rows, 8.0) == ("lost: b +10 %", True)
 
 
+@pytest.mark.slow
 def test_a_process_imports_the_package_of_its_tree(losses, tmp_path):
     (tmp_path / "iblf_jax").mkdir()
     (tmp_path / "iblf_jax" / "__init__.py").write_text("value = 7")
@@ -75,11 +76,13 @@ def test_a_process_imports_the_package_of_its_tree(losses, tmp_path):
     assert 0 <= found[1] < 1
 
 
+@pytest.mark.slow
 def test_a_commit_that_cannot_run_a_row_says_why(losses, tmp_path):
     with pytest.raises(SystemExit, match="cannot run 'a': ModuleNotFoundError"):
         losses.measured(tmp_path, losses.Measure(("a",), "import there_is_no_such_module"))
 
 
+@pytest.mark.slow
 def test_the_working_tree_is_compared_with_the_baseline(losses, capsys, monkeypatch):
     if not losses.is_known(losses.BASELINE.read_text().split()[0]):
         pytest.skip("this copy of the files has no history")

@@ -15,8 +15,7 @@ from iblf_jax.studies.statistics import probability
 from iblf_jax.tuning.report import Change, Verdict
 from iblf_jax.tuning.report import TuningReport as Report
 
-SHORT = {"duration": 0.2, "dt": 2e-3}
-
+SHORT = {"duration": 0.16, "dt": 2e-3}
 
 SCENARIO = ij.presets.zhang_yan_2024()
 DRAWN = {"plant.mass": ij.factor(ij.uniform(0.8, 1.25), shared=True)}
@@ -54,6 +53,10 @@ SAYS = {
 }
 
 
+PAGES = ("Rollout", "Study", "Certificate")
+"""Kinds of which the page is looked at, too."""
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", SAYS)
 def test_a_card_has_words_a_table_and_a_picture_and_a_page_needs_nothing_else(
@@ -67,6 +70,8 @@ def test_a_card_has_words_a_table_and_a_picture_and_a_page_needs_nothing_else(
     for words in SAYS[kind]:
         assert words in text, words
 
+    if kind not in PAGES:
+        return
     path = ij.report(result, tmp_path / "page.html", title="A <title>")
     text = path.read_text()
     assert "A &lt;title&gt;" in text and "A <title>" not in text
@@ -74,9 +79,8 @@ def test_a_card_has_words_a_table_and_a_picture_and_a_page_needs_nothing_else(
     assert f"iblf_jax {ij.__version__}" in text and f"jax {jax.__version__}" in text
     for words in SAYS[kind]:
         assert words in text, words
-    assert ("[controller]" in text) == (kind != "Certificate"), (
-        "the scenario as a file, of what keeps it"
-    )
+    # The scenario as a file, of what keeps it.
+    assert ("[controller]" in text) == (kind != "Certificate")
     assert ("factor uniform, low 0.8, high 1.25, shared" in text) == (kind == "Study")
 
 
@@ -96,9 +100,9 @@ def test_a_title_does_not_repeat_the_name_of_the_class(results):
         assert not parts.words[0].startswith(parts.title), kind
     study = reports.shown(results["Study"])
     assert study.title == "Monte-Carlo study"
-    assert study.words[0].startswith("16 runs of 0.2 s, dt = 0.002 s, seed 0")
+    assert study.words[0].startswith("16 runs of 0.16 s, dt = 0.002 s, seed 0")
     assert reports.shown(results["Comparison"]).words == [
-        "2 laws, 0.2 s, dt = 0.002 s, rk4; worst joint"
+        "2 laws, 0.16 s, dt = 0.002 s, rk4; worst joint"
     ]
 
 
