@@ -8,9 +8,10 @@ The number of boxes does not depend on the number of threads: results count in t
 units, up to the first one that is not proved.
 
 **Which coordinate is bisected.** The one whose bisection removes most of the margin, of those whose
-width is at least 1/GUARD of the widest one, each in parts of its scale. Without this guard the
-search may bisect one coordinate for ever: where the margin falls only after bisections along
-several coordinates, a bisection along each one of them alone gains nothing.
+width is at least 1/guard of the widest one, each in parts of its scale. Without a guard the search
+may bisect one coordinate for ever: where the margin falls only after bisections along several
+coordinates, a bisection along each one of them alone gains nothing. Random descents from the units
+estimate the number of boxes with each guard of GUARDS before the search.
 
 **Why the choice cannot prove too much.** A bisection replaces [low, high] by [low, middle] and
 [middle, high] along one coordinate, with one floating-point number low < middle < high in both, and
@@ -56,9 +57,15 @@ UNITS = 4096
 """Units of work, at least, unless fewer boxes prove the statement."""
 RENEWAL = 7
 """Bisections after which the weights of the coordinates are measured again."""
-GUARD = 3.0
-"""A coordinate is bisected only if its width is at least 1/GUARD of the largest one, in parts of
-their scales."""
+GUARDS = (3.0, 16.0, math.inf)
+"""Guards of which a search takes the one that is estimated to need the fewest boxes. Which is the
+best differs by a factor of 1000 and more: a coordinate on which the bound hardly depends should not
+be bisected, and one that counts together with another one only must be."""
+FEW_BOXES = 4.0
+"""Further guards are tried if the search is expected to take more than this multiple of the boxes
+of an estimate."""
+DIFFERENCE = 2.0
+"""Standard errors that are added to an estimate before it is compared with another one."""
 DESCENTS = 512
 """Units from which a random path descends to estimate the number of boxes."""
 GROUPS = 16
@@ -104,6 +111,11 @@ class Expectation(NamedTuple):
     """Infinite if a path ends at a box that is too narrow to be bisected, or that refutes."""
     error: float
     """Standard error of the estimate."""
+
+    @property
+    def at_most(self) -> float:
+        """The number that is compared with those of other rules."""
+        return self.boxes + DIFFERENCE * self.error
 
     def __str__(self) -> str:
         if not math.isfinite(self.boxes):
@@ -181,6 +193,7 @@ class _Problem:
         self.upper = upper
         self.smallest = (upper - lower)[0] * NARROWEST
         self.scales = (upper - lower)[0] if scales is None else scales
+        self.guard = GUARDS[0]
         self.stop = np.zeros(1, np.int32)
         self.size = int(kernel.library.record_size())
         self.dimension = lower.shape[1]
@@ -195,7 +208,7 @@ class _Problem:
             FORMAT,
             UNITS,
             RENEWAL,
-            GUARD,
+            self.guard,
             NARROWEST,
             MAX_UNDECIDED,
             ENCLOSURE_FLAGS,
@@ -237,19 +250,42 @@ class _Problem:
         )
         return units[np.random.default_rng(0).permutation(len(units))], division
 
-    def expected(self, units: np.ndarray) -> Expectation:
-        """An estimate of the boxes of some units, which are in a random order."""
+    def choose_guard(self, units: np.ndarray) -> Expectation:
+        """Chooses the guard that is expected to need the fewest boxes for some units.
+
+        Returns:
+          The estimate with this guard.
+        """
+        self.guard = GUARDS[0]
+        best, boxes = self.expected(units)
+        chosen = self.guard
+        for guard in GUARDS[1:]:
+            if best.boxes <= FEW_BOXES * boxes:
+                break
+            self.guard = guard
+            found, _ = self.expected(units)
+            if found.at_most < best.at_most:
+                best, chosen = found, guard
+        self.guard = chosen
+        return best
+
+    def expected(self, units: np.ndarray) -> tuple[Expectation, int]:
+        """An estimate of the boxes of some units, which are in a random order, and the boxes that
+        it takes itself.
+        """
         sampled = units[:DESCENTS].copy()
         groups = np.array_split(sampled, min(GROUPS, len(sampled)))
         means = []
+        boxes = 0
         for seed, group in enumerate(groups):
             more = (ctypes.c_int64(len(group)), ctypes.c_uint64(seed))
             result, _ = self._call("expected_boxes", 0, group, *more)
             means.append(result.done / len(group))
+            boxes += result.boxes
         if not np.isfinite(means).all():
-            return Expectation(math.inf, math.inf)
-        deviation = np.std(means) / math.sqrt(max(1, len(means) - 1))
-        return Expectation(len(units) * float(np.mean(means)), len(units) * float(deviation))
+            return Expectation(math.inf, math.inf), boxes
+        deviation = float(np.std(means)) / math.sqrt(max(1, len(means) - 1))
+        return Expectation(len(units) * float(np.mean(means)), len(units) * deviation), boxes
 
     def searched(self, unit: np.ndarray, max_boxes: int) -> _Found:
         """The result of a unit."""
@@ -276,7 +312,7 @@ class _Problem:
             pointer(self.smallest),
             pointer(self.scales),
             pointer(self.stop),
-            GUARD,
+            self.guard,
         )
         result = self._result_type()()
         function = getattr(self.kernel.library, name)
@@ -434,7 +470,6 @@ def search(
     )
     problem = _Problem(interval_kernel(function, low.shape[1], constants), low, high, widths)
     units, division = problem.divided(max_boxes)
-    results = _Results(checkpoint, problem.digest(units), len(units))
     boxes = division.boxes
     done = division.done
     ended = division
@@ -443,8 +478,9 @@ def search(
     with bar(progress, total=100, unit="% of the volume") as shown:
         shown.update(100 * done)
         if division.status == PROVED and len(units) > 0:
-            expected = problem.expected(units)
+            expected = problem.choose_guard(units)
             shown.set_postfix_str(str(expected))
+            results = _Results(checkpoint, problem.digest(units), len(units))
             for found in _in_order(problem, units, results, max_boxes - boxes, threads):
                 ended = found
                 boxes += found.boxes

@@ -171,7 +171,7 @@ def test_no_coordinate_is_bisected_alone_for_ever(monkeypatch):
     options = {"max_boxes": 100_000, "progress": False}
     found = search(coupled, LOW, HIGH, [-0.02], **options)
     assert found.proved
-    monkeypatch.setattr(module, "GUARD", np.inf)
+    monkeypatch.setattr(module, "GUARDS", (np.inf,))
     unguarded = search(coupled, LOW, HIGH, [-0.02], **options)
     assert unguarded.status == "out of boxes"
     assert unguarded.done < 0.5
@@ -182,7 +182,7 @@ def test_no_choice_of_the_coordinate_proves_too_much(monkeypatch):
     """Scales and guards at random, also absurd ones, prove a statement or leave it open."""
     generator = np.random.default_rng(4)
     for guard in (0.0, 1.0, 3.0, np.inf, np.nan):
-        monkeypatch.setattr(module, "GUARD", guard)
+        monkeypatch.setattr(module, "GUARDS", (guard,))
         for scales in 10.0 ** generator.uniform(-12.0, 12.0, (4, 3)):
             options = {"scales": scales, "max_boxes": 20_000, "progress": False}
             assert not search(waves, LOW, HIGH, [-0.999], **options).proved
@@ -215,6 +215,21 @@ def test_descents_estimate_the_number_of_boxes(constant):
     assert found.expected.error < 0.3 * searched
 
 
+def test_a_guard_that_needs_more_boxes_is_not_chosen():
+    """The bound hardly depends on x_1 and x_2, which a small guard bisects nevertheless."""
+
+    def one_of_three(x, c):
+        y = jnp.array([20.0, 1e-3, 1e-3]) * x
+        return (jnp.sum(jnp.cos(y) ** 2 + jnp.sin(y) ** 2) - 3.0 + c[0])[None], NOWHERE
+
+    problem = module._Problem(interval_kernel(one_of_three, 3, [-1e-4]), LOW[None], HIGH[None])
+    units, _ = problem.divided(10**6)
+    fair, _ = problem.expected(units)
+    chosen = problem.choose_guard(units)
+    assert chosen.boxes < 0.1 * fair.boxes
+    assert problem.guard > module.GUARDS[0]
+
+
 def division_of(function, constants):
     """Boxes of the division into units."""
     problem = module._Problem(interval_kernel(function, 3, constants), LOW[None], HIGH[None])
@@ -229,8 +244,8 @@ def test_descents_say_that_no_number_of_boxes_is_enough():
 
     problem = module._Problem(interval_kernel(zero, 1, [1.0]), LOW[None, :1], HIGH[None, :1])
     units, _ = problem.divided(10**5)
-    assert problem.expected(units).boxes == np.inf
-    assert "no number of boxes" in str(problem.expected(units))
+    expected = problem.choose_guard(units)
+    assert expected.boxes == np.inf and "no number of boxes" in str(expected)
 
 
 def test_the_units_that_are_left_are_named():
