@@ -168,13 +168,11 @@ def coupled(x, c):
 
 def test_no_coordinate_is_bisected_alone_for_ever(monkeypatch):
     """Without the guard x_2 alone is bisected: each of its bisections gains a little."""
-    options = {"max_boxes": 100_000, "progress": False}
-    found = search(coupled, LOW, HIGH, [-0.02], **options)
+    options = {"max_boxes": 60_000, "progress": False}
+    found = search(coupled, LOW, HIGH, [-0.2], **options)
     assert found.proved
     monkeypatch.setattr(module, "GUARDS", (np.inf,))
-    unguarded = search(coupled, LOW, HIGH, [-0.02], **options)
-    assert unguarded.status == "out of boxes"
-    assert unguarded.done < 0.5
+    assert search(coupled, LOW, HIGH, [-0.2], **options).status == "out of boxes"
 
 
 @pytest.mark.slow
@@ -206,7 +204,7 @@ def test_the_halves_of_a_box_cover_it():
         assert is_inside or waves(point, [-1.01])[0] < 0.0
 
 
-@pytest.mark.parametrize("constant", [-1.1, -1.01, -1.001])
+@pytest.mark.parametrize("constant", [-1.01, -1.001, -1.0003])
 def test_descents_estimate_the_number_of_boxes(constant):
     found = search(waves, LOW, HIGH, [constant], progress=False)
     assert found.proved
@@ -222,7 +220,7 @@ def test_a_guard_that_needs_more_boxes_is_not_chosen():
         y = jnp.array([20.0, 1e-3, 1e-3]) * x
         return (jnp.sum(jnp.cos(y) ** 2 + jnp.sin(y) ** 2) - 3.0 + c[0])[None], NOWHERE
 
-    problem = module._Problem(interval_kernel(one_of_three, 3, [-1e-4]), LOW[None], HIGH[None])
+    problem = module._Problem(interval_kernel(one_of_three, 3, [-1e-2]), LOW[None], HIGH[None])
     units, _ = problem.divided(10**6)
     fair, _ = problem.expected(units)
     chosen = problem.choose_guard(units)
