@@ -470,17 +470,18 @@ def search(
     )
     problem = _Problem(interval_kernel(function, low.shape[1], constants), low, high, widths)
     units, division = problem.divided(max_boxes)
+    expected = None
+    if division.status == PROVED and len(units) > 0:
+        expected = problem.choose_guard(units)
+    results = _Results(checkpoint, problem.digest(units), len(units))
     boxes = division.boxes
     done = division.done
     ended = division
     proved = 0
-    expected = None
     with bar(progress, total=100, unit="% of the volume") as shown:
         shown.update(100 * done)
-        if division.status == PROVED and len(units) > 0:
-            expected = problem.choose_guard(units)
-            shown.set_postfix_str(str(expected))
-            results = _Results(checkpoint, problem.digest(units), len(units))
+        shown.set_postfix_str(str(expected or ""))
+        if division.status == PROVED:
             for found in _in_order(problem, units, results, max_boxes - boxes, threads):
                 ended = found
                 boxes += found.boxes
@@ -494,10 +495,10 @@ def search(
     if ended.status == OUT_OF_BOXES:
         left = [box for box in (worst, problem.worst(units[proved:])) if box is not None]
         worst = max(left, key=lambda box: box.value, default=None)
-    left = units[proved:, : 2 * problem.dimension].reshape(-1, 2, problem.dimension)
+    corners = units[proved:, : 2 * problem.dimension].reshape(-1, 2, problem.dimension)
     seconds = time.monotonic() - start
     return SearchResult(
-        STATUSES[ended.status], boxes, seconds, done, worst, expected, len(units), left
+        STATUSES[ended.status], boxes, seconds, done, worst, expected, len(units), corners
     )
 
 
