@@ -265,7 +265,8 @@ class _Problem:
             self.guard = guard
             found, _ = self.expected(units)
             if found.at_most < best.at_most:
-                best, chosen = found, guard
+                best = found
+                chosen = guard
         self.guard = chosen
         return best
 
