@@ -1,7 +1,7 @@
 """What is left where a search ends without a proof: where, and whether more boxes would help.
 
 Random points of the units that are left are centres of boxes of several widths. The share of these
-boxes with a negative bound tells whether the search advances where it is left: if every box of a
+boxes with a negative bound shows whether the search advances where it is left: if every box of a
 width that a search reaches is negative, more boxes prove the statement; if a bound is not negative
 at a point, no number of boxes does.
 """
