@@ -19,7 +19,10 @@ from _timing import report
 
 import iblf_jax as ij
 
-COLUMNS = ["case", "K2", "kf", "level", "parameters", "verdict", "boxes", "share", "seconds"]
+COLUMNS = [
+    *("case", "K2", "kf", "level", "parameters"),
+    *("verdict", "boxes", "expected boxes", "share", "seconds"),
+]
 MASSES = "plant.mass, plant.inertia"
 
 
@@ -106,6 +109,8 @@ CASES = [
         (20.0, 20.0, 0.5, 0.02, 2e-3),
         (20.0, 20.0, 0.5, 0.05, 2e-3),
         (20.0, 20.0, 0.5, 0.1, 2e-3),
+        (20.0, 20.0, 0.5, 0.2, 2e-3),
+        (20.0, 20.0, 0.5, 0.3, 2e-3),
     ),
     *[
         Case(
@@ -145,6 +150,7 @@ def row(case: Case, boxes: int) -> list[Any]:
 
     prove(5000)  # compiles
     proof = prove(boxes)
+    expected, _ = proof.expected_boxes or (float("nan"), 0.0)
     return [
         case.name,
         case.K2,
@@ -153,6 +159,7 @@ def row(case: Case, boxes: int) -> list[Any]:
         case.parameters,
         str(proof.verdict),
         proof.boxes,
+        float(f"{expected:.2g}"),
         round(float(proof.done), 4),
         round(proof.seconds, 2),
     ]

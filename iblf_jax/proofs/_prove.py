@@ -35,6 +35,7 @@ from iblf_jax.proofs.periods import AperiodicError
 from iblf_jax.proofs.problem import LevelSetProblem
 from iblf_jax.proofs.result import GrowthPoint, Proof, Verdict, Violation, WorstBox
 from iblf_jax.proofs.search import SearchedBox, SearchResult, search
+from iblf_jax.proofs.undecided import left_over
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.distributions import Perturbation
@@ -160,10 +161,10 @@ def prove(
         scenario = canonical(scenario)
         sampled = sample_weights(problem, level, weights_of(scenario, weight), seed)
         best = min(sampled, key=lambda each: each.largest)
-        result, worst, growth_points = None, None, []
+        result, growth_points, of_search = None, [], {}
         if best.largest <= 0.0:
             best, result = _search_best_weight(problem, level, sampled, best, options)
-            worst = result.worst
+            of_search = _of_search(problem, level, best.weight, result, seed)
         else:
             # For each weight, V_w' > 0 at a point of the set.
             for each in sampled:
@@ -185,15 +186,13 @@ def prove(
             weight=best.weight,
             duration=problem.duration,
             is_period=problem.is_period,
-            boxes=0 if result is None else result.boxes,
-            done=0.0 if result is None else result.done,
             seconds=time.monotonic() - start,
             rates={each.weight: each.largest for each in sampled},
             growth_points=tuple(growth_points),
-            worst_box=None if worst is None else _worst_box(problem, level, best.weight, worst),
             violation=violation,
             assumptions=problem.assumptions,
             disturbance_rate=disturbance_rate,
+            **of_search,
         )
 
 
@@ -371,6 +370,7 @@ def _search_at(
             problem.upper,
             problem.constants(weight, level),
             patterns=problem.patterns,
+            scales=problem.scales,
             max_boxes=max_boxes,
             threads=options.threads,
             progress=options.progress,
@@ -379,6 +379,22 @@ def _search_at(
     except UnsupportedError as error:
         expected = "operations of the list in docs/how_to/prove.md"
         raise checks.fail("prove: scenario", checks.Words(str(error)), expected) from error
+
+
+def _of_search(
+    problem: LevelSetProblem, level: float, weight: float, result: SearchResult, seed: int
+) -> dict[str, Any]:
+    """The fields of a `Proof` that describe its search."""
+    fields: dict[str, Any] = {"boxes": result.boxes, "done": result.done}
+    if result.expected is not None:
+        fields["expected_boxes"] = tuple(result.expected)
+    if result.worst is not None:
+        fields["worst_box"] = _worst_box(problem, level, weight, result.worst)
+    if result.proved:
+        return fields
+    fields["units_left"] = (len(result.left), result.units)
+    left = left_over(problem, problem.constants(weight, level), result.left, seed)
+    return fields if left is None else fields | left._asdict()
 
 
 def _worst_box(problem: LevelSetProblem, level: float, weight: float, box: SearchedBox) -> WorstBox:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import abc
 import dataclasses
 import itertools
+import math
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, ClassVar, NamedTuple
@@ -27,6 +28,13 @@ from iblf_jax.simulation.scenario import Scenario
 PARTS_OF_TIME = 32
 """Parts of the time interval, each of which is searched on its own: over a long part a tube may
 have no positive width, so that no bisection would be better than another."""
+
+
+TIME_SCALE = 4.0
+"""Width of the time at which `search` counts it as wide as an angle of a quarter turn or more, in
+parts of its interval."""
+PARAMETER_SCALE = 10.0
+"""The same of a parameter, in parts of its interval."""
 
 
 class LevelSetState(NamedTuple):
@@ -143,6 +151,21 @@ class LevelSetProblem(abc.ABC):
         """
         part = self.duration / PARTS_OF_TIME * (1.0 + 1e-9)
         return np.array([part, *(high for _, _, high in self.angles), *self.uncertain.high])
+
+    @property
+    def scales(self) -> np.ndarray:
+        """Widths at which coordinates count as equally wide, (b,).
+
+        Time and parameters vary little within their intervals, and an angle of a full turn counts
+        as one of half a turn (docs/theory/guarantees.md has measurements).
+        """
+        width = self.upper - self.lower
+        angles = slice(1, 1 + len(self.angles))
+        scales = PARAMETER_SCALE * width
+        scales[0] = TIME_SCALE * width[0]
+        scales[angles] = np.minimum(width[angles], math.pi)
+        # A number that does not vary has a width of 0, and is not bisected.
+        return np.where(width > 0.0, scales, 1.0)
 
     @property
     def patterns(self) -> np.ndarray:

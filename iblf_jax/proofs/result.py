@@ -29,6 +29,9 @@ INSTANTS = 512
 """Times of a guaranteed tube."""
 CONSTANT = 1e-9
 """Relative variation of the bound of |xi| below which it does not depend on the time."""
+REACHED = 2.0**-6
+"""Width of boxes, in parts of each coordinate, that a search of two links reaches with some million
+boxes."""
 AT_REST = 5.0
 """Time that is shown if reference and bounds are constant, so that there is no period [s]."""
 
@@ -145,22 +148,39 @@ class Proof(Result):
     """Length of the time interval [s]."""
     is_period: bool
     """Whether the time interval is a period, so that the statement is about all times."""
-    boxes: int
-    """Number of boxes that were evaluated."""
-    done: float
-    """Part of the volume on which V_w' < 0 is proved."""
     seconds: float
     """Time that the call took [s]."""
     rates: dict[float, float]
     """Weight w that was tried -> the largest V_w' that was found."""
     growth_points: tuple[GrowthPoint, ...]
     """For each weight a point with V_w' > 0, if every weight has one; () otherwise."""
-    worst_box: WorstBox | None
-    """Of a proof that is not complete; None otherwise."""
     violation: Violation | None
     """None unless the verdict is REFUTED."""
     assumptions: tuple[str, ...]
     """What the statement assumes, in sentences."""
+    boxes: int = 0
+    """Number of boxes that were evaluated."""
+    done: float = 0.0
+    """Part of the volume on which V_w' < 0 is proved."""
+    expected_boxes: tuple[float, float] | None = None
+    """Number of boxes that random descents estimated before the search, infinite if one of them
+    ended at a box that cannot be bisected, and the standard error of the number; None without an
+    estimate."""
+    worst_box: WorstBox | None = None
+    """Of a proof that is not complete; None otherwise."""
+    units_left: tuple[int, int] = (0, 0)
+    """Units of work of the search that are not proved, which includes those that were not begun,
+    and all units."""
+    negative_shares: Mapping[float, float] = dataclasses.field(default_factory=dict)
+    """Width of boxes at random points of these units, in parts of each coordinate -> share of those
+    on which V_w' < 0 is shown; empty unless the search ended without a proof."""
+    left_width: float | None = None
+    """The least of these widths with boxes to which `left_intervals` belongs."""
+    left_intervals: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
+    """Coordinate -> interval of the middle 90 % of the boxes of this width on which V_w' < 0 is not
+    shown."""
+    left_value: float | None = None
+    """The largest upper bound of V_w' at the random points."""
     disturbance_rate: Any = None
     """Bound of the rate of a further disturbance, () or (n,) [N m/s]; None without one."""
     history: tuple[Attempt, ...] = ()
@@ -265,8 +285,7 @@ class Proof(Result):
 
     def details(self) -> list[str]:
         """What was found, as lines."""
-        rows = [("", name, f"{low:.6g} to {high:.6g}") for name, (low, high) in self.ranges.items()]
-        lines = list(tables.as_text(rows, left=(0, 1)))
+        lines = list(tables.as_text(_rows(self.ranges), left=(0, 1)))
         if self.proved:
             xi = self.tube.xi.max(axis=0)
             texts = ", ".join(f"{math.ceil(x * 1e4) / 1e4:.4g}" for x in xi)
@@ -292,8 +311,13 @@ class Proof(Result):
             )
         if self.verdict == Verdict.UNDECIDED:
             lines += self._why_undecided()
-        evaluated = f"w = {self.weight:.3g}, {self.boxes:,} boxes, {self.seconds:.3g} s."
-        lines.append(evaluated)
+        expected = ""
+        if self.expected_boxes is not None and math.isfinite(self.expected_boxes[0]):
+            boxes, error = self.expected_boxes
+            expected = f" ({boxes:.2g} expected, standard error {error:.1g})"
+        lines.append(
+            f"w = {self.weight:.3g}, {self.boxes:,} boxes{expected}, {self.seconds:.3g} s."
+        )
         if self.history:
             levels = ", ".join(f"{x.value:.4g} {x.verdict}" for x in self.history)
             lines.append(f"Tried: {levels}.")
@@ -302,23 +326,53 @@ class Proof(Result):
 
     def _why_undecided(self) -> list[str]:
         lines = [f"V_w' < 0 is proved on {100.0 * self.done:.3g} % of the volume."]
+        lines += self._what_is_left()
         box = self.worst_box
         if box is None:
             return lines
-        if box.bound < 0.0:
-            lines.append("The boxes that are left need more of them: increase max_boxes.")
-            return lines
         lines.append(f"Worst box: V_w' <= {box.bound:+.4g}, {box.value:+.4g} at its centre:")
-        rows = [
-            ("", name, f"{low:.6g} to {high:.6g}") for name, (low, high) in box.intervals.items()
-        ]
-        lines += tables.as_text(rows, left=(0, 1))
-        if box.decisive is not None:
+        lines += tables.as_text(_rows(box.intervals), left=(0, 1))
+        if box.decisive is not None and box.bound >= 0.0:
             lines.append(
                 f"The width of {box.decisive} raises the bound most: it is"
                 f" {box.narrowed[box.decisive]:+.4g} without it."
             )
         return lines
+
+    def _what_is_left(self) -> list[str]:
+        """Where the boxes are that are left, and what is likely to help."""
+        if self.left_width is None or self.left_value is None:
+            return []
+        left, units = self.units_left
+        lines = [
+            f"{left:,} of {units:,} units of work are not finished or not begun. At random points"
+            f" of them V_w' <= {self.left_value:+.4g}, and of boxes around the points this share"
+            " has a negative bound, by their width in parts of each coordinate:"
+        ]
+        shares = self.negative_shares.items()
+        lines.append("  " + ", ".join(f"1/{1.0 / w:.0f}: {_percent(share)}" for w, share in shares))
+        if self.left_intervals:
+            lines.append(
+                f"The middle 90 % of the others of width 1/{1.0 / self.left_width:.0f} are at:"
+            )
+            lines += tables.as_text(_rows(self.left_intervals), left=(0, 1))
+        return [*lines, self._remedy()]
+
+    def _remedy(self) -> str:
+        """What is likely to help."""
+        narrower = "A smaller level, narrower intervals or other gains help."
+        if self.left_value is not None and self.left_value >= 0.0:
+            return (
+                f"The bound is not negative at a point, so that more boxes do not help. {narrower}"
+            )
+        negative = [width for width, share in self.negative_shares.items() if share == 1.0]
+        widest = max(negative, default=0.0)
+        if widest >= REACHED:
+            return f"All of width 1/{1.0 / widest:.0f} are negative: increase max_boxes."
+        return (
+            f"Some of width 1/{1.0 / REACHED:.0f} are not negative, which takes many more boxes."
+            f" {narrower}"
+        )
 
 
 _STATEMENTS = {
@@ -327,6 +381,16 @@ _STATEMENTS = {
     Verdict.REFUTED: "not inside the bounds forever",
     Verdict.UNDECIDED: "neither proved nor refuted to be invariant",
 }
+
+
+def _rows(intervals: Mapping[str, tuple[float, float]]) -> list[tuple[str, str, str]]:
+    """Intervals as rows of a table."""
+    return [("", name, f"{low:.6g} to {high:.6g}") for name, (low, high) in intervals.items()]
+
+
+def _percent(share: float) -> str:
+    """A share in per cent, which is 100 only if it is 1."""
+    return f"{math.floor(1000.0 * share) / 10.0:g} %"
 
 
 def _numbers(value: np.ndarray | float | Mapping[str, float]) -> str:

@@ -1,12 +1,27 @@
 """Branch and bound over boxes: proves that one of several functions is negative at every point.
 
 A box is finished if an alternative is negative on it, or if it is outside the region; otherwise it
-is bisected, along the coordinate that reduces the margin most (`kernels/c/boxes.h`). The whole box
-is first divided into some thousand boxes, the units of work. A compiled kernel searches each of
-them depth-first.
+is bisected. The whole box is first divided into some thousand boxes, the units of work. A compiled
+kernel (`kernels/c/boxes.h`) searches each of them depth-first.
 
 The number of boxes does not depend on the number of threads: results count in the order of the
 units, up to the first one that is not proved.
+
+**Which coordinate is bisected.** The one whose bisection removes most of the margin, of those whose
+width is at least 1/guard of the widest one, each in parts of its scale. Without a guard the search
+may bisect one coordinate for ever: where the margin falls only after bisections along several
+coordinates, a bisection along each one of them alone gains nothing. Random descents from the units
+estimate the number of boxes with each guard of GUARDS before the search.
+
+**Why the choice cannot prove too much.** A bisection replaces [low, high] by [low, middle] and
+[middle, high] along one coordinate, with one floating-point number low < middle < high in both, and
+keeps all other ends. The union of the halves is the box, whichever coordinate was chosen. By
+induction, the boxes that are finished, that wait or that count as undecided cover the whole box
+after every bisection. A box is finished only by its own bound, which is rounded outward and holds
+at each of its points, and which knows nothing of the bisections before. A search has proved its
+statement only if no box waits and none is undecided, so that finished boxes cover the whole. Each
+weight, scale and guard, also a wrong one or NaN, decides how many boxes that takes, and if the
+search ends; no more. The estimate by descents reads copies of the units and changes no result.
 """
 
 from __future__ import annotations
@@ -42,14 +57,31 @@ UNITS = 4096
 """Units of work, at least, unless fewer boxes prove the statement."""
 RENEWAL = 7
 """Bisections after which the weights of the coordinates are measured again."""
+GUARDS = (3.0, 16.0, math.inf)
+"""Guards of which a search takes the one that is estimated to need the fewest boxes. Which is the
+best differs by a factor of 1000 and more: a coordinate on which the bound hardly depends should not
+be bisected, and one that counts together with another one only must be."""
+FEW_BOXES = 4.0
+"""Further guards are tried if the search is expected to take more than this multiple of the boxes
+of an estimate."""
+DIFFERENCE = 2.0
+"""Standard errors that are added to an estimate before it is compared with another one."""
+DESCENTS = 512
+"""Units from which a random path descends to estimate the number of boxes."""
+GROUPS = 16
+"""Groups of these units, from whose differences the standard error follows."""
 NARROWEST = 2.0**-24
 """Width, in parts of the whole, up to which a coordinate is not bisected."""
 MAX_UNDECIDED = 16
 """Boxes of a unit that are too narrow to be bisected, after which its search ends."""
 SECONDS_BETWEEN_CHECKPOINTS = 10.0
-FORMAT = "checkpoint 2"
+FORMAT = "checkpoint 3"
 """Name of the form of a checkpoint."""
-RESULT_TYPES = {"divide_box": ctypes.c_int64, "search_box": ctypes.c_int}
+RESULT_TYPES = {
+    "divide_box": ctypes.c_int64,
+    "search_box": ctypes.c_int,
+    "expected_boxes": ctypes.c_int,
+}
 """Function of a kernel -> the C type of its result, which is negative if it has not run."""
 
 
@@ -66,6 +98,31 @@ class SearchedBox(NamedTuple):
     """The same at its centre."""
 
 
+class Expectation(NamedTuple):
+    """An estimate of the number of boxes of a search, which is made before it.
+
+    Each of some random units contributes one path to a random leaf; what is evaluated there after k
+    bisections counts 2^k times (D. E. Knuth, Mathematics of Computation 29 (1975) 122-136). The
+    expectation is the number of boxes itself; the estimate is too small where few deep paths, which
+    a sample misses, make up most of the search.
+    """
+
+    boxes: float
+    """Infinite if a path ends at a box that is too narrow to be bisected, or that refutes."""
+    error: float
+    """Standard error of the estimate."""
+
+    @property
+    def at_most(self) -> float:
+        """The number that is compared with those of other rules."""
+        return self.boxes + DIFFERENCE * self.error
+
+    def __str__(self) -> str:
+        if not math.isfinite(self.boxes):
+            return "no number of boxes is enough, by random descents"
+        return f"{self.boxes:.2g} boxes expected, standard error {self.error:.1g}"
+
+
 class SearchResult(NamedTuple):
     """The result of a search."""
 
@@ -79,6 +136,13 @@ class SearchResult(NamedTuple):
     """Part of the volume on which the statement is proved."""
     worst: SearchedBox | None
     """None if the statement is proved."""
+    expected: Expectation | None
+    """None where the division into units ends the search."""
+    units: int
+    """Number of units of work."""
+    left: np.ndarray
+    """Lower and upper corners of the units that are not proved, (k, 2, d); the first one was
+    begun."""
 
     @property
     def proved(self) -> bool:
@@ -92,7 +156,9 @@ class _Options(ctypes.Structure):
         ("max_undecided", ctypes.c_int64),
         ("renewal", ctypes.c_int64),
         ("smallest", ctypes.c_void_p),
+        ("scale", ctypes.c_void_p),
         ("stop", ctypes.c_void_p),
+        ("guard", ctypes.c_double),
     )
 
 
@@ -112,13 +178,22 @@ class _Problem:
       kernel: kernel of the function.
       lower: lower corners of the boxes that are to be searched, (p, d).
       upper: upper corners, (p, d).
+      scales: widths at which coordinates count as equally wide, (d,); all of the width if None.
     """
 
-    def __init__(self, kernel: IntervalKernel, lower: np.ndarray, upper: np.ndarray) -> None:
+    def __init__(
+        self,
+        kernel: IntervalKernel,
+        lower: np.ndarray,
+        upper: np.ndarray,
+        scales: np.ndarray | None = None,
+    ) -> None:
         self.kernel = kernel
         self.lower = lower
         self.upper = upper
         self.smallest = (upper - lower)[0] * NARROWEST
+        self.scales = (upper - lower)[0] if scales is None else scales
+        self.guard = GUARDS[0]
         self.stop = np.zeros(1, np.int32)
         self.size = int(kernel.library.record_size())
         self.dimension = lower.shape[1]
@@ -133,12 +208,14 @@ class _Problem:
             FORMAT,
             UNITS,
             RENEWAL,
+            self.guard,
             NARROWEST,
             MAX_UNDECIDED,
             ENCLOSURE_FLAGS,
             np.shape(units),
         )
-        arrays = (self.kernel.numbers, self.lower, self.upper, self.smallest, units)
+        corners = (self.lower, self.upper, self.smallest, self.scales)
+        arrays = (self.kernel.numbers, *corners, units)
         parts = [repr(options).encode(), self.kernel.compiled.source.encode()]
         parts += [np.ascontiguousarray(x).tobytes() for x in arrays]
         found = hashlib.sha256()
@@ -173,6 +250,44 @@ class _Problem:
         )
         return units[np.random.default_rng(0).permutation(len(units))], division
 
+    def choose_guard(self, units: np.ndarray) -> Expectation:
+        """Chooses the guard that is expected to need the fewest boxes for some units.
+
+        Returns:
+          The estimate with this guard.
+        """
+        self.guard = GUARDS[0]
+        best, boxes = self.expected(units)
+        chosen = self.guard
+        for guard in GUARDS[1:]:
+            if best.boxes <= FEW_BOXES * boxes:
+                break
+            self.guard = guard
+            found, _ = self.expected(units)
+            if found.at_most < best.at_most:
+                best = found
+                chosen = guard
+        self.guard = chosen
+        return best
+
+    def expected(self, units: np.ndarray) -> tuple[Expectation, int]:
+        """An estimate of the boxes of some units, which are in a random order, and the boxes that
+        it takes itself.
+        """
+        sampled = units[:DESCENTS].copy()
+        groups = np.array_split(sampled, min(GROUPS, len(sampled)))
+        means = []
+        boxes = 0
+        for seed, group in enumerate(groups):
+            more = (ctypes.c_int64(len(group)), ctypes.c_uint64(seed))
+            result, _ = self._call("expected_boxes", 0, group, *more)
+            means.append(result.done / len(group))
+            boxes += result.boxes
+        if not np.isfinite(means).all():
+            return Expectation(math.inf, math.inf), boxes
+        deviation = float(np.std(means)) / math.sqrt(max(1, len(means) - 1))
+        return Expectation(len(units) * float(np.mean(means)), len(units) * deviation), boxes
+
     def searched(self, unit: np.ndarray, max_boxes: int) -> _Found:
         """The result of a unit."""
         result, _ = self._call("search_box", max_boxes, unit)
@@ -192,7 +307,13 @@ class _Problem:
     def _call(self, name: str, max_boxes: int, boxes: np.ndarray, *more: Any) -> tuple[_Found, int]:
         """Calls a function of the kernel."""
         options = _Options(
-            max_boxes, MAX_UNDECIDED, RENEWAL, pointer(self.smallest), pointer(self.stop)
+            max_boxes,
+            MAX_UNDECIDED,
+            RENEWAL,
+            pointer(self.smallest),
+            pointer(self.scales),
+            pointer(self.stop),
+            self.guard,
         )
         result = self._result_type()()
         function = getattr(self.kernel.library, name)
@@ -294,6 +415,7 @@ def search(
     constants: Sequence[Any] = (),
     *,
     patterns: ArrayLike | None = None,
+    scales: ArrayLike | None = None,
     max_boxes: int = 1_000_000_000,
     threads: int | None = None,
     progress: bool | None = None,
@@ -310,6 +432,8 @@ def search(
       constants: numbers and arrays of the function, which count as exact.
       patterns: values of the last d - b coordinates, which are not divided, (p, d - b): the
         statement is to be proved for each row. None if d = b.
+      scales: widths at which coordinates count as equally wide, (b,); the widths of the whole box
+        if None. They decide how many boxes are needed, not what is proved.
       max_boxes: number of boxes after which the search ends, at the end of a generation of boxes
         where it is reached during the division into units.
       threads: number of threads; None for the number of processors.
@@ -334,13 +458,22 @@ def search(
     rows = np.zeros((1, 0))
     if patterns is not None:
         rows = np.asarray(patterns, np.float64)
+    widths = high - low
+    if scales is not None:
+        widths = np.asarray(scales, np.float64)
+        if widths.shape != low.shape or not (np.isfinite(widths) & (widths > 0.0)).all():
+            raise checks.fail("scales", scales, f"{len(low)} positive numbers")
+    widths = np.concatenate([widths, np.zeros(rows.shape[1])])
     # The corners of the boxes of all patterns, each (p, d).
     low, high = (
         np.concatenate([np.broadcast_to(corner, (len(rows), len(corner))), rows], axis=1)
         for corner in (low, high)
     )
-    problem = _Problem(interval_kernel(function, low.shape[1], constants), low, high)
+    problem = _Problem(interval_kernel(function, low.shape[1], constants), low, high, widths)
     units, division = problem.divided(max_boxes)
+    expected = None
+    if division.status == PROVED and len(units) > 0:
+        expected = problem.choose_guard(units)
     results = _Results(checkpoint, problem.digest(units), len(units))
     boxes = division.boxes
     done = division.done
@@ -348,13 +481,14 @@ def search(
     proved = 0
     with bar(progress, total=100, unit="% of the volume") as shown:
         shown.update(100 * done)
+        shown.set_postfix_str(str(expected or ""))
         if division.status == PROVED:
             for found in _in_order(problem, units, results, max_boxes - boxes, threads):
                 ended = found
                 boxes += found.boxes
                 done += found.done
                 shown.update(100 * found.done)
-                shown.set_postfix_str(f"{boxes:.3g} boxes", refresh=False)
+                shown.set_postfix_str(f"{boxes:.3g} boxes, {expected}", refresh=False)
                 if found.status != PROVED:
                     break
                 proved += 1
@@ -362,7 +496,11 @@ def search(
     if ended.status == OUT_OF_BOXES:
         left = [box for box in (worst, problem.worst(units[proved:])) if box is not None]
         worst = max(left, key=lambda box: box.value, default=None)
-    return SearchResult(STATUSES[ended.status], boxes, time.monotonic() - start, done, worst)
+    corners = units[proved:, : 2 * problem.dimension].reshape(-1, 2, problem.dimension)
+    seconds = time.monotonic() - start
+    return SearchResult(
+        STATUSES[ended.status], boxes, seconds, done, worst, expected, len(units), corners
+    )
 
 
 def _in_order(

@@ -133,7 +133,17 @@ def test_a_small_budget_leaves_it_undecided():
     assert set(box.intervals) == set(found.problem.names)
     assert list(box.narrowed) == ["plant.mass[0]"]
     assert box.narrowed["plant.mass[0]"] <= box.bound
-    assert "of the volume" in repr(found)
+    left, units = found.units_left
+    assert 0 < left <= units
+    assert found.left_value < 0.0
+    # A proof with more boxes exists, so that the narrowest ones are all negative.
+    shares = list(found.negative_shares.values())
+    assert shares == sorted(shares) and shares[0] < 1.0 and shares[-1] == 1.0
+    assert set(found.left_intervals) == {"t", *found.problem.names[1:-1]}
+    low, high = found.left_intervals["plant.mass[0]"]
+    assert 0.95 <= low < high <= 1.05
+    text = repr(found)
+    assert "of the volume" in text and "units of work" in text and "increase max_boxes" in text
 
 
 WIDE = 5.0
@@ -309,8 +319,22 @@ def test_two_links_are_proved_and_nothing_contradicts(gains, percent, level):
 
 
 @pytest.mark.release
+@pytest.mark.parametrize(("percent", "most"), [(0.1, 2_000_000), (0.2, 12_000_000)])
+def test_the_gains_of_the_paper_are_proved_for_narrow_intervals(percent, most):
+    inertia = percent / 100.0
+    masses = {"plant.mass, plant.inertia": ij.factor(ij.interval(1.0 - inertia, 1.0 + inertia))}
+    options = {"level": 0.5, "parameters": masses, "weight": 2e-3, "progress": False}
+    found = ij.prove(paper(), max_boxes=most, **options)
+    assert found.proved
+    boxes, error = found.expected_boxes
+    assert boxes == pytest.approx(found.boxes, abs=5.0 * error + 0.1 * found.boxes)
+    assert max(largest_rate(found, 100_000, seed) for seed in range(10)) < 0.0
+    assert contradictions(found, 1_000, duration=2.0) == 0
+
+
+@pytest.mark.release
 @pytest.mark.parametrize("level", [0.5, 1.0])
-def test_the_gains_of_the_paper_are_not_proved(level):
+def test_the_gains_of_the_paper_are_not_proved_for_wide_intervals(level):
     found = ij.prove(paper(), level=level, parameters=within(3.0), progress=False)
     assert found.verdict == Verdict.NOT_PROVED
     assert all(point.rate > 0.0 for point in found.growth_points)

@@ -156,6 +156,104 @@ def test_proved_statements_hold_at_random_points():
         assert found.proved == (constant < -1)
 
 
+def coupled(x, c):
+    """The larger one of two terms that are 0 and have a width, beside a term of little width that
+    is 0, too; the constant is the value.
+
+    A bisection of x_0 or x_1 alone does not reduce the bound.
+    """
+    zeros = jnp.cos(x) ** 2 + jnp.sin(x) ** 2 - 1.0
+    return (jnp.maximum(zeros[0], zeros[1]) + 0.01 * zeros[2] + c[0])[None], NOWHERE
+
+
+def test_no_coordinate_is_bisected_alone_for_ever(monkeypatch):
+    """Without the guard x_2 alone is bisected: each of its bisections gains a little."""
+    options = {"max_boxes": 60_000, "progress": False}
+    found = search(coupled, LOW, HIGH, [-0.2], **options)
+    assert found.proved
+    monkeypatch.setattr(module, "GUARDS", (np.inf,))
+    assert search(coupled, LOW, HIGH, [-0.2], **options).status == "out of boxes"
+
+
+@pytest.mark.slow
+def test_no_choice_of_the_coordinate_proves_too_much(monkeypatch):
+    """Scales and guards at random, also absurd ones, prove a statement or leave it open."""
+    generator = np.random.default_rng(4)
+    for guard in (0.0, 1.0, 3.0, np.inf, np.nan):
+        monkeypatch.setattr(module, "GUARDS", (guard,))
+        for scales in 10.0 ** generator.uniform(-12.0, 12.0, (4, 3)):
+            options = {"scales": scales, "max_boxes": 20_000, "progress": False}
+            assert not search(waves, LOW, HIGH, [-0.999], **options).proved
+            assert not search(bowl, LOW, HIGH, [0.0], **options).proved
+            found = search(waves, LOW, HIGH, [-1.5], **options)
+            assert found.proved == (found.done == pytest.approx(1.0, abs=1e-12))
+
+
+def test_the_halves_of_a_box_cover_it():
+    """After a division all units together have the volume that is not finished, and every point of
+    the whole is in one of them or has a negative value.
+    """
+    problem = module._Problem(interval_kernel(waves, 3, [-1.01]), LOW[None], HIGH[None])
+    units, division = problem.divided(10**6)
+    low, high = units[:, :3], units[:, 3:6]
+    left = np.prod(high - low, axis=1).sum() / np.prod(HIGH - LOW)
+    assert division.done + left == pytest.approx(1.0, abs=1e-12)
+    points = np.random.default_rng(0).uniform(LOW, HIGH, (300, 3))
+    for point in points:
+        is_inside = np.all((low <= point) & (point <= high), axis=1).any()
+        assert is_inside or waves(point, [-1.01])[0] < 0.0
+
+
+@pytest.mark.parametrize("constant", [-1.01, -1.001, -1.0003])
+def test_descents_estimate_the_number_of_boxes(constant):
+    found = search(waves, LOW, HIGH, [constant], progress=False)
+    assert found.proved
+    searched = found.boxes - division_of(waves, [constant])
+    assert found.expected.boxes == pytest.approx(searched, abs=5.0 * found.expected.error)
+    assert found.expected.error < 0.3 * searched
+
+
+def test_a_guard_that_needs_more_boxes_is_not_chosen():
+    """The bound hardly depends on x_1 and x_2, which a small guard bisects nevertheless."""
+
+    def one_of_three(x, c):
+        y = jnp.array([20.0, 1e-3, 1e-3]) * x
+        return (jnp.sum(jnp.cos(y) ** 2 + jnp.sin(y) ** 2) - 3.0 + c[0])[None], NOWHERE
+
+    problem = module._Problem(interval_kernel(one_of_three, 3, [-1e-2]), LOW[None], HIGH[None])
+    units, _ = problem.divided(10**6)
+    fair, _ = problem.expected(units)
+    chosen = problem.choose_guard(units)
+    assert chosen.boxes < 0.1 * fair.boxes
+    assert problem.guard > module.GUARDS[0]
+
+
+def division_of(function, constants):
+    """Boxes of the division into units."""
+    problem = module._Problem(interval_kernel(function, 3, constants), LOW[None], HIGH[None])
+    return problem.divided(10**9)[1].boxes
+
+
+def test_descents_say_that_no_number_of_boxes_is_enough():
+    """The value is exactly 0, so that every path ends at a box that is too narrow."""
+
+    def zero(x, c):
+        return (jnp.cos(x[0]) ** 2 + jnp.sin(x[0]) ** 2 - c[0])[None], NOWHERE
+
+    problem = module._Problem(interval_kernel(zero, 1, [1.0]), LOW[None, :1], HIGH[None, :1])
+    units, _ = problem.divided(10**5)
+    expected = problem.choose_guard(units)
+    assert expected.boxes == np.inf and "no number of boxes" in str(expected)
+
+
+def test_the_units_that_are_left_are_named():
+    found = search(waves, LOW, HIGH, [-1.0001], max_boxes=50_000, progress=False)
+    assert 0 < len(found.left) < found.units
+    assert found.left.shape[1:] == (2, 3)
+    assert np.all(found.left[:, 0] <= found.left[:, 1])
+    assert len(search(waves, LOW, HIGH, [-1.2], progress=False).left) == 0
+
+
 @pytest.mark.slow
 def test_an_interrupted_proof_continues(tmp_path, monkeypatch):
     """After an interruption the search needs no proved unit again, and gives the same count."""
@@ -229,8 +327,8 @@ def test_no_two_problems_have_the_bytes_of_a_digest_in_common():
     kernel = interval_kernel(waves, 3, [-1.2])
     units = np.arange(44.0).reshape(4, 11)
 
-    def digest(lower, upper, units):
-        return module._Problem(kernel, lower, upper).digest(units)
+    def digest(lower, upper, units, scales=None):
+        return module._Problem(kernel, lower, upper, scales).digest(units)
 
     digests = [
         digest(LOW[None], HIGH[None], units),
@@ -238,6 +336,7 @@ def test_no_two_problems_have_the_bytes_of_a_digest_in_common():
         digest(LOW[None], HIGH[None], units[:3]),
         digest(np.stack([LOW, HIGH]), np.stack([HIGH, HIGH]), units),
         digest(LOW[None], np.nextafter(HIGH, 3.0)[None], units),
+        digest(LOW[None], HIGH[None], units, np.array([4.0, 4.0, 2.0])),
     ]
     assert len(set(digests)) == len(digests)
 
@@ -250,6 +349,8 @@ def test_no_two_problems_have_the_bytes_of_a_digest_in_common():
         ([0.0], [1.0, 1.0], {}, "lower"),
         ([0.0], [1.0], {"threads": 0}, "threads"),
         ([0.0], [1.0], {"max_boxes": 0}, "max_boxes"),
+        ([0.0], [1.0], {"scales": [0.0]}, "scales"),
+        ([0.0], [1.0], {"scales": [1.0, 1.0]}, "scales"),
     ],
 )
 def test_bad_input_is_refused(lower, upper, options, message):

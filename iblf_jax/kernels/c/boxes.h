@@ -20,7 +20,9 @@ SEPARATE void leave(environment *e) { fesetenv(&e->before); }
 typedef struct {
   int64_t max_boxes, max_undecided, renewal;
   const real *smallest;          /* width up to which a coordinate is not bisected */
+  const real *scale;             /* width at which a coordinate counts as 1 wide */
   const volatile int *stop;
+  real guard;                    /* a coordinate is bisected only if it is at least 1/guard of the widest one */
 } search_options;
 typedef struct {
   int64_t boxes, undecided, status;
@@ -87,13 +89,19 @@ SEPARATE void measure(const shared_number *table, real *box, real value, real ou
   }
 }
 
-/* The coordinate along which a box is bisected; -1 if all are too narrow. */
-INLINE int widest(const real *box, const real *smallest) {
+/* The coordinate along which a box is bisected; -1 if all are too narrow.  It is the one whose bisection removes most of the margin, of those that are
+   not much narrower than the widest one: where only bisections along several coordinates together reduce the margin, no weight would choose them. */
+INLINE int chosen(const real *box, const search_options *options) {
   int best = -1;
-  real most = 0;
+  real most = 0, broadest = 0;
+  for (int i = 0; i < COORDINATES; i++) {
+    real width = box[COORDINATES + i] - box[i];
+    if (width > options->smallest[i] && width > broadest * options->scale[i]) broadest = width / options->scale[i];
+  }
   for (int i = 0; i < COORDINATES; i++) {
     real width = box[COORDINATES + i] - box[i], size = width * box[2 * COORDINATES + i];
-    if (width > smallest[i] && size > most) { most = size; best = i; }
+    int may = width > options->smallest[i] && width * options->guard >= broadest * options->scale[i];
+    if (may && size > most) { most = size; best = i; }
   }
   return best;
 }
@@ -139,7 +147,7 @@ SEPARATE int64_t branch(const shared_number *table, real *boxes, int some, const
       r->boxes += 2 * COORDINATES;
       box[AGE] = options->renewal;
     }
-    int i = widest(box, options->smallest);
+    int i = chosen(box, options);
     real middle = i < 0 ? 0 : box[i] + REAL(0.5) * (box[COORDINATES + i] - box[i]);
     if (i < 0 || !(box[i] < middle && middle < box[COORDINATES + i])) {
       note_worst(table, box, 1, r);
@@ -205,6 +213,27 @@ SEPARATE int64_t divide(const shared_number *table, real *boxes, int64_t target,
   return count;
 }
 
+/* The number of boxes that `search` would evaluate for some boxes, which are changed: a path on each follows a random half, and what is evaluated there
+   after k bisections counts 2^k times, so that the expectation is the number itself. */
+SEPARATE real descend(const shared_number *table, real *boxes, int64_t count, uint64_t random, const search_options *options, search_result *r) {
+  real batch[W * RECORD], children[2 * W * RECORD], expected = 0;
+  for (real parts = 1; count > 0 && r->status == FINISHED; parts *= 2) {
+    int64_t before = r->boxes, left = 0;
+    for (int64_t first = 0; first < count; first += W) {
+      int some = count - first < W ? (int)(count - first) : W;
+      memcpy(batch, boxes + first * RECORD, some * RECORD * sizeof(real));
+      int64_t halves = branch(table, batch, some, options, children, r);
+      for (int64_t k = 0; k < halves; k += 2) {
+        random = random * 6364136223846793005u + 1442695040888963407u;
+        memcpy(boxes + left++ * RECORD, children + (k + (random >> 63)) * RECORD, RECORD * sizeof(real));
+      }
+    }
+    expected += parts * (r->boxes - before);
+    count = left;
+  }
+  return expected;
+}
+
 #define BEGIN                                   \
   environment e;                                \
   if (enter(&e)) return -1;                     \
@@ -223,6 +252,14 @@ VISIBLE int64_t divide_box(const real *shared, real *boxes, int64_t target, cons
 VISIBLE int search_box(const real *shared, const real *box, const search_options *options, search_result *result) {
   BEGIN START_RESULT
   search(table, box, options, result);
+  leave(&e);
+  return 0;
+}
+/* result->done is the number of boxes that are expected; infinite where the search of these boxes proves nothing. */
+VISIBLE int expected_boxes(const real *shared, real *boxes, int64_t count, uint64_t random, const search_options *options, search_result *result) {
+  BEGIN START_RESULT
+  real expected = descend(table, boxes, count, random, options, result);
+  result->done = result->status == FINISHED && !result->undecided ? expected : INFINITY;
   leave(&e);
   return 0;
 }
