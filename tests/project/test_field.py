@@ -153,7 +153,7 @@ def tee_ge(runs):
     assert all(run.status == 0 for run in runs.values())
     for name in ("exact derivatives", "filter of the package"):
         assert 2.4 < np.abs(runs[name].alpha).max() < 2.5
-    evidence = entry.execute(entry.ENTRIES / "tee_ge_2012").evidence
+    evidence = entry.execute(entry.ENTRIES / "goel_2020").evidence
     np.testing.assert_allclose(evidence["corrected"], evidence["limit"], rtol=1e-6)
     assert evidence["branch"] > 5 * evidence["limit"]
 
@@ -166,7 +166,7 @@ def tangent(runs):
     unbounded = runs["Quadratic, no barrier"]
     assert unbounded.status == int(ij.Status.BOUND_VIOLATED)
     assert unbounded.x[:, 0].max() > 0.56
-    evidence = entry.execute(entry.ENTRIES / "tangent_barrier_2013").evidence
+    evidence = entry.execute(entry.ENTRIES / "xernicrose_2024").evidence
     assert evidence["wrong_V"] > 10 * evidence["wrong_least"]
     assert abs(evidence["hand"] - evidence["exact"]) > 0.1 * abs(evidence["exact"])
 
@@ -192,13 +192,13 @@ def zhang_yan(runs):
 
 
 FURTHER = {
-    "cruz_ancona_2022": cruz_ancona,
+    "bartelt_2024": cruz_ancona,
     "dimanidis_2018": dimanidis,
     "liu_2018": liu,
     "mahmud_2021": mahmud,
     "shaw_cortez_2022": shaw_cortez,
-    "tangent_barrier_2013": tangent,
-    "tee_ge_2012": tee_ge,
+    "xernicrose_2024": tangent,
+    "goel_2020": tee_ge,
     "zhang_2022": zhang,
     "zhang_yan_2024": zhang_yan,
 }
