@@ -132,8 +132,8 @@ LEFT_OUT = (
     " the others: the noted run has the method Tsit5, with six.",
     "Model predictive control is left out, because the noted runs are no comparison of equals: it"
     " has a period of 20 ms and an RMS torque of 1.22 N m, the safety filter beside it a period of"
-    " 1 ms and 0.35 N m; it is called from Python once a period, where the loop of the filter is one"
-    " compiled program; and it solves to convergence by IPOPT, without real-time iterations.",
+    " 1 ms and 0.35 N m; it is called from Python once a period, where the loop of the filter is"
+    " one compiled program; and it solves to convergence by IPOPT, without real-time iterations.",
 )
 """What has no row, and the reason, in sentences."""
 
@@ -191,7 +191,7 @@ def table() -> str:
     shown = [x for x in COMPARISONS if x.benchmark not in withdrawn.BENCHMARKS]
     removed = [x.task for x in COMPARISONS if x.benchmark in withdrawn.BENCHMARKS]
     head = [
-        "| task | iblf_jax | other software (ratio; below 1 the other one is better) | measured by |",
+        "| task | iblf_jax | other software (ratio; below 1 it is better) | measured by |",
         "|---|---|---|---|",
     ]
     lines = [*head, *map(row, shown)]

@@ -116,7 +116,7 @@ class Efforts(NamedTuple):
         """The numbers, in a sentence."""
         return (
             f"of {self.laws} laws in {self.tables} tables {self.equal} have such a factor,"
-            f" {self.own} run at gains of their own and therefore at another effort, and"
+            f" {self.own} have none and run at gains of their own, and"
             f" {self.failed} have no error, because they leave the bounds or diverge, or the time"
             f" step is too large for them; {self.compared} have both the factor and an error"
         )
@@ -173,8 +173,8 @@ def benchmark_page(found: list[Part]) -> str:
         " the printed and the missing parameters, the script, and the published numbers beside"
         f" those that the script reaches: {sum(numbers)} of {len(numbers)} published numbers are"
         " reached within the accuracy to which they can be read, and"
-        f" {sum(holds)} of {len(holds)} published statements hold. {corrected} corrections were"
-        " necessary, which [a page of its own](literature_corrected.md) lists."
+        f" {sum(holds)} of {len(holds)} published statements hold."
+        f" [A page of its own](literature_corrected.md) lists {corrected} corrections."
         " [Adding an entry](add_an_entry.md) describes the steps." + checked(),
         "## Entries",
         summary(found),
@@ -278,7 +278,7 @@ def published_and_reached(part: Part) -> str:
 
 
 def best_law(part: Part) -> tuple[str, str, str]:
-    """The law with the smallest error at equal effort and with noise, and its errors with and
+    """The law with the smallest error with noise among those with a factor, and its errors with and
     without noise as shares of those of the published law.
     """
     if part.is_withdrawn:
@@ -287,7 +287,7 @@ def best_law(part: Part) -> tuple[str, str, str]:
         return "not measured", "", ""
     best = _name_of_best(part.result)
     if best is None:
-        return "none at equal effort", "", ""
+        return "none has a factor", "", ""
     rows = {row["law"]: row for row in part.result["rows"]}
     columns = [column(part.result, start) for start in (NOISE, ERROR)]
     shares = [_share(rows[best][name], rows[PUBLISHED][name]) for name in columns]
@@ -296,7 +296,7 @@ def best_law(part: Part) -> tuple[str, str, str]:
 
 
 def _name_of_best(result: dict[str, Any]) -> str | None:
-    """The law with the smallest error at equal effort and with noise; None if there is none."""
+    """The law with a factor that has the smallest error with noise; None if there is none."""
     with_noise = column(result, NOISE)
     inside = {
         row["law"]: row[with_noise]
@@ -431,8 +431,8 @@ def corrections_page(found: list[Part]) -> str:
     )
     sections = [
         "# What the literature printed, and what is correct",
-        f"{count} corrections that were necessary to reproduce {concerned} of the {len(found)}"
-        " published examples of the [benchmark of the field](field.md):"
+        f"{count} corrections, found while {concerned} of the {len(found)} published examples of"
+        " the [benchmark of the field](field.md) were reproduced:"
         f" {len(lists['publication'])} of publications and {len(lists['program'])} of programs."
         " An entry has the name of whoever made what was read. Each correction states the commit or"
         " the edition that was read, its evidence, and whether somebody was asked:"
