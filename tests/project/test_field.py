@@ -10,6 +10,8 @@ import sys
 from types import SimpleNamespace
 from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import ROOT
@@ -760,6 +762,23 @@ def test_texts_state_what_was_equal_in_the_results():
     corrected = sum(bool(x.corrected) for x in entries)
     assert f"{lacking} of {len(NAMES)} published examples lack at least one" in article
     assert f"{corrected} have a correction" in article
+
+
+@pytest.mark.slow
+def test_most_of_the_effort_belongs_to_the_start():
+    """The README states both shares of the squared torque above gravity."""
+    scenario = ij.presets.zhang_yan_2024()
+    run = ij.simulate(scenario, duration=20.0, dt=1e-3)
+    gravity = jax.vmap(scenario.plant.gravity)(jnp.asarray(run.q))
+    square = np.sum((np.asarray(run.tau) - np.asarray(gravity)) ** 2, axis=1)
+    total, start, late = (
+        np.trapezoid(square[part], run.t[part])
+        for part in (run.t >= 0.0, run.t <= 0.5, run.t >= 10.0)
+    )
+    np.testing.assert_allclose(start / total, 0.94, atol=0.01)
+    np.testing.assert_allclose(late / total, 0.034, atol=0.005)
+    readme = (FIELD / "README.md").read_text(encoding="utf-8")
+    assert "94 % of the squared torque" in readme and "3 % to the second half" in readme
 
 
 def test_laws_that_lose_their_accuracy_with_noise_are_named_below_the_table(parts):
