@@ -24,8 +24,8 @@ ADVICE = {
     "Backstepping(Integral)": Advice(
         "the certificate of the paper's theorem counts. It stays inside the bounds at 10 ms, where"
         " `Backstepping` with the other barriers does not, because those run at 2 to 4.4 times its"
-        " gains: at twice its gains it leaves the bounds, too, and at its gains the logarithmic"
-        " barrier stays inside (lab notes)",
+        " gains: at twice its gains it leaves the bounds, too, and at its gains the other"
+        " barriers stay inside (lab notes)",
         "accuracy at a given effort counts; the other barriers have smaller errors",
     ),
     "Backstepping(Log)": Advice(
