@@ -1,5 +1,5 @@
-"""What keeps constraints, at equal effort: barrier laws, full state, dynamic surface, governor,
-safety filter, and nonlinear MPC.
+"""What keeps constraints: barrier laws, full state, dynamic surface, governor, safety filter, and
+nonlinear MPC.
 
     python benchmarks/constraints.py [--quick] [--json FILE] [--runs 400] [--mpc-runs 20]
 
@@ -7,10 +7,12 @@ The paper's arm, reference, bounds and disturbance, with bounds on the velocitie
 the tip that the reference crosses.  Each law's gains are scaled by the factor at which its RMS
 torque above gravity is the integral barrier's (`ij.compare`), where there is one; then many runs
 from starts within +-0.03 rad.  The MPC (`peers/mpc.py`; needs CasADi, and is left out without it)
-has a cost of its own, and its runs are the first of the others'.  `left` is the share of the runs
-that left it, `least` the smallest margin of all runs; rmse (worst joint) and effort above gravity
-are medians; `us a step` is the processor time of one control step: of a period of 1 ms with the
-plant's motion, or of one MPC of 20 ms.
+has a cost and a period of its own, 20 ms, solves to convergence, and its runs are the first of the
+others': its time a step is no number to compare with that of a formula that runs once in 1 ms.
+`left` is the share of the runs that left it, `least` the smallest margin of all runs; rmse (worst
+joint) and effort above gravity are medians; `us a step` is the processor time of one control step:
+of a period of 1 ms with the plant's motion, in one compiled loop, or of one MPC of 20 ms, which is
+called from Python.
 """
 
 from __future__ import annotations
@@ -222,7 +224,7 @@ def main() -> None:
     if importlib.util.find_spec("casadi"):
         rows.append(mpc_row(base, starts[:peers], duration))
     report(
-        f"Constraints at equal effort: {runs} runs of {duration:g} s a law, {peers} of the MPC",
+        f"Constraints: {runs} runs of {duration:g} s a law, {peers} of the MPC",
         COLUMNS,
         rows,
         args.json,

@@ -1,4 +1,4 @@
-"""Choosing a law: accuracy, peak torque and robustness of every law at equal effort.
+"""Choosing a law: accuracy, peak torque and robustness of laws whose gains have one factor.
 
     python benchmarks/laws.py [--quick] [--json FILE] [--only NAME]
 
@@ -279,7 +279,7 @@ def main() -> None:
         warnings.simplefilter("ignore")  # the table reports runs that leave the bounds
         rows = [row(name, duration) for name in names]
         further = {"settings": settings(duration), "messages": messages(duration)}
-    title = f"Laws at equal effort: {duration:g} s of the paper's motion"
+    title = f"Laws with one factor on their gains: {duration:g} s of the paper's motion"
     report(title, COLUMNS, rows, args.json, further)
 
 

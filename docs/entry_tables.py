@@ -54,7 +54,7 @@ def source_in_words(entry: Entry) -> str:
     )
     if source.code:
         text += f" Public program: <{source.code}>."
-    return f"{text} Source of the numbers: {READ[source.read]}."
+    return f"{text} Source of the numbers: {READ[source.read]}, {escaped(source.edition)}."
 
 
 def before_the_script(entry: Entry, made: Reproduction) -> list[str]:
@@ -79,12 +79,17 @@ def after_the_script(entry: Entry) -> list[str]:
 
 
 def corrections(entry: Entry, evidence: dict[str, float]) -> str:
-    """The corrections, with the computed numbers of their evidence."""
-    rows = [
-        [escaped(x.printed), escaped(x.corrected), escaped(filled(x.evidence, evidence))]
-        for x in entry.corrected
-    ]
-    return markdown_table(["printed", "corrected", "evidence"], rows)
+    """The corrections, with the computed numbers of their evidence, what was read, and whether
+    somebody was asked.
+    """
+    rows = []
+    for x in entry.corrected:
+        texts = [x.printed, x.corrected, filled(x.evidence, evidence)]
+        texts += [x.edition_of(entry.source), x.contact_in_words]
+        rows.append([x.found_in, *map(escaped, texts)])
+    headings = ["error of the", "printed", "corrected", "evidence", "read", "contact"]
+    table = markdown_table(headings, rows)
+    return f"{table}\n\nWho could be asked: {escaped(entry.source.contact)}."
 
 
 def published(entry: Entry, reached: dict[str, float]) -> str:

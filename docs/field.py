@@ -19,7 +19,9 @@ import gallery
 import withdrawn
 from entry import (
     CHECKS,
+    FOUND_IN,
     KINDS,
+    NOT_CONTACTED,
     PUBLISHED,
     READ,
     RESULTS,
@@ -57,6 +59,13 @@ COLUMNS = {
     " their largest value in the published run",
 }
 """Column of the tables -> its meaning."""
+INTRODUCTIONS = {
+    "publication": "Articles and theses, read in the edition that the table names.",
+    "program": "Programs of the authors of a publication, and programs of others that follow one."
+    " The publication may be right where the program is not: it is not concerned, unless its list"
+    " above has it.",
+}
+"""Value of `found_in` of a correction -> the sentences above its list."""
 
 
 class Part(NamedTuple):
@@ -85,6 +94,48 @@ class Part(NamedTuple):
         source = self.contents.source
         author = escaped(source.authors.split(",")[0])
         return f"[{author} {source.year}](gallery/{self.name}.md)"
+
+
+class Efforts(NamedTuple):
+    """What was equal in the tables of some entries: numbers of laws beside the published ones."""
+
+    tables: int
+    laws: int
+    equal: int
+    """Laws with one factor on their gains, whose effort is the published law's within 1 %."""
+    own: int
+    """Laws that reach this effort with no factor from 1/32 to 32, and run at their own gains."""
+    failed: int
+    """Laws without an error of the run without sampling: they leave the bounds or diverge, or the
+    step of the entry is too large for them."""
+    compared: int
+    """Laws with such a factor and an error."""
+
+    @property
+    def in_words(self) -> str:
+        """The numbers, in a sentence."""
+        return (
+            f"of {self.laws} laws in {self.tables} tables {self.equal} have such a factor,"
+            f" {self.own} have none and run at gains of their own, and"
+            f" {self.failed} have no error, because they leave the bounds or diverge, or the time"
+            f" step is too large for them; {self.compared} have both the factor and an error"
+        )
+
+
+def efforts(results: list[dict[str, Any]]) -> Efforts:
+    """Counts what was equal in some results of `measure.py`."""
+    laws, equal, failed, compared = 0, 0, 0, 0
+    for result in results:
+        error = column(result, ERROR)
+        for row in result["rows"]:
+            if row["law"] == PUBLISHED:
+                continue
+            is_equal, has_error = row["factor"] != "own", isinstance(row[error], float)
+            laws += 1
+            equal += is_equal
+            failed += not has_error
+            compared += is_equal and has_error
+    return Efforts(len(results), laws, equal, laws - equal, failed, compared)
 
 
 def parts(results: Path = RESULTS, made: Path = gallery.MADE) -> list[Part]:
@@ -122,26 +173,30 @@ def benchmark_page(found: list[Part]) -> str:
         " the printed and the missing parameters, the script, and the published numbers beside"
         f" those that the script reaches: {sum(numbers)} of {len(numbers)} published numbers are"
         " reached within the accuracy to which they can be read, and"
-        f" {sum(holds)} of {len(holds)} published statements hold. {corrected} corrections were"
-        " necessary, which [a page of its own](literature_corrected.md) lists."
+        f" {sum(holds)} of {len(holds)} published statements hold."
+        f" [A page of its own](literature_corrected.md) lists {corrected} corrections."
         " [Adding an entry](add_an_entry.md) describes the steps." + checked(),
         "## Entries",
         summary(found),
-        "The last three columns name the law of the package that has the smallest error at the"
-        " effort of the published law, sampled at about 500 Hz with noise, and its errors with and"
+        "The last three columns name the law of the package that has the smallest error among"
+        " those with a factor for the effort of the published law, sampled at about 500 Hz with"
+        " noise, and its errors with and"
         " without noise as shares of those of the published law. Without noise many of these tasks"
         " have an exact model and no disturbance, so that errors tend to zero under every law and"
         " their ratio states how fast." + noisy_laws(measured),
         "## Comparison on each task",
         f"{len(measured)} of {len(found)} entries have a table. The published law sets the effort:"
-        " the RMS input above the one that balances gravity. For"
+        " the RMS input above the one that balances gravity, over the entire run, so that most of"
+        " it may belong to the start. For"
         " a plant in strict-feedback form it is the RMS of all inputs, each in its unit, above the"
         " steady input of the plant, which is zero where the plant states none. One factor scales"
         " the gains of every other law to this effort. Before that, the laws have the rates of the"
         " published law, and boxes and limits at the scales of the published run"
         " (`benchmarks/field/measure.py`). Laws"
         " with several gains, or with a choice of the published gains for another purpose, could be"
-        " tuned further; the tables compare laws at one ratio of their gains.",
+        " tuned further; the tables compare laws at one ratio of their gains."
+        " Not all laws were equal in this sense:"
+        f" {efforts([x.result for x in measured]).in_words}.",
         markdown_table(
             ["column", "meaning"],
             [[name, meaning.format(noise=noise)] for name, meaning in COLUMNS.items()],
@@ -223,7 +278,7 @@ def published_and_reached(part: Part) -> str:
 
 
 def best_law(part: Part) -> tuple[str, str, str]:
-    """The law with the smallest error at equal effort and with noise, and its errors with and
+    """The law with the smallest error with noise among those with a factor, and its errors with and
     without noise as shares of those of the published law.
     """
     if part.is_withdrawn:
@@ -232,7 +287,7 @@ def best_law(part: Part) -> tuple[str, str, str]:
         return "not measured", "", ""
     best = _name_of_best(part.result)
     if best is None:
-        return "none at equal effort", "", ""
+        return "none has a factor", "", ""
     rows = {row["law"]: row for row in part.result["rows"]}
     columns = [column(part.result, start) for start in (NOISE, ERROR)]
     shares = [_share(rows[best][name], rows[PUBLISHED][name]) for name in columns]
@@ -241,7 +296,7 @@ def best_law(part: Part) -> tuple[str, str, str]:
 
 
 def _name_of_best(result: dict[str, Any]) -> str | None:
-    """The law with the smallest error at equal effort and with noise; None if there is none."""
+    """The law with a factor that has the smallest error with noise; None if there is none."""
     with_noise = column(result, NOISE)
     inside = {
         row["law"]: row[with_noise]
@@ -360,26 +415,39 @@ def _cell(value: Any) -> str:
 
 
 def corrections_page(found: list[Part]) -> str:
-    """All corrections, grouped by what was wrong."""
-    grouped: dict[str, list[tuple[Part, Correction]]] = {kind: [] for kind in KINDS}
+    """All corrections: a list of those of publications and one of those of programs, each grouped
+    by what was wrong.
+    """
+    lists: dict[str, list[tuple[Part, Correction]]] = {place: [] for place in FOUND_IN}
     for part in found:
         for correction in part.contents.corrected:
-            grouped[correction.kind].append((part, correction))
-    count = sum(len(group) for group in grouped.values())
+            lists[correction.found_in].append((part, correction))
+    count = sum(len(corrections) for corrections in lists.values())
     concerned = sum(bool(part.contents.corrected) for part in found)
+    contacted = sum(
+        correction.contacted != NOT_CONTACTED
+        for corrections in lists.values()
+        for _, correction in corrections
+    )
     sections = [
         "# What the literature printed, and what is correct",
-        f"{count} corrections that were necessary to reproduce {concerned} of the {len(found)}"
-        " published examples of the [benchmark of the field](field.md). Each has its evidence; the"
-        " numbers in it were computed by the script of the entry when this page was made. Some"
-        " entries were read from a public program that follows a publication; their corrections"
-        " concern this program, and the column *read* states it. The page"
+        f"{count} corrections, found while {concerned} of the {len(found)} published examples of"
+        " the [benchmark of the field](field.md) were reproduced:"
+        f" {len(lists['publication'])} of publications and {len(lists['program'])} of programs."
+        " An entry has the name of whoever made what was read. Each correction states the commit or"
+        " the edition that was read, its evidence, and whether somebody was asked:"
+        f" {contacted} of {count} were. The"
+        " numbers of the evidence were computed by the script of the entry when this page was made,"
+        " unless they are cited. The page"
         " [Printed and corrected](theory/printed_and_corrected.md) derives the corrections of the"
         " law and of the observer of the paper that this package is built on.",
     ]
-    for kind, group in grouped.items():
-        if group:
-            sections += [f"## {KINDS[kind]}", corrections_table(group)]
+    for place, corrections in lists.items():
+        sections += [f"## {FOUND_IN[place]}", INTRODUCTIONS[place]]
+        for kind in KINDS:
+            group = [pair for pair in corrections if pair[1].kind == kind]
+            if group:
+                sections += [f"### {KINDS[kind]}", corrections_table(group)]
     return "\n\n".join(sections) + "\n"
 
 
@@ -387,7 +455,16 @@ def corrections_table(group: list[tuple[Part, Correction]]) -> str:
     """The corrections of a group."""
     rows = []
     for part, correction in group:
-        evidence = filled(correction.evidence, part.computed["evidence"])
-        texts = [escaped(x) for x in (correction.printed, correction.corrected, evidence)]
-        rows.append([part.short_link, READ[part.contents.source.read], *texts])
-    return markdown_table(["entry", "read", "printed", "corrected", "evidence"], rows)
+        source = part.contents.source
+        read = f"{READ[source.read]}, {correction.edition_of(source)}"
+        texts = [
+            read,
+            correction.printed,
+            correction.corrected,
+            filled(correction.evidence, part.computed["evidence"]),
+            source.contact,
+            correction.contact_in_words,
+        ]
+        rows.append([part.short_link, *map(escaped, texts)])
+    headings = ["entry", "read", "printed", "corrected", "evidence", "who could be asked"]
+    return markdown_table([*headings, "contact"], rows)

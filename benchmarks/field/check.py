@@ -30,6 +30,7 @@ import numpy as np
 from _timing import machine
 from entry import (
     ENTRIES,
+    NOT_CONTACTED,
     PLACEHOLDER,
     TEMPLATE,
     Entry,
@@ -88,7 +89,7 @@ def _faults_of_name(folder: Path) -> list[str]:
         return []
     return [
         f"the folder {folder.name!r} must be named after the first author and the year,"
-        " such as tee_ge_2012"
+        " such as liu_2018"
     ]
 
 
@@ -139,12 +140,28 @@ def _faults_of_text(entry: Entry) -> list[str]:
     for number in entry.published:
         if not number.tolerance > 0.0:
             found.append(f"entry.toml: the tolerance of {number.quantity!r} must be positive")
+    found += _faults_of_corrections(entry)
     for pair in entry.equal_rows:
         if pair.law == pair.other:
             found.append(f"entry.toml: [[equal_rows]] needs two laws, not {pair.law!r} twice")
     keys = [x.quantity for x in entry.published] + [x.statement for x in entry.claims]
     for key in sorted({key for key in keys if keys.count(key) > 1}):
         found.append(f"entry.toml: {key!r} is there twice")
+    return found
+
+
+def _faults_of_corrections(entry: Entry) -> list[str]:
+    """Every correction has a number as its evidence, and says what was asked or answered."""
+    found = []
+    for i, correction in enumerate(entry.corrected, 1):
+        place = f"entry.toml: [[corrected]] number {i}"
+        if not re.search(r"[0-9]|{\w", correction.evidence):
+            found.append(f"{place}: the evidence needs a number")
+        if (correction.contacted == NOT_CONTACTED) != (correction.answer == ""):
+            found.append(
+                f"{place}: answer = {correction.answer!r} does not agree with contacted ="
+                f" {correction.contacted!r}; state what was asked or answered, with its date"
+            )
     return found
 
 

@@ -49,6 +49,11 @@ KINDS = {
     "other": "Others",
 }
 """Value of `kind` of a correction -> heading of its group on the page of all corrections."""
+FOUND_IN = {"publication": "Errors in publications", "program": "Errors in programs"}
+"""Value of `found_in` of a correction -> heading of its list on the page of all corrections."""
+NOT_CONTACTED = "not contacted"
+CONTACTED = (NOT_CONTACTED, "asked", "confirmed", "disputed")
+"""Values of `contacted` of a correction."""
 
 
 class EntryError(ValueError):
@@ -75,6 +80,10 @@ class Source:
     title: str
     where: str
     year: int
+    edition: str
+    """The commit, or the edition, that was read."""
+    contact: str
+    """Who could be asked about the corrections."""
     read: str = _one_of(READ)
     doi: str = ""
     url: str = ""
@@ -102,7 +111,23 @@ class Correction:
     printed: str
     corrected: str
     evidence: str
+    """At least one number."""
+    found_in: str = _one_of(FOUND_IN)
     kind: str = _one_of(KINDS, default="other")
+    edition: str = ""
+    """Where it is another one than that of the source."""
+    contacted: str = _one_of(CONTACTED, default=NOT_CONTACTED)
+    answer: str = ""
+    """What was asked or answered, with its date; not empty if somebody was contacted."""
+
+    def edition_of(self, source: Source) -> str:
+        """The commit, or the edition, that was read."""
+        return self.edition or source.edition
+
+    @property
+    def contact_in_words(self) -> str:
+        """Whether somebody was contacted, and the answer."""
+        return f"{self.contacted}: {self.answer}" if self.answer else self.contacted
 
 
 @dataclasses.dataclass(frozen=True)

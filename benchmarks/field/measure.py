@@ -1,4 +1,5 @@
-"""All applicable laws of the package on the task of each entry, at equal effort.
+"""All applicable laws of the package on the task of each entry, at the effort of the published law
+where one factor on their gains gives it.
 
     python benchmarks/field/measure.py [NAME ...] [--quick] [--processes N] [--out FOLDER]
 

@@ -10,6 +10,8 @@ import sys
 from types import SimpleNamespace
 from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import ROOT
@@ -142,23 +144,25 @@ def mahmud(runs):
     )
 
 
-def cruz_ancona(runs):
+def bartelt(runs):
     for run in runs.values():
         assert run.status == 0
         w = 1.4195117 * np.linalg.norm(run.dq - run.alpha, axis=1)
         assert w[0] > 1 > 0.05 > w[run.t > 8.0].max()
 
 
-def tee_ge(runs):
+def goel(runs):
     assert all(run.status == 0 for run in runs.values())
     for name in ("exact derivatives", "filter of the package"):
         assert 2.4 < np.abs(runs[name].alpha).max() < 2.5
-    evidence = entry.execute(entry.ENTRIES / "tee_ge_2012").evidence
+    evidence = entry.execute(entry.ENTRIES / "goel_2020").evidence
     np.testing.assert_allclose(evidence["corrected"], evidence["limit"], rtol=1e-6)
     assert evidence["branch"] > 5 * evidence["limit"]
+    # The branch at z_1 = 0 has no effect on the runs.
+    assert evidence["zeros"] == 0 < evidence["states"]
 
 
-def tangent(runs):
+def xernicrose(runs):
     for name in ("published barrier", "Log"):
         assert runs[name].status == 0
         assert np.abs(runs[name].e1).max() < 0.06
@@ -166,7 +170,7 @@ def tangent(runs):
     unbounded = runs["Quadratic, no barrier"]
     assert unbounded.status == int(ij.Status.BOUND_VIOLATED)
     assert unbounded.x[:, 0].max() > 0.56
-    evidence = entry.execute(entry.ENTRIES / "tangent_barrier_2013").evidence
+    evidence = entry.execute(entry.ENTRIES / "xernicrose_2024").evidence
     assert evidence["wrong_V"] > 10 * evidence["wrong_least"]
     assert abs(evidence["hand"] - evidence["exact"]) > 0.1 * abs(evidence["exact"])
 
@@ -192,13 +196,13 @@ def zhang_yan(runs):
 
 
 FURTHER = {
-    "cruz_ancona_2022": cruz_ancona,
+    "bartelt_2024": bartelt,
     "dimanidis_2018": dimanidis,
     "liu_2018": liu,
     "mahmud_2021": mahmud,
     "shaw_cortez_2022": shaw_cortez,
-    "tangent_barrier_2013": tangent,
-    "tee_ge_2012": tee_ge,
+    "xernicrose_2024": xernicrose,
+    "goel_2020": goel,
     "zhang_2022": zhang,
     "zhang_yan_2024": zhang_yan,
 }
@@ -309,6 +313,32 @@ IN_TEXT = {
     "correction of the template": (
         {'printed = "k1 = 2"': 'printed = "k1 = 1"'},
         "[[corrected]] has the example of the template",
+    ),
+    "where the error is": (
+        {'found_in = "publication"': 'found_in = "web"'},
+        "found_in = 'web' must be one of publication, program",
+    ),
+    "no list of the correction": (
+        {'found_in = "publication"': ""},
+        "[[corrected]] number 1 lacks the key 'found_in'",
+    ),
+    "edition": ({'edition = "published version"': ""}, "[source] lacks the key 'edition'"),
+    "whom to ask": ({'contact = "A. Author"': ""}, "[source] lacks the key 'contact'"),
+    "evidence without a number": (
+        {"the error after 0.5 s is {printed} rad, and figure 3 shows 0.001 rad.": "it is larger."},
+        "[[corrected]] number 1: the evidence needs a number",
+    ),
+    "contacted": (
+        {'contacted = "not contacted"': 'contacted = "no"'},
+        "contacted = 'no' must be one of not contacted, asked, confirmed, disputed",
+    ),
+    "no answer": (
+        {'contacted = "not contacted"': 'contacted = "asked"'},
+        "answer = '' does not agree with contacted = 'asked'",
+    ),
+    "answer of nobody": (
+        {'contacted = "not contacted"': 'answer = "yes"'},
+        "answer = 'yes' does not agree with contacted = 'not contacted'",
     ),
     "equal rows of one law": (
         {"[run]": '[[equal_rows]]\nlaw = "A"\nother = "A"\nreason = "R"\n[run]'},
@@ -681,8 +711,74 @@ def test_the_page_of_the_corrections_has_all_of_them(parts):
     assert page.startswith("# What the literature printed, and what is correct")
     assert f"{count} corrections" in page
     assert sum(line.startswith("| [") for line in page.splitlines()) == count
+    publications, programs = page.split("## Errors in programs")
+    for text, place in ((publications, "publication"), (programs, "program")):
+        expected = sum(x.found_in == place for part in parts for x in part.contents.corrected)
+        assert sum(line.startswith("| [") for line in text.splitlines()) == expected
+        assert f"{expected} of {place}s" in page
+    assert f"whether somebody was asked: 0 of {count} were." in page
     assert "and with k = 1 by 0.51 rad" in page
+    (row,) = (line for line in page.splitlines() if "control\\_1\\_step.m" in line)
+    read, contact = "program of others, commit 5aa7ac7 of 2024-07-27", "S. Damodaran, owner"
+    assert read in row and contact in row and row.endswith("| not contacted |")
     assert "theory/printed_and_corrected.md" in page
+
+
+def test_an_answer_is_in_the_table_of_corrections(parts):
+    part = next(part for part in parts if part.name == "zhang_yan_2024")
+    correction = dataclasses.replace(
+        part.contents.corrected[0],
+        contacted="confirmed",
+        answer="by the author, 2026-12-01",
+        edition="second edition",
+    )
+    table = field.corrections_table([(part, correction)])
+    assert "confirmed: by the author, 2026-12-01 |" in table
+    assert "| article, second edition |" in table
+    contents = dataclasses.replace(part.contents, corrected=(correction,))
+    assert "| publication | " in entry_tables.corrections(contents, {})
+    assert "Who could be asked: T. Zhang" in entry_tables.corrections(contents, {})
+
+
+def test_what_was_equal_is_counted():
+    found = field.efforts([RESULT])
+    assert found == field.Efforts(tables=1, laws=3, equal=2, own=1, failed=1, compared=1)
+    assert field.efforts([]).laws == 0
+
+
+def test_texts_state_what_was_equal_in_the_results():
+    """The numbers of a README and of the article are those of the result files."""
+    files = sorted(entry.RESULTS.glob("*.json"))
+    found = field.efforts([json.loads(path.read_text(encoding="utf-8")) for path in files])
+    readme = " ".join((FIELD / "README.md").read_text(encoding="utf-8").split())
+    assert found.in_words in readme
+    article = " ".join((ROOT / "paper" / "paper.md").read_text(encoding="utf-8").split())
+    words = f"of {found.laws} laws {found.equal} have such a factor, and {found.own} have none"
+    assert words in article
+    assert found.tables == 6 and "Six of them have a table" in article
+    assert f"a benchmark of {len(NAMES)} published examples" in article
+    entries = [entry.load(entry.ENTRIES / name) for name in NAMES]
+    lacking = sum(bool(x.missing) for x in entries)
+    corrected = sum(bool(x.corrected) for x in entries)
+    assert f"{lacking} of {len(NAMES)} published examples lack at least one" in article
+    assert f"{corrected} have a correction" in article
+
+
+@pytest.mark.slow
+def test_most_of_the_effort_belongs_to_the_start():
+    """The README states both shares of the squared torque above gravity."""
+    scenario = ij.presets.zhang_yan_2024()
+    run = ij.simulate(scenario, duration=20.0, dt=1e-3)
+    gravity = jax.vmap(scenario.plant.gravity)(jnp.asarray(run.q))
+    square = np.sum((np.asarray(run.tau) - np.asarray(gravity)) ** 2, axis=1)
+    total, start, late = (
+        np.trapezoid(square[part], run.t[part])
+        for part in (run.t >= 0.0, run.t <= 0.5, run.t >= 10.0)
+    )
+    np.testing.assert_allclose(start / total, 0.94, atol=0.01)
+    np.testing.assert_allclose(late / total, 0.034, atol=0.005)
+    readme = (FIELD / "README.md").read_text(encoding="utf-8")
+    assert "94 % of the squared torque" in readme and "3 % to the second half" in readme
 
 
 def test_laws_that_lose_their_accuracy_with_noise_are_named_below_the_table(parts):

@@ -1,5 +1,5 @@
-"""A barrier on a surface, and a load (Cruz-Ancona et al. 2022): the common arm of two joints, with
-a load of 2 kg that the model does not contain.
+"""A barrier on a surface, and a load (after Cruz-Ancona et al. 2022): the common arm of two joints,
+with a load of 2 kg that the model does not contain.
 """
 
 from pathlib import Path

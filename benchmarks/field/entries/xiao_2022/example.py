@@ -1,4 +1,4 @@
-"""Adaptive cruise control, sampled (Xiao and Belta 2021): a force that is held for 0.1 s keeps the
+"""Adaptive cruise control, sampled (Xiao and Belta 2022): a force that is held for 0.1 s keeps the
 distance to a slower car, and a term for braking in the barrier function keeps the force small.
 
 The car starts 100 m behind a car of 13.89 m/s with 20 m/s and wants 30 m/s.
@@ -122,7 +122,7 @@ holds = {
 }
 details = {
     distance: f"least z - 1.8 v: {min(free.min() for free in room.values()):.1e} m",
-    limited: f"u/(m g) from {share[published].min():.4f} to {share[published].max():.4f}",
+    limited: f"u/(m g) from {share[published].min():.4f} to {share[published].max():.4f}; without"
+    f" the distance from {share['without'].min():.4f}",
     slow: f"at the end within {max(abs(v[-1] - LEAD) for v in speed.values()):.1e} m/s of 13.89",
 }
-evidence = {"with_braking": share[published].min(), "without": share["without"].min()}

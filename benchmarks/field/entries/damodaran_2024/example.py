@@ -1,4 +1,4 @@
-"""Prescribed performance with a prescribed limit of the input (Mishra and Jagtap 2024): the speed
+"""Prescribed performance with a prescribed limit of the input (after Mishra and Jagtap): the speed
 of a direct-current motor goes to a set point under a law that does not know the motor.
 """
 

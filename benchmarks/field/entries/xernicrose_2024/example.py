@@ -1,6 +1,6 @@
-"""A bound on the output, tangent barrier (IFAC 2013): a barrier keeps the error within 0.06;
-without one it leaves this bound. The published law is that of V_1 = (k_b/pi) tan^2(xi), with
-V' = -k1 z1^2 - k2 z2^2, which is not `barriers.Tan`; it is a class of this page.
+"""A bound on the output, tangent barrier (after Tang, Tee, He 2013): a barrier keeps the error
+within 0.06; without one it leaves this bound. The published law is that of V_1 = (k_b/pi)
+tan^2(xi), with V' = -k1 z1^2 - k2 z2^2, which is not `barriers.Tan`; it is a class of this page.
 """
 
 import math

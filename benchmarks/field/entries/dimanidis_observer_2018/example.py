@@ -1,5 +1,5 @@
-"""Prescribed performance of a surface (Bechlioulis et al. 2013): an oscillator is stabilised by a
-law that does not know it, with the measured state and with a high-gain observer.
+"""Prescribed performance of a surface (after Bechlioulis et al. 2013): an oscillator is stabilised
+by a law that does not know it, with the measured state and with a high-gain observer.
 """
 
 import jax
