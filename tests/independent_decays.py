@@ -14,7 +14,6 @@ with alpha' by complex steps along (1, q').
 from __future__ import annotations
 
 import itertools
-import math
 from dataclasses import dataclass
 
 import independent
@@ -129,15 +128,3 @@ def _sine_at(parts, t):
     offset, amplitude, frequency, phase = (np.asarray(x, float) * np.ones(2) for x in parts)
     angle = frequency * t + phase
     return offset + amplitude * np.sin(angle), amplitude * frequency * np.cos(angle)
-
-
-QUADRATURE = np.polynomial.legendre.leggauss(80)
-
-
-def time_to_band(k, powers, z0, z1):
-    """The time in which z' = -(k + g(z)) z leads from z0 to z1, by quadrature over ln z."""
-    points, weights = QUADRATURE
-    low, high = math.log(z1), math.log(z0)
-    nodes = np.exp(0.5 * (high - low) * points + 0.5 * (high + low))
-    values = [1.0 / (k + powers.gain(0.0, 0.5 * z * z)) for z in nodes]
-    return 0.5 * (high - low) * float(weights @ values)

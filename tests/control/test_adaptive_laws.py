@@ -15,7 +15,6 @@ from claim_terms import terms_at
 
 import iblf_jax as ij
 from iblf_jax import barriers, controllers
-from iblf_jax.files.scenario import load_scenario, save_scenario
 from iblf_jax.simulation.closed_loop import LoopState, rate
 
 PAPER = ij.presets.zhang_yan_2024(variant="corrected")
@@ -230,14 +229,13 @@ class PassOn(controllers.Law):
 @pytest.mark.parametrize(
     ("make", "paths"),
     [
-        (lambda: ARM, ("plant.mass", "plant.payload", "model.mass")),
         (
             lambda: dataclasses.replace(ARM, controller=adapting(PassOn(ARM.controller.law))),
             ("plant.mass", "plant.payload", "model.mass"),
         ),
         (chain, ("plant.H", "plant.Km", "model.H")),
     ],
-    ids=["arm", "law of x around one of robots", "order 3"],
+    ids=["law of x around one of robots", "order 3"],
 )
 def test_the_rate_of_the_lyapunov_function_is_what_is_claimed(make, paths, rng):
     scenario = ij.simulation.scenario.canonical(make())
@@ -282,28 +280,6 @@ def test_without_an_error_the_law_is_the_wrapped_one_and_nothing_adapts():
     np.testing.assert_array_equal(rates.theta, 0.0)
 
 
-@pytest.mark.release
-def test_true_parameters_stay_and_slow_adaptation_tends_to_the_wrapped_law():
-    quiet = dataclasses.replace(ARM, disturbance=ij.disturbances.Nothing())
-    tube = quiet.context.tube(jnp.zeros(()))
-    on_reference = {"initial.q": tube.q_d, "initial.dq": tube.dq_d, "controller.sigma": 0.0}
-    started = ij.with_parameters(quiet, on_reference)
-    run = ij.simulate(started, duration=1.0, dt=5e-4, record_every=100)
-    theta = run.controller_state.theta
-    np.testing.assert_allclose(theta - theta[0], 0.0, atol=1e-9)
-    heavier = ij.with_parameters(quiet, {"plant.mass": [2.4, 1.0]})
-    plain = ij.simulate(
-        dataclasses.replace(heavier, controller=MAPPED), duration=1.0, dt=1e-3, record_every=10
-    )
-    errors = []
-    for factor in (1e-3, 1e-5):
-        slow = ij.with_parameters(heavier, {"controller.Gamma": factor})
-        found = ij.simulate(slow, duration=1.0, dt=1e-3, record_every=10)
-        errors.append(float(jnp.max(jnp.abs(found.q - plain.q))))
-    assert errors[1] < 1e-5
-    assert errors[1] < 0.02 * errors[0]
-
-
 def test_one_rule_is_the_integral_of_the_velocity_error_with_a_leak(rng):
     law = controllers.AdaptiveRBF(k1=2.0, K2=20.0, nodes=1, normalised=True, Gamma=3.0, sigma=0.1)
     scenario = network(law)
@@ -321,52 +297,6 @@ def test_a_fuzzy_system_is_a_mean_of_its_rules_far_from_all_of_them():
         small = jax.tree.map(lambda x, kind=kind: x.astype(kind), law)
         S = small.basis(*[far.astype(kind)] * 4)
         assert float(jnp.sum(S)) == pytest.approx(1.0, rel=1e-6)
-
-
-def test_both_layers_descend_the_lyapunov_function(rng):
-    # (H.1) and (H.2): what remains of V' beside e2 . r is the leak, for any ideal weights.
-    law = controllers.AdaptiveNetwork(k1=2.0, K2=[20.0, 10.0], nodes=3, Gamma=[5.0, 7.0])
-    scenario, nodes = network(law), 3
-    first = law.init(scenario.initial.q, scenario.initial.dq, scenario.context)
-    for _ in range(10):
-        W, ideal_W = rng.normal(size=(2, nodes, 2))
-        V, ideal_V = rng.normal(size=(2, 9, nodes))
-        q, dq = np.array([0.5, 0.6]) + 0.05 * rng.normal(size=2), rng.normal(size=2)
-        state = type(first)(jnp.asarray(W), jnp.asarray(V))
-        t = jnp.asarray(0.3)
-        command, rates = law.command(t, jnp.asarray(q), jnp.asarray(dq), q, scenario.context, state)
-        e2 = np.asarray(dq - command.alpha)
-        slope = np.asarray(law.barrier.slope(scenario.context.tube(t), jnp.asarray(q)))
-        learned = np.asarray(command.tau) + np.asarray(law.K2) * e2 + slope
-        z = -(
-            np.asarray(rates.hidden) / float(law.Gamma_h)
-            + float(law.sigma_h) * (V - np.asarray(first.hidden))
-        )
-        # z is known from the rate of V up to a factor; its last entry, the threshold's, is 1.
-        back = z[-1]
-        z = z[:, 0] / back[0]
-        phi, D = np.tanh(V.T @ z), np.diag(1.0 - np.tanh(V.T @ z) ** 2)
-        np.testing.assert_allclose(learned, W.T @ phi, rtol=1e-9)
-        error_W, error_V = W - ideal_W, V - ideal_V
-        ideal_phi = np.tanh(ideal_V.T @ z)
-        r = error_W.T @ D @ ideal_V.T @ z - ideal_W.T @ (ideal_phi - phi + D @ error_V.T @ z)
-        effect = e2 @ (W.T @ phi - ideal_W.T @ ideal_phi)
-        adapted = np.sum(error_W * np.asarray(rates.output) / np.asarray(law.Gamma))
-        adapted += np.sum(error_V * np.asarray(rates.hidden)) / float(law.Gamma_h)
-        leak = np.sum(error_W * W * np.asarray(law.sigma))
-        leak += float(law.sigma_h) * np.sum(error_V * (V - np.asarray(first.hidden)))
-        np.testing.assert_allclose(effect + adapted, e2 @ r - leak, rtol=1e-8, atol=1e-8)
-
-
-@pytest.mark.release
-def test_weights_of_both_layers_stay_below_their_bounds():
-    law = controllers.AdaptiveNetwork(k1=2.0, K2=20.0, sigma=0.5)
-    strong = {"disturbance.acceleration_amplitude": 20.0}
-    disturbed = dataclasses.replace(PAPER, controller=law)
-    run = ij.simulate(ij.with_parameters(disturbed, strong), duration=5.0, dt=1e-3, record_every=10)
-    norms = jnp.sqrt(jnp.sum(run.controller_state.output**2, axis=1))
-    largest = jnp.max(jnp.abs(run.e2), axis=0)
-    assert bool(jnp.all(norms <= np.sqrt(law.nodes) * largest / 0.5))
 
 
 # ------------------------------------------------------------------------- what is refused
@@ -422,14 +352,6 @@ def test_units_of_the_adaptation_are_those_of_the_parameters():
     assert units["controller.Gamma"] == "kg^2/(N m rad)"
 
 
-def test_a_scenario_file_keeps_the_parameters(tmp_path):
-    path = tmp_path / "adapting.toml"
-    save_scenario(ARM, path)
-    loaded = load_scenario(path)
-    assert loaded.controller.parameters == NAMES
-    jax.tree.map(np.testing.assert_array_equal, loaded, ARM)
-
-
 @pytest.mark.release
 def test_operations_are_at_most_half_more_than_those_of_the_law_that_is_extended():
     def cost(scenario):
@@ -440,14 +362,11 @@ def test_operations_are_at_most_half_more_than_those_of_the_law_that_is_extended
 
     plain = operations(dataclasses.replace(UNDISTURBED, controller=PAPER.controller))
     two = controllers.AdaptiveParameters(
-        law=PAPER.controller, parameters=NAMES[:2], Gamma=1.0, lower=0.0, upper=4.0
+        law=PAPER.controller, parameters=NAMES[:2], Gamma=1.0, lower=-1.0, upper=4.0
     )
     assert operations(network(two)) < 1.5 * plain
     # Each parameter has a state of its own: beyond two, the limit is one of vector instructions.
-    names = (*NAMES, "inertia[1]")
-    four = controllers.AdaptiveParameters(
-        law=PAPER.controller, parameters=names, Gamma=1.0, lower=-1.0, upper=4.0
-    )
+    four = dataclasses.replace(two, parameters=(*NAMES, "inertia[1]"))
     assert cost(network(four)).slots < 1.5 * cost(UNDISTURBED).slots
     gaussian = operations(network(controllers.AdaptiveRBF(k1=2.0, K2=20.0)))
     fuzzy = controllers.AdaptiveRBF(k1=2.0, K2=20.0, normalised=True)
@@ -471,8 +390,8 @@ def test_a_figure_shows_the_parameters_with_their_names_and_units():
     loaded = ij.with_parameters(ARM, {"plant.payload": 0.4})
     law = controllers.Saturated(loaded.controller, limit=15.0, auxiliary=5.0)
     limited = dataclasses.replace(loaded, controller=law)
-    run = ij.simulate(loaded, duration=0.1, dt=1e-3)
-    runs = {"free": run, "limited": ij.simulate(limited, duration=0.1, dt=1e-3)}
+    run = ij.simulate(loaded, duration=0.01, dt=1e-3)
+    runs = {"free": run, "limited": ij.simulate(limited, duration=0.01, dt=1e-3)}
     figure = ij.plotting.adaptation(runs)
     labels = [axes.get_ylabel() for axes in figure.axes[::2]]
     assert labels == [f"{name}\n$\\hat\\theta$ [kg]" for name in NAMES]

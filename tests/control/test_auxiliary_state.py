@@ -177,22 +177,6 @@ def test_a_certificate_covers_the_limited_torque():
     )
 
 
-@pytest.mark.release
-@pytest.mark.parametrize("decay", [ij.decays.FiniteTime(k_a=2.0), ij.decays.PrescribedTime(T=0.5)])
-def test_a_certificate_covers_the_limited_torque_of_a_law_that_settles(decay):
-    law = controllers.Backstepping(
-        k1=2.0, K2=20.0, barrier=barriers.TransformedError(), variant="corrected", decays=decay
-    )
-    scenario = ij.with_parts(LIMITED, controller=_limited(law))
-    run = ij.simulate(scenario, duration=0.6, dt=5e-4)
-    certificate = ij.certify(scenario, run)
-    assert np.max(np.abs(run.auxiliary)) > 0.1
-    assert certificate["inequality, limited torque"].verdict == "holds"
-    # Without the auxiliary state (D.2) is about the torque of the law itself.
-    note = certificate["inequality, decays"].note
-    assert "the auxiliary state of Saturated changed the input of Backstepping" in note
-
-
 # --- limits ---------------------------------------------------------------------------------------
 
 
@@ -231,32 +215,3 @@ def test_the_command_of_a_network_with_an_auxiliary_state_needs_no_model(name):
         commands.append(law.command(jnp.asarray(0.0), x, jnp.zeros(2), context, state)[0])
     np.testing.assert_array_equal(commands[0].tau, commands[1].tau)
     np.testing.assert_array_equal(commands[0].input_slope, x[1] - commands[0].alpha)
-
-
-@pytest.mark.slow
-def test_the_rate_that_gives_the_limit_alone():
-    """One joint without Coriolis torques: for k M0 = K2 the torque is that of the limit alone,
-    and a large k does not tend to it."""
-    chain = ij.robots.PlanarChain(mass=[1.0], length=0.4, centre=0.2, inertia=0.02)
-    law = controllers.Backstepping(k1=2.0, K2=0.6, variant="corrected")
-    scenario = ij.with_parts(
-        PAPER,
-        plant=chain,
-        model=chain,
-        reference=ij.references.Sinusoid(offset=0.5, amplitude=0.2, frequency=2.0),
-        bounds=ij.Bounds(ij.bounds.Constant(-1.0), ij.bounds.Constant(2.0)),
-        disturbance=ij.disturbances.Nothing(),
-        observer=ij.observers.Momentum(kf=20.0),
-        initial=ij.Initial(q=[0.8], dq=[0.0]),
-        controller=controllers.Saturated(law, limit=1.53),
-    )
-    inertia = float(chain.mass_matrix(jnp.zeros(1))[0, 0])
-    alone = ij.simulate(scenario, duration=1.5, dt=1e-3)
-    distances = []
-    for k in (0.6 / inertia, 60.0 / inertia):
-        limited = ij.with_parts(scenario, controller=_limited(law, 1.53, k))
-        run = ij.simulate(limited, duration=1.5, dt=1e-3)
-        distances.append(np.max(np.abs(run.q - alone.q)))
-    assert np.any(alone.metrics.saturated_share > 0.01)
-    assert distances[0] < 1e-9
-    assert distances[1] > 1e-4

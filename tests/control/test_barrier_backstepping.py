@@ -15,6 +15,7 @@ import iblf_jax as ij
 from iblf_jax import barriers, bounds, controllers, plants, references
 from iblf_jax.engine.switching import surfaces
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
+from iblf_jax.simulation.scenario import canonical
 
 DATA = np.load(other.FILE)
 
@@ -74,10 +75,6 @@ def test_a_torque_estimate_is_held_and_not_the_acceleration_that_it_causes():
     np.testing.assert_allclose(found.tau, expected.tau, rtol=1e-9)
 
 
-def flexible(**parts):
-    return chain_cases.scenario("flexible", **parts)
-
-
 def law(**fields):
     given = {"k": (3.0, 20.0, 60.0), "barriers": (barriers.TransformedError(),)}
     return controllers.BarrierBackstepping(**(given | fields))
@@ -101,27 +98,23 @@ def third_order(**parts):
 
 
 MAPPING = barriers.TransformedError()
+INTEGRAL, LOG = barriers.Integral(), barriers.Log()
+
+
+def under(*given):
+    """The law with these barriers."""
+    return {"controller": law(barriers=given)}
+
+
 REFUSED = {
-    "a kink of the slope on the first level": (
-        {"controller": law(barriers=(barriers.Integral(), MAPPING, MAPPING))},
-        r"barriers\[0\].*Integral.*Log\(p=2\)",
-    ),
-    "a ratio that jumps on a level in the middle": (
-        {"controller": law(barriers=(MAPPING, barriers.Integral(), MAPPING))},
-        r"barriers\[1\].*Integral.*TransformedError\(\)",
-    ),
-    "the logarithmic form on a level in the middle": (
-        {"controller": law(barriers=(MAPPING, barriers.Log(), MAPPING))},
+    "slope with a kink": (under(INTEGRAL, MAPPING, MAPPING), r"\[0\].*Integral.*Log\(p=2\)"),
+    "ratio that jumps": (under(MAPPING, INTEGRAL, MAPPING), r"\[1\].*Integral.*TransformedError"),
+    "logarithmic form between": (
+        under(MAPPING, LOG, MAPPING),
         r"barriers\[1\].*Log.* e/s does not jump at e = 0.*level 2, about alpha_1.*filter=",
     ),
-    "a barrier without a ratio": (
-        {"controller": law(barriers=(MAPPING, MAPPING, barriers.Log(p=2)))},
-        r"barriers\[2\].*error_over_slope",
-    ),
-    "a barrier on a level without bounds": (
-        {"controller": law(barriers=(MAPPING,) * 3), "bounds": within(1.0)},
-        r"bounds\[1\]",
-    ),
+    "no ratio": (under(MAPPING, MAPPING, barriers.Log(p=2)), r"\[2\].*error_over_slope"),
+    "no bounds": (under(*(MAPPING,) * 3) | {"bounds": within(1.0)}, r"bounds\[1\]"),
     "a reference with two continuous derivatives": (
         {"reference": references.Quintic(start=0.0, end=0.5, duration=2.0)},
         "reference.*Quintic.*2.*Sinusoid",
@@ -131,14 +124,8 @@ REFUSED = {
         {"initial": ij.Initial(x=[[0.0], [0.0], [25.0]])},
         r"initial.x\[2\]\[0\].*level 3",
     ),
-    "a start without the third level": (
-        {"initial": ij.Initial(q=0.0)},
-        r"Initial\(x=\.\.\.\)",
-    ),
-    "a law of robots": (
-        {"controller": controllers.Backstepping(k1=1.0, K2=1.0)},
-        "BarrierBackstepping",
-    ),
+    "a start without x": ({"initial": ij.Initial(q=0.0)}, r"Initial\(x=\.\.\.\)"),
+    "a law of robots": ({"controller": controllers.Backstepping(1.0, 1.0)}, "BarrierBackstepping"),
     "an observer of robots": (
         {"observer": ij.observers.Momentum(kf=10.0)},
         "Scenario.observer.*LevelObserver",
@@ -154,61 +141,21 @@ REFUSED = {
 def test_refused_with_a_remedy(what):
     parts, message = REFUSED[what]
     with pytest.raises(ValueError, match=message):
-        ij.simulate(third_order(**parts), duration=0.01, dt=1e-3)
+        canonical(third_order(**parts))
 
 
-ALLOWED = {
-    "log with a sufficient exponent": law(barriers=(barriers.Log(p=2), MAPPING, MAPPING)),
-    "a jump on the last level": law(barriers=(MAPPING, MAPPING, barriers.Integral())),
-    "a dynamic surface": law(barriers=(barriers.Integral(), MAPPING, MAPPING), filter=0.01),
-}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("what", ALLOWED)
-def test_allowed(what):
-    run = ij.simulate(third_order(controller=ALLOWED[what]), duration=0.3, dt=1e-3)
-    assert run.ok, run
-
-
-@pytest.mark.slow
-def test_a_symmetric_tube_needs_no_smooth_barrier():
+def test_allowed():
     """Integral has no kink where both sides are at the same distance."""
-    tube = ij.Bounds(lower=bounds.Funnel(-0.6, -0.6, 0.0), upper=bounds.Funnel(0.6, 0.6, 0.0))
-    wide = ij.Bounds(lower=bounds.Funnel(-60.0, -60.0, 0.0), upper=bounds.Funnel(60.0, 60.0, 0.0))
-    narrow = ij.Bounds(lower=bounds.Funnel(-5.0, -5.0, 0.0), upper=bounds.Funnel(5.0, 5.0, 0.0))
-    integral = barriers.Integral()
-    scenario = third_order(
-        bounds=(tube, narrow, wide),
-        controller=law(barriers=(integral, integral, integral), weights=(1.0, 10.0, 1000.0)),
-    )
-    run = ij.simulate(scenario, duration=0.5, dt=1e-3)
-    assert run.ok, run
-
-
-@pytest.mark.slow
-def test_a_gain_that_becomes_singular_is_flagged():
-    """The gain of the last level, cos(t), is zero at t = pi/2."""
-
-    def gain(t, x):
-        one = jnp.ones_like(x[0])
-        return jnp.stack([one, one, jnp.where(t < 0.2, 1.0, 0.0) * one])
-
-    plant = plants.StrictFeedback(lambda t, x: jnp.zeros_like(x), gain, n=1, order=3)
-    with pytest.warns(ij.SimulationWarning):
-        run = ij.simulate(third_order(plant=plant), duration=0.4, dt=1e-3)
-    assert int(run.status) & ij.Status.SINGULAR_GAIN
-
-
-@pytest.mark.slow
-def test_a_virtual_control_outside_the_bounds_of_its_level_is_flagged():
-    scenario = third_order(
-        bounds=(within(1.0), within(0.3), within(50.0)),
-        controller=law(barriers=(MAPPING, MAPPING, MAPPING)),
-    )
-    with pytest.warns(ij.SimulationWarning):
-        run = ij.simulate(scenario, duration=1.0, dt=1e-3)
-    assert int(run.status) & ij.Status.ALPHA_INFEASIBLE
+    canonical(third_order(**under(barriers.Log(p=2), MAPPING, MAPPING)))
+    canonical(third_order(**under(MAPPING, MAPPING, INTEGRAL)))
+    filtered = law(barriers=(INTEGRAL, MAPPING, MAPPING), filter=0.01)
+    canonical(third_order(controller=filtered))
+    sides = [
+        ij.Bounds(lower=bounds.Funnel(-x, -x, 0.0), upper=bounds.Funnel(x, x, 0.0))
+        for x in (0.6, 5.0, 60.0)
+    ]
+    integral = law(barriers=(INTEGRAL,) * 3, weights=(1.0, 10.0, 1000.0))
+    canonical(third_order(bounds=sides, controller=integral))
 
 
 @pytest.mark.slow

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from scipy.integrate import solve_ivp
 
 import iblf_jax as ij
@@ -87,10 +86,3 @@ def test_bounds_on_both_levels_are_kept_and_the_motion_is_that_of_the_other_prog
     assert np.abs(run.e1[t > 7.0]).max() < 1e-3
     found = solve_ivp(alone, (0.0, 8.0), START, "DOP853", t_eval=t[::100], rtol=1e-10, atol=1e-12)
     np.testing.assert_allclose(x[::100], found.y.T, atol=1e-7)
-
-
-def test_a_reference_that_these_bounds_exclude_is_flagged():
-    """On x_d = 0.5 sin t the plant needs x2 = -1 at t = pi, which is the bound of x2."""
-    with pytest.warns(ij.SimulationWarning):
-        run = ij.simulate(scenario(0.5), duration=4.0, dt=1e-3)
-    assert int(run.status) & ij.Status.ALPHA_INFEASIBLE

@@ -1,5 +1,7 @@
-"""Barriers against quadrature and the paper's statements: Theorem 1, Lemma 1, V_integral = 2 V_log,
-kappa, limits."""
+"""Barriers against the paper's statements: Theorem 1, Lemma 1, kappa, and the guard.
+
+Quadrature and limits, for every barrier, are in `test_barriers_systems.py`.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,6 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from iblf_jax.barriers import Integral, Log, guard_is_active, guarded_error
 from iblf_jax.bounds import Tube
-from scipy.integrate import quad
 
 from iblf_jax.control.barriers._base import paper_virtual_velocity
 
@@ -52,39 +53,6 @@ kappa_of = compiled(
 )
 
 
-@pytest.mark.slow
-@given(xi=INSIDE, k_l=WIDTH, k_u=WIDTH)
-def test_integral_barrier_is_the_integral(xi, k_l, k_u):
-    """(2.6): V1 = int_0^xi 2 s / (1 - s^2) ds, by quadrature."""
-    q = xi * (k_u if xi > 0 else k_l)
-    expected = quad(lambda s: 2 * s / (1 - s**2), 0, xi, limit=200)[0]
-    assert float(value(Integral(), tube(k_l, k_u), [q])[0]) == pytest.approx(
-        expected, rel=1e-7, abs=1e-12
-    )
-
-
-@given(xi=INSIDE, k_l=WIDTH, k_u=WIDTH, p=st.integers(1, 3))
-def test_log_barrier_is_the_integral_of_its_slope(xi, k_l, k_u, p):
-    k = k_u if xi > 0 else k_l
-    e = xi * k
-    expected = quad(lambda x: x ** (2 * p - 1) / (1 - x ** (2 * p)), 0, xi, limit=200)[0]
-    got = value(Log(p=p), tube(k_l, k_u), [e])[0]
-    assert float(got) == pytest.approx(expected, rel=1e-7, abs=1e-12)
-    assert float(slope(Log(p=p), tube(k_l, k_u), [e])[0]) == pytest.approx(
-        xi ** (2 * p - 1) / (1 - xi ** (2 * p)) / k, rel=1e-9, abs=1e-300
-    )
-
-
-@given(xi=st.floats(-1.5, 1.5), k_l=WIDTH, k_u=WIDTH)
-def test_integral_is_twice_the_logarithm(xi, k_l, k_u):
-    """V_integral = 2 V_log(p = 1) identically, past the wall too; so is the slope, and alpha is the
-    same."""
-    t, q = tube(k_l, k_u, 0.1, -0.2), [xi * (k_u if xi > 0 else k_l)]
-    np.testing.assert_allclose(value(Integral(), t, q), 2 * value(Log(), t, q), rtol=1e-12)
-    np.testing.assert_allclose(slope(Integral(), t, q), 2 * slope(Log(), t, q), rtol=1e-12)
-    np.testing.assert_array_equal(alpha(Integral(), t, q, 2.0, 0.1), alpha(Log(), t, q, 2.0, 0.1))
-
-
 @given(xi=INSIDE)
 def test_theorem_1(xi):
     """xi^2 / 2 <= V1 <= xi^2 / (1 - xi^2) on |xi| < 1."""
@@ -121,17 +89,6 @@ def test_without_the_root_kappa_fails_on_the_papers_bounds():
     assert np.mean((printed + u < 0) | (printed + low < 0)) == pytest.approx(0.22, abs=0.005)
     kappa = kappa_of(tube(k_l.ravel(), k_u.ravel(), (low * k_l).ravel(), (u * k_u).ravel()), 0.1)
     assert np.all(np.asarray(kappa) + u.ravel() > 0)
-
-
-@pytest.mark.parametrize("barrier", [Integral(), Log(), Log(p=2)])
-def test_limit_of_wide_bounds(barrier):
-    """k -> infinity: the slope vanishes and alpha = q_d' - (k1 + sqrt(o)) e1."""
-    t, e1 = tube(1e9, 1e9), np.asarray([0.3, -0.2])
-    t = jax.tree.map(lambda x: np.broadcast_to(x, (2,)), t)
-    np.testing.assert_allclose(slope(barrier, t, e1), 0, atol=1e-15)
-    np.testing.assert_allclose(
-        alpha(barrier, t, e1, 2.0, 0.1), -(2.0 + np.sqrt(0.1)) * e1, rtol=1e-9
-    )
 
 
 def test_the_guard_is_exact_inside_and_tangent_beyond():

@@ -20,21 +20,16 @@ KAPPA = {"integral", "log", "log_p2"}
 
 REFERENCE = ij.references.Sinusoid(0.5, 0.14, 1.0, [0.0, 1.5])
 BOUNDS = {
-    "paper": ij.bounds.Bounds(
-        ij.bounds.Sinusoid(0.2, 0.14, 1.0, [1.57, 0.0]),
-        ij.bounds.Sinusoid(0.9, 0.14, 1.0, [1.57, 0.0]),
-    ),
     "breathing": ij.bounds.Bounds(
         ij.bounds.Sinusoid(0.1, 0.1, 1.3, [0.2, 2.0]), ij.bounds.Sinusoid(1.0, 0.2, 0.7, [0.0, 1.0])
     ),
     "funnel": ij.bounds.Bounds(ij.bounds.Funnel(-0.5, -0.05, 0.8), ij.bounds.Funnel(0.4, 0.1, 0.6)),
 }
-_GRID = [
-    (t, xi)
-    for t in (0.0, 0.4, 2.2)
-    for xi in (-0.97, -0.5, -1e-3, -1e-9, 0.0, 1e-9, 1e-3, 0.4, 0.95)
-]
-POINTS = tuple(np.array(column) for column in zip(*_GRID, strict=True))
+BREATHING = BOUNDS["breathing"]
+"""Those of what a barrier states at an instant; its rate also knows the funnel."""
+SIZES = (-0.97, -0.5, -1e-3, -1e-9, 0.0, 1e-9, 1e-3, 0.4, 0.95)
+POINTS = tuple(np.ravel(x) for x in np.meshgrid((0.0, 0.4, 2.2), SIZES))
+"""Times and relative errors."""
 
 
 def tube_of(bounds, t):
@@ -78,12 +73,11 @@ def test_integral_is_twice_the_logarithmic_barrier():
 
 
 @pytest.mark.parametrize("name", BARRIERS)
-@pytest.mark.parametrize("bounds", BOUNDS)
-def test_slope_is_the_derivative_of_the_value(name, bounds):
+def test_slope_is_the_derivative_of_the_value(name):
     barrier = BARRIERS[name]
 
     def both(t, xi):
-        tube = tube_of(BOUNDS[bounds], t)
+        tube = tube_of(BREATHING, t)
         q = position(tube, xi)
         return (
             barrier.slope(tube, q),
@@ -128,8 +122,9 @@ def test_rate_of_V1_along_alpha_is_what_the_law_promises(name, bounds):
 
 
 @pytest.mark.parametrize("bounds", BOUNDS)
-@pytest.mark.parametrize("name", BARRIERS)
+@pytest.mark.parametrize("name", sorted(KAPPA | {"state"}))
 def test_decay_rate_holds(name, bounds):
+    """Where V1' is not given."""
     barrier, generator = BARRIERS[name], np.random.default_rng(0)
     t, xi = (
         jnp.asarray(generator.uniform(0, 6, 400)),
@@ -149,13 +144,12 @@ def test_state_rate_is_the_best_constant():
     assert float(jnp.min(ratio)) >= 1.0
 
 
-@pytest.mark.parametrize("bounds", BOUNDS)
 @pytest.mark.parametrize("name", sorted(set(BARRIERS) - {"quadratic"}))
-def test_xi_bound_holds_and_is_reached_on_the_worse_side(name, bounds):
+def test_xi_bound_holds_and_is_reached_on_the_worse_side(name):
     barrier = BARRIERS[name]
 
     def claims(t, size):
-        tube = tube_of(BOUNDS[bounds], t)
+        tube = tube_of(BREATHING, t)
         return jnp.stack(
             [
                 barrier.xi_bound(barrier.value(tube, position(tube, side * size)), tube)
@@ -169,13 +163,12 @@ def test_xi_bound_holds_and_is_reached_on_the_worse_side(name, bounds):
     np.testing.assert_allclose(jnp.min(bound, axis=1), np.broadcast_to(size, (8, 2)), rtol=1e-6)
 
 
-@pytest.mark.parametrize("bounds", BOUNDS)
 @pytest.mark.parametrize("name", sorted(set(BARRIERS) - {"quadratic", "state"}))
-def test_error_at_is_the_error_at_which_the_barrier_has_a_value(name, bounds):
+def test_error_at_is_the_error_at_which_the_barrier_has_a_value(name):
     barrier = BARRIERS[name]
 
     def error(t, xi):
-        tube = tube_of(BOUNDS[bounds], t)
+        tube = tube_of(BREATHING, t)
         q = position(tube, jnp.full(2, xi))
         return q - tube.q_d, barrier.error_at(barrier.value(tube, q), tube, jnp.asarray(xi > 0))
 
@@ -254,9 +247,10 @@ def test_symmetric_forms_are_those_of_the_literature():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 @pytest.mark.parametrize("name", BARRIERS)
-def test_singular_points_are_finite(name, dtype):
+def test_singular_points_are_finite(name):
+    """In float32, whose range is the smaller one."""
+    dtype = jnp.float32
     barrier, tube = BARRIERS[name], simple_tube(0.3, 0.5, dtype)
     k1, o = K1.astype(dtype), MARGIN.astype(dtype)
 
@@ -279,24 +273,8 @@ def test_singular_points_are_finite(name, dtype):
         return values, forward, second, reverse
 
     tiny = float(jnp.finfo(dtype).tiny)
-    e = [
-        0.0,
-        -0.0,
-        tiny,
-        -tiny,
-        1e-20,
-        1e-7,
-        -0.3,
-        0.5,
-        0.4995,
-        -0.2997,
-        0.49999,
-        -0.29999,
-        0.51,
-        -0.4,
-        3.0,
-        -1e3,
-    ]
+    beside = (-0.3, 0.5, 0.4995, -0.2997, 0.49999, -0.29999, 0.51, -0.4)
+    e = [0.0, -0.0, tiny, -tiny, 1e-20, 1e-7, *beside, 3.0, -1e3]
     results = jax.jit(jax.vmap(at))(jnp.asarray(e, dtype)[:, None] * jnp.ones(2, dtype))
     for part in jax.tree.leaves(results):
         assert part.dtype == dtype

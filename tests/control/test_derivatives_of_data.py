@@ -12,9 +12,9 @@ from iblf_jax.barriers import Quadratic, TransformedError
 
 import iblf_jax as ij
 from iblf_jax import bounds, references
+from iblf_jax.simulation.scenario import canonical
 
 BASE = ij.presets.motor_driven_pendulum()
-SHORT = {"duration": 0.5, "dt": 2e-3}
 
 
 @ij.component
@@ -59,38 +59,16 @@ def test_a_reference_with_too_few_derivatives_is_refused(reference, has):
     name = type(reference).__name__
     expected = rf"reference: got {name}, which has {has}, expected .* 3 continuous derivatives"
     with pytest.raises(ValueError, match=rf"{expected}.*derivatives=3.*filter="):
-        ij.simulate(with_reference(reference), **SHORT)
+        canonical(with_reference(reference))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "reference",
-    [
-        references.SmoothStep(0.0, 0.5, 1.0, derivatives=3),
-        references.WaypointSpline((0.0, 1.0), [[0.0], [0.5]], derivatives=3),
-    ],
-    ids=["step", "spline"],
-)
-def test_a_reference_with_enough_derivatives_gives_a_continuous_input(reference):
+def test_a_reference_with_enough_derivatives_gives_a_continuous_input():
+    reference = references.WaypointSpline((0.0, 1.0), [[0.0], [0.5]], derivatives=3)
     run = ij.simulate(with_reference(reference), duration=1.2, dt=1e-3)
     assert int(run.status) == 0
     jumps = np.abs(np.diff(np.asarray(run.tau[:, 0])))
     assert jumps.max() < 0.1  # of 4 V
-
-
-@pytest.mark.slow
-def test_a_dynamic_surface_takes_any_reference():
-    chain = ij.plants.StrictFeedback(
-        drift=lambda t, x: -x, gain=lambda t, x: jnp.ones_like(x), n=1, order=3
-    )
-    scenario = ij.Scenario(
-        plant=chain,
-        reference=references.Quintic(0.0, 0.5, 1.0),
-        bounds=BASE.bounds[0],
-        controller=law(filter=0.01),
-        initial=ij.Initial(x=[[0.0], [0.0], [0.0]]),
-    )
-    assert int(ij.simulate(scenario, **SHORT).status) == 0
 
 
 def with_bounds(level, barriers):
@@ -107,16 +85,12 @@ def test_bounds_with_too_few_derivatives_are_refused(level, name, needed):
     barriers = (TransformedError(), TransformedError() if level == 2 else Quadratic(), Quadratic())
     expected = rf"{name}: got Rounded, which has 1, expected a side with {needed} continuous"
     with pytest.raises(ValueError, match=rf"{expected}.*Funnel are smooth"):
-        ij.simulate(with_bounds(level, barriers), **SHORT)
+        canonical(with_bounds(level, barriers))
 
 
-@pytest.mark.slow
-def test_bounds_of_the_last_level_need_one_derivative():
-    scenario = with_bounds(3, (TransformedError(), Quadratic(), TransformedError()))
-    assert int(ij.simulate(scenario, **SHORT).status) == 0
-
-
-@pytest.mark.slow
-def test_bounds_of_a_level_without_a_barrier_need_none():
-    scenario = with_bounds(2, (TransformedError(), Quadratic(), Quadratic()))
-    assert int(ij.simulate(scenario, **SHORT).status) == 0
+def test_what_needs_fewer_derivatives_is_accepted():
+    """Bounds of the last level need one, those of a level without a barrier none, and a dynamic
+    surface takes any reference."""
+    canonical(with_bounds(3, (TransformedError(), Quadratic(), TransformedError())))
+    canonical(with_bounds(2, (TransformedError(), Quadratic(), Quadratic())))
+    canonical(with_reference(references.Quintic(0.0, 0.5, 1.0), filter=0.01))

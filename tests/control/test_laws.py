@@ -7,37 +7,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from members import two_barriers
 
 import iblf_jax as ij
 from iblf_jax import controllers, observers
 from iblf_jax.control.controllers.adaptive_rbf import sobol_centres
 from iblf_jax.core.pytree import rewrapped, unwrapped
-from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state, rate
+from iblf_jax.simulation.closed_loop import evaluate, initial_state, rate
 
 PAPER = {"duration": 20.0, "dt": 1e-3, "record_every": 10}
 Q, DQ = jnp.array([0.7, 0.6]), jnp.array([0.4, -0.3])
 
 
-@pytest.fixture(scope="module")
-def saturated_runs():
-    """The saturated preset at several limits, and without one; one structure, so one
-    compilation."""
-    scenario = ij.presets.zhang_yan_2024_saturated()
-    limits = {"free": 100.0, "preset": scenario.controller.limit, "below_gravity": (6.0, 2.0)}
-    runs = {}
-    for name, limit in limits.items():
-        one = ij.with_parameters(scenario, {"controller.limit": jnp.asarray(limit)})
-        if name == "below_gravity":
-            with pytest.warns(ij.SimulationWarning, match="bound was violated"):
-                runs[name] = ij.simulate(one, **PAPER)
-        else:
-            runs[name] = ij.simulate(one, **PAPER)
-    return runs
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("law", ij.presets.LAWS)
+@pytest.mark.parametrize("law", ["tan", "mapping", "adaptive_rbf", "computed_torque"])
 def test_every_system_keeps_the_bounds_and_settles(law):
     run = ij.simulate(ij.presets.zhang_yan_2024(law=law), **PAPER)
     assert run.ok
@@ -58,78 +40,38 @@ def test_the_funnel_is_kept_by_its_own_law():
     assert float(jnp.max(jnp.abs(run.e1[run.t >= 1.0]))) < 0.12
     # and it lies inside the paper's bounds
     paper = ij.presets.zhang_yan_2024()
-    tubes = [
-        jax.vmap(scenario.context.tube)(jnp.linspace(0.0, 20.0, 2001))
-        for scenario in (run.scenario, paper)
-    ]
+    t = jnp.linspace(0.0, 20.0, 2001)
+    tubes = [jax.vmap(x.context.tube)(t) for x in (run.scenario, paper)]
     assert bool(jnp.all(tubes[0].lower >= tubes[1].lower))
     assert bool(jnp.all(tubes[0].upper <= tubes[1].upper))
 
 
 NO_DISTURBANCE = {"disturbance.acceleration_amplitude": 0.0, "disturbance.velocity_amplitude": 0.0}
-# Other values in the same structure: nothing compiles anew.
 
 
-def walls(lower, upper):
-    return {
-        "bounds.lower.offset": lower,
-        "bounds.upper.offset": upper,
-        "bounds.lower.amplitude": 0.0,
-        "bounds.upper.amplitude": 0.0,
-    }
-
-
+@pytest.mark.slow
 def test_computed_torque_gives_the_error_equation_that_it_promises():
     blind = NO_DISTURBANCE | {"observer.kf": 1e-12}
-    run = ij.simulate(
-        ij.with_parameters(ij.presets.zhang_yan_2024(law="computed_torque"), blind), **PAPER
-    )
+    preset = ij.presets.zhang_yan_2024(law="computed_torque")
+    run = ij.simulate(ij.with_parameters(preset, blind), **PAPER)
     w, t = 5.0, run.t[:, None]  # Kp = 25, Kd = 10: double pole at -5
     e0, de0 = run.e1[0], run.dq[0] - run.dq_d[0]
     np.testing.assert_allclose(run.e1, (e0 + (de0 + w * e0) * t) * jnp.exp(-w * t), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_pd_holds_a_reference_at_rest():
-    rest = (
-        NO_DISTURBANCE
-        | walls(0.1, 1.0)
-        | {
-            "reference.offset": [0.5, 0.6],
-            "reference.amplitude": 0.0,
-        }
-    )
+    walls = {f"bounds.{side}.amplitude": 0.0 for side in ("lower", "upper")}
+    walls |= {"bounds.lower.offset": 0.1, "bounds.upper.offset": 1.0}
+    rest = NO_DISTURBANCE | walls
+    rest |= {"reference.offset": [0.5, 0.6], "reference.amplitude": 0.0}
     run = ij.simulate(ij.with_parameters(ij.presets.zhang_yan_2024(law="pd"), rest), **PAPER)
     assert float(jnp.max(jnp.abs(run.e1[-1]))) < 1e-8
     np.testing.assert_allclose(run.tau[-1], run.scenario.model.gravity(run.q[-1]), atol=1e-6)
 
 
 @pytest.mark.slow
-def test_backstepping_without_barrier_is_the_limit_of_state_and_mapping():
-    wide = walls(-1e5, 1e5 + 1.0)
-    laws = ("backstepping", "state", "mapping")
-    runs = [
-        ij.simulate(ij.with_parameters(ij.presets.zhang_yan_2024(law=law), wide), **PAPER)
-        for law in laws
-    ]
-    for run in runs[1:]:
-        np.testing.assert_allclose(run.q, runs[0].q, atol=2e-5)
-
-
-@pytest.mark.parametrize("law", ij.presets.LAWS)
-def test_every_system_goes_through_a_scenario_file(law, tmp_path):
-    scenario = ij.presets.zhang_yan_2024(law=law, variant="corrected")
-    limited = controllers.Saturated(law=scenario.controller, limit=[7.2, 1.5], edge="smooth")
-    scenario = dataclasses.replace(
-        scenario, controller=limited, observer=observers.ExtendedState(bandwidth=30.0)
-    )
-    ij.save_scenario(scenario, tmp_path / "scenario.toml")
-    again = ij.load_scenario(tmp_path / "scenario.toml")
-    assert jax.tree.structure(again) == jax.tree.structure(scenario)
-    jax.tree.map(np.testing.assert_array_equal, again, scenario)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("law", ij.presets.LAWS)
+@pytest.mark.parametrize("law", ["state", "mapping", "dynamic_surface"])
 def test_a_start_at_the_wall_stays_finite_in_float32(law):
     scenario = ij.with_parameters(
         ij.presets.zhang_yan_2024(law=law), {"initial.q": [1.0399, 0.8999], "initial.dq": 1.0}
@@ -146,37 +88,10 @@ def test_a_start_at_the_wall_stays_finite_in_float32(law):
     for part in jax.tree.leaves((slope, sample, tangent)):
         assert part.dtype in (jnp.float32, bool, jax.dtypes.float0)
         assert part.dtype == jax.dtypes.float0 or bool(jnp.all(jnp.isfinite(part)))
-    if law not in ("backstepping", "computed_torque", "pd"):
-        assert bool(jnp.all(sample.tau < 0))
+    assert bool(jnp.all(sample.tau < 0))
 
 
 # ---------------------------------------------------------------------------------- adaptive RBF
-
-
-@pytest.mark.slow
-def test_adaptive_weights_stay_below_their_bound():
-    run = ij.simulate(ij.presets.zhang_yan_2024(law="adaptive_rbf"), **PAPER)
-    law, weights = run.scenario.controller, run.controller_state
-    assert weights.shape == (run.t.size, law.nodes, 2)
-    norms = jnp.sqrt(jnp.sum(weights**2, axis=1))
-    bound = jnp.sqrt(law.nodes) * jnp.max(jnp.abs(run.e2), axis=0) / law.sigma
-    assert bool(jnp.all(norms <= bound))
-    # the leak keeps them from drifting in the second half of the run
-    assert bool(jnp.all(jnp.max(norms[1000:], axis=0) < 1.5 * jnp.max(norms[:1000], axis=0)))
-
-
-@pytest.mark.slow
-def test_adaptive_weights_are_bounded_under_a_large_disturbance():
-    strong = {
-        "disturbance.acceleration_amplitude": 20.0,
-        "disturbance.acceleration_frequency": 5.0,
-        "controller.sigma": 0.5,
-    }
-    run = ij.simulate(
-        ij.with_parameters(ij.presets.zhang_yan_2024(law="adaptive_rbf"), strong), **PAPER
-    )
-    norms = jnp.sqrt(jnp.sum(run.controller_state**2, axis=1))
-    assert bool(jnp.all(norms <= 8.0 * jnp.max(jnp.abs(run.e2), axis=0) / 0.5))
 
 
 def test_adaptive_law_uses_neither_model_nor_estimate():
@@ -196,25 +111,13 @@ def test_adaptation_descends_the_lyapunov_function():
     weights, ideal = jax.random.normal(jax.random.PRNGKey(1), (2, law.nodes, 2))
     command, dweights = law.command(t, Q, DQ, jnp.zeros(2), scenario.context, weights)
     e2 = DQ - command.alpha
-    S = jnp.linalg.lstsq(
-        weights.T, command.tau + law.K2 * e2 + law.barrier.slope(scenario.context.tube(t), Q)
-    )[0]
-    np.testing.assert_allclose(
-        weights.T @ S,
-        command.tau + law.K2 * e2 + law.barrier.slope(scenario.context.tube(t), Q),
-        atol=1e-9,
-    )
     S = -(dweights / law.Gamma + law.sigma * weights)[:, 0] / e2[0]
-    np.testing.assert_allclose(
-        weights.T @ S,
-        command.tau + law.K2 * e2 + law.barrier.slope(scenario.context.tube(t), Q),
-        atol=1e-9,
-    )
+    learned = command.tau + law.K2 * e2 + law.barrier.slope(scenario.context.tube(t), Q)
+    np.testing.assert_allclose(weights.T @ S, learned, atol=1e-9)
     error = weights - ideal
-    storage_rate = jnp.sum(error * dweights / law.Gamma)
-    np.testing.assert_allclose(
-        storage_rate, -e2 @ (error.T @ S) - jnp.sum(law.sigma * weights * error), rtol=1e-9
-    )
+    stored = jnp.sum(error * dweights / law.Gamma)
+    expected = -e2 @ (error.T @ S) - jnp.sum(law.sigma * weights * error)
+    np.testing.assert_allclose(stored, expected, rtol=1e-9)
 
 
 @pytest.mark.parametrize(("nodes", "dimensions"), [(1, 4), (7, 8), (64, 8), (64, 28)])
@@ -231,17 +134,18 @@ def test_centres_fill_the_box(nodes, dimensions):
 
 
 @pytest.mark.slow
-def test_under_the_preset_limit_bounds_tracking_and_estimate_still_hold(saturated_runs):
-    run, free = saturated_runs["preset"], saturated_runs["free"]
-    limit = run.scenario.controller.limit
+def test_under_the_preset_limit_bounds_tracking_and_estimate_still_hold():
+    scenario = ij.presets.zhang_yan_2024_saturated()
+    limit = scenario.controller.limit
+    run = ij.simulate(scenario, **PAPER)
+    free = ij.simulate(ij.with_parameters(scenario, {"controller.limit": 100.0}), **PAPER)
     assert bool(jnp.all(jnp.max(jnp.abs(free.tau), axis=0) > limit))
     assert run.status == ij.Status.TORQUE_SATURATED
     assert free.ok
     np.testing.assert_allclose(run.metrics.peak_torque, limit, rtol=1e-12)
     assert bool(jnp.all(run.metrics.saturated_share > 0))
-    assert (
-        0.35 < float(jnp.min(run.metrics.xi_margin)) < 0.38
-    )  # less than the start's: it came nearer
+    # Less than the start's: it came nearer.
+    assert 0.35 < float(jnp.min(run.metrics.xi_margin)) < 0.38
     assert float(jnp.max(run.metrics.settling_time)) < 1.05
     np.testing.assert_allclose(run.e1[1000:], free.e1[1000:], atol=1e-6)
     # The observer is told the torque that was applied, so it does not take the cut for a
@@ -250,51 +154,9 @@ def test_under_the_preset_limit_bounds_tracking_and_estimate_still_hold(saturate
     np.testing.assert_allclose(error[0], error[1], rtol=0.1)
 
 
-def inequality_excess(run):
-    """V2' + rho V2 - |f'|^2 / 2 at the recorded samples, with Theorem 2's rho at that mass matrix
-    (case 2)."""
-    scenario = run.scenario
-
-    def at(t, state):
-        def of_interest(t, state):
-            sample = evaluate(scenario, t, state)[1]
-            return sample.V, sample.disturbance
-
-        (V, _), (dV, df) = jax.jvp(
-            of_interest, (t, state), (jnp.ones(()), rate(scenario, t, state))
-        )
-        rho = jnp.minimum(
-            4.0, 2 * 19.5 / jnp.linalg.eigvalsh(scenario.model.mass_matrix(state.q))[-1]
-        )
-        return dV + rho * V - 0.5 * jnp.sum(df**2)
-
-    states = LoopState(run.x, run.controller_state, run.observer_state)
-    return jax.jit(jax.vmap(at))(run.t, states)
-
-
 @pytest.mark.slow
-def test_the_inequality_of_theorem_2_fails_only_while_the_torque_is_cut(saturated_runs):
-    run = saturated_runs["preset"]
-    assert float(jnp.max(inequality_excess(saturated_runs["free"]))) < 1e-9
-    excess, cut = (
-        inequality_excess(run),
-        jnp.any(jnp.abs(run.tau) >= run.scenario.controller.limit, axis=1),
-    )
-    assert float(jnp.max(excess[cut])) > 1.0
-    assert float(jnp.max(excess[~cut])) < 1e-9
-
-
-def test_a_limit_below_gravity_keeps_nothing(saturated_runs):
-    run = saturated_runs["below_gravity"]
-    assert int(run.status) & ij.Status.BOUND_VIOLATED
-    assert int(run.status) & ij.Status.TORQUE_SATURATED
-    assert float(jnp.min(run.metrics.margin)) < -0.1
-    assert bool(jnp.all(jnp.isfinite(run.q)))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
-def test_smooth_limit(dtype):
+def test_smooth_limit():
+    dtype = jnp.float32
     scenario = ij.astype(ij.presets.zhang_yan_2024_saturated(edge="smooth"), dtype)
     law = scenario.controller
     tau = jnp.asarray([0.0, 1e-30, 0.5, 0.999, 1.0, 1.001, 2.0, 1e8, 1e30], dtype)
@@ -302,25 +164,16 @@ def test_smooth_limit(dtype):
     def limited(x):
         fixed = _Fixed(tau=jnp.stack([x, -x]))
         wrapped = controllers.Saturated(law=fixed, limit=jnp.ones(2, dtype), edge="smooth")
-        return wrapped.command(
-            jnp.zeros((), dtype),
-            jnp.stack([Q, DQ]).astype(dtype),
-            jnp.zeros(2, dtype),
-            scenario.context,
-            (),
-        )[0].tau
+        x, zero = jnp.stack([Q, DQ]).astype(dtype), jnp.zeros(2, dtype)
+        return wrapped.command(zero[0], x, zero, scenario.context, ())[0].tau
 
     value, slope = jax.vmap(limited)(tau), jax.vmap(jax.jacfwd(limited))(tau)
     assert value.dtype == dtype
     np.testing.assert_allclose(value[:, 0], -value[:, 1])
-    exact = np.asarray(tau, np.longdouble) / (1 + np.asarray(tau, np.longdouble) ** 8) ** 0.125
+    wide = np.asarray(tau, np.longdouble)
+    exact, exact_slope = wide / (1 + wide**8) ** 0.125, (1 + wide**8) ** -1.125
     np.testing.assert_allclose(value[:, 0], exact.astype(float), rtol=1e-6)
-    np.testing.assert_allclose(
-        slope[:, 0],
-        ((1 + np.asarray(tau, np.longdouble) ** 8) ** -1.125).astype(float),
-        rtol=1e-5,
-        atol=1e-30,
-    )
+    np.testing.assert_allclose(slope[:, 0], exact_slope.astype(float), rtol=1e-5, atol=1e-30)
     assert bool(jnp.all(jnp.isfinite(jax.vmap(jax.jacrev(limited))(tau))))
     assert bool(jnp.all(jnp.abs(value) <= 1.0))
     assert law.edge == "smooth"
@@ -377,19 +230,6 @@ def test_a_wrapper_in_a_wrapper_keeps_both_fields_apart():
     assert isinstance(again.law.law, controllers.PDGravity)
 
 
-def test_new_limits_and_gains_do_not_recompile():
-    scenario, traces = ij.presets.zhang_yan_2024_saturated(), []
-
-    @jax.jit
-    def start(scenario):
-        traces.append(1)
-        return evaluate(scenario, jnp.zeros(()), initial_state(scenario))[1].tau
-
-    for limit, K2 in ((8.0, 20.0), (3.0, 10.0)):
-        start(ij.with_parameters(scenario, {"controller.limit": limit, "controller.K2": K2}))
-    assert len(traces) == 1
-
-
 def test_saturation_says_what_is_wrong():
     law = controllers.PDGravity(Kp=1.0, Kd=1.0)
     with pytest.raises(ValueError, match="hard"):
@@ -404,47 +244,10 @@ def test_saturation_says_what_is_wrong():
 
 
 @pytest.mark.slow
-def test_extended_state_observer_obeys_its_error_equation():
-    scenario = dataclasses.replace(
-        ij.presets.zhang_yan_2024(variant="corrected"),
-        observer=observers.ExtendedState(bandwidth=30.0),
-        initial=ij.Initial(Q, DQ),
-    )
-
-    def f_tilde(t, state):
-        sample = evaluate(scenario, t, state)[1]
-        return sample.disturbance - sample.disturbance_estimate
-
-    def f(t, state):
-        return evaluate(scenario, t, state)[1].disturbance
-
-    def along(g):
-        return lambda t, state: jax.jvp(g, (t, state), (jnp.ones(()), rate(scenario, t, state)))[1]
-
-    t, state = jnp.asarray(0.4), initial_state(scenario)
-    state = state._replace(
-        observer=state.observer._replace(
-            f_hat=jnp.array([0.3, -0.2]), p_hat=state.observer.p_hat + 0.01
-        )
-    )
-    left = (
-        along(along(f_tilde))(t, state)
-        + 60.0 * along(f_tilde)(t, state)
-        + 900.0 * f_tilde(t, state)
-    )
-    np.testing.assert_allclose(
-        left, along(along(f))(t, state) + 60.0 * along(f)(t, state), rtol=1e-8
-    )
-
-
-@pytest.mark.slow
-def test_extended_state_observer_finds_a_constant_torque_and_its_gains_have_two_forms():
+def test_gains_of_the_extended_state_observer_have_two_forms():
     scenario = ij.presets.zhang_yan_2024(variant="corrected")
-    push = ij.disturbances.Sinusoids(amplitude=0.0, frequency=1.0, offset=[1.0, -0.5])
     forms = [observers.ExtendedState(bandwidth=40.0), observers.ExtendedState(l1=80.0, l2=1600.0)]
-    one, other = (dataclasses.replace(scenario, disturbance=push, observer=form) for form in forms)
-    run = ij.simulate(one, duration=2.0, dt=1e-3)
-    np.testing.assert_allclose(run.disturbance_estimate[-1], [1.0, -0.5], atol=1e-8)
+    one, other = (dataclasses.replace(scenario, observer=form) for form in forms)
     states = [
         initial_state(s)._replace(observer=observers.extended_state.ExtendedStateValues(Q, DQ))
         for s in (one, other)
@@ -456,86 +259,6 @@ def test_extended_state_observer_finds_a_constant_torque_and_its_gains_have_two_
     for wrong in ({}, {"l1": 1.0}, {"bandwidth": 1.0, "l1": 1.0, "l2": 1.0}):
         with pytest.raises(ValueError, match="bandwidth"):
             observers.ExtendedState(**wrong)
-
-
-# --------------------------------------------------- laws for other constraints, on the backends
-
-
-def _constrained(name):
-    """The paper's arm under one of the laws that know of other constraints, or keep bounds in
-    another way."""
-    full = ij.presets.zhang_yan_2024_full_state()
-    pd = controllers.PDGravity(Kp=60.0, Kd=20.0)
-    law = {
-        "full_state": full.controller,
-        "full_state_smooth": two_barriers(second=ij.barriers.Tan()),
-        "dynamic_surface": controllers.DynamicSurface(k1=2.0, K2=20.0, filter=0.02),
-        "reference_governor": controllers.ReferenceGovernor(law=pd),
-        "safety_filter": controllers.SafetyFilter(law=pd, nearest="acceleration"),
-    }[name]
-    return ij.with_parts(full, controller=law)
-
-
-CONSTRAINED = (
-    "full_state",
-    "full_state_smooth",
-    "dynamic_surface",
-    "reference_governor",
-    "safety_filter",
-)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", CONSTRAINED)
-def test_backends_agree_on_them_and_a_run_alone_is_that_of_a_batch(name):
-    scenario, spread = _constrained(name), {"initial.q": ij.offset(ij.uniform(-0.05, 0.05))}
-    options = {
-        "runs": 5,
-        "duration": 0.1,
-        "dt": 5e-4,
-        "progress": False,
-        "seed": 3,
-        "method": "rk4" if name == "full_state" else "euler",
-    }
-    studies = {
-        b: ij.monte_carlo(scenario, spread, backend=b, **options) for b in ("native", "vmap")
-    }
-    for metric in ("ise", "margin", "velocity_margin", "alpha_margin", "peak_torque"):
-        found, expected = (np.asarray(studies[b].metrics[metric]) for b in ("vmap", "native"))
-        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12, err_msg=metric)
-    np.testing.assert_array_equal(studies["vmap"].status, studies["native"].status)
-    alone = studies["native"].replay(2)
-    for metric in ("ise", "velocity_margin"):
-        np.testing.assert_array_equal(alone.metrics[metric], studies["native"].metrics[metric][2])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "path"),
-    [
-        ("full_state", "controller.c[1]"),
-        ("dynamic_surface", "controller.filter"),
-        ("safety_filter", "controller.a1"),
-    ],
-)
-def test_their_gains_can_be_tuned(name, path):
-    scenario = _constrained(name)
-    objective = (
-        ij.objectives.tracking()
-        + 0.1 * ij.objectives.effort()
-        + ij.objectives.velocity_margin_above(0.05)
-    )
-    result = ij.tune(
-        scenario,
-        [path],
-        objective,
-        duration=0.2,
-        dt=5e-4,
-        effort=ij.tuning.Effort(iterations=4),
-        progress=False,
-    )
-    assert result.report.verdicts[0].verdict == "pass"
-    assert result.objective <= result.report.changes[0].before
 
 
 # --------------------------------------------------------------------- the weight of the barrier
@@ -562,9 +285,8 @@ def weighted(name, weight=None):
 def commanded(scenario):
     """What its law commands at one state."""
     law, context = scenario.controller, scenario.context
-    return law.command(
-        jnp.asarray(0.3), Q, DQ, jnp.array([0.5, -0.2]), context, law.init(Q, DQ, context)
-    )[0]
+    f_hat, state = jnp.array([0.5, -0.2]), law.init(Q, DQ, context)
+    return law.command(jnp.asarray(0.3), Q, DQ, f_hat, context, state)[0]
 
 
 @pytest.mark.parametrize("name", WEIGHTED)
@@ -586,9 +308,8 @@ def test_the_weight_is_a_leaf_with_the_unit_that_its_barrier_gives_it(name):
     assert (found.shape, found.unit) == ((2,), units.get(name, "N m rad"))
     assert ij.simulation.paths.unit_at(weighted(name), "controller.weight[1]") == found.unit
     limited = controllers.Saturated(law=WEIGHTED[name], limit=30.0)
-    inside = ij.with_parameters(
-        dataclasses.replace(weighted(name), controller=limited), {"controller.weight": WEIGHT}
-    )
+    outer = dataclasses.replace(weighted(name), controller=limited)
+    inside = ij.with_parameters(outer, {"controller.weight": WEIGHT})
     np.testing.assert_array_equal(inside.controller.law.weight, WEIGHT)
     with pytest.raises(ValueError, match=r"weight.*> 0"):
         ij.with_parameters(weighted(name), {"controller.weight": [1.0, 0.0]})
@@ -597,15 +318,13 @@ def test_the_weight_is_a_leaf_with_the_unit_that_its_barrier_gives_it(name):
 def test_files_without_a_weight_have_the_papers_and_others_keep_theirs(tmp_path):
     ij.save_scenario(weighted("backstepping", WEIGHT), tmp_path / "scenario.toml")
     text = (tmp_path / "scenario.toml").read_text()
-    np.testing.assert_array_equal(
-        ij.load_scenario(tmp_path / "scenario.toml").controller.weight, WEIGHT
-    )
+    loaded = ij.load_scenario(tmp_path / "scenario.toml")
+    np.testing.assert_array_equal(loaded.controller.weight, WEIGHT)
     old = "\n".join(line for line in text.splitlines() if not line.startswith("weight"))
     assert old != text.rstrip("\n")
     (tmp_path / "old.toml").write_text(old)
-    np.testing.assert_array_equal(
-        ij.load_scenario(tmp_path / "old.toml").controller.weight, [1.0, 1.0]
-    )
+    loaded = ij.load_scenario(tmp_path / "old.toml")
+    np.testing.assert_array_equal(loaded.controller.weight, [1.0, 1.0])
 
 
 def test_a_weight_of_one_costs_no_operation_and_another_one_a_joint():
@@ -619,42 +338,13 @@ def test_a_weight_of_one_costs_no_operation_and_another_one_a_joint():
 
 
 @pytest.mark.slow
-def test_a_run_of_other_weights_is_the_same_in_a_batch():
-    paper = ij.presets.zhang_yan_2024()
-    varied = {"controller.weight": ij.factor(ij.uniform(0.2, 3.0))}
-    study = ij.monte_carlo(paper, varied, runs=3, seed=1, duration=0.1, dt=1e-3, progress=False)
-    run = study.replay(1)
-    assert np.all(np.abs(np.asarray(run.scenario.controller.weight) - 1.0) > 1e-3)
-    single = ij.simulate(run.scenario, duration=0.1, dt=1e-3)
-    np.testing.assert_allclose(single.q, run.q, rtol=1e-12)
-    np.testing.assert_allclose(study.metrics["margin"][1], run.metrics["margin"], rtol=1e-9)
-    assert np.max(np.abs(single.q - ij.simulate(paper, duration=0.1, dt=1e-3).q)) > 1e-5
-
-
-@pytest.mark.slow
 def test_the_derivative_by_the_weight_is_that_of_differences_also_at_one():
     paper = ij.presets.zhang_yan_2024()
 
-    def margin(w):
-        return ij.simulate(
-            ij.with_parameters(paper, {"controller.weight": w}), duration=0.05, dt=1e-3
-        ).q[-1, 0]
+    def end(w):
+        weighted = ij.with_parameters(paper, {"controller.weight": w})
+        return ij.simulate(weighted, duration=0.05, dt=1e-3).q[-1, 0]
 
     for w in (1.0, 0.7):
-        difference = (margin(w + 1e-4) - margin(w - 1e-4)) / 2e-4
-        np.testing.assert_allclose(jax.grad(margin)(w), difference, rtol=1e-5)
-
-
-@pytest.mark.slow
-def test_weights_are_tuned():
-    goal = ij.objectives.tracking() + 0.1 * ij.objectives.effort()
-    found = ij.tune(
-        ij.presets.zhang_yan_2024(),
-        ["controller.weight"],
-        goal,
-        duration=0.1,
-        dt=1e-3,
-        effort=ij.tuning.Effort(iterations=3),
-        progress=False,
-    )
-    assert np.any(np.abs(np.asarray(found.scenario.controller.weight) - 1.0) > 1e-3)
+        difference = (end(w + 1e-4) - end(w - 1e-4)) / 2e-4
+        np.testing.assert_allclose(jax.grad(end)(w), difference, rtol=1e-5)

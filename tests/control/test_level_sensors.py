@@ -16,8 +16,6 @@ from iblf_jax.sensors import (
     Unmeasured,
 )
 
-import iblf_jax as ij
-
 PERIOD = jnp.asarray(1e-3)
 ENCODER = Encoder(
     counts=4096, noise=1e-3, offset=0.1, velocity=Measured(noise=jnp.array([0.01, 0.02]))
@@ -75,18 +73,3 @@ def test_the_advice_names_the_part():
 def test_what_is_no_sensor_is_refused(parts):
     with pytest.raises(ValueError, match=r"Levels\.parts"):
         Levels(parts)
-
-
-def test_a_scenario_file_keeps_the_parts(tmp_path):
-    base = ij.presets.zhang_yan_2024()
-    sensor = Levels((ENCODER, Direct(noise=0.1)))
-    names = [type(part).__name__ for part in sensor.parts]
-    scenario = ij.with_parts(
-        base, sampling=ij.Sampling(period=1e-3), sensor=Levels((Direct(noise=[0.1, 0.2]), Direct()))
-    )
-    path = tmp_path / "scenario.toml"
-    ij.save_scenario(scenario, path)
-    loaded = ij.load_scenario(path).sensor
-    assert [type(part) for part in loaded.parts] == [Direct, Direct]
-    np.testing.assert_array_equal(loaded.parts[0].noise, [0.1, 0.2])
-    assert names == ["Encoder", "Direct"]

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from arm_cases import loop_on
 from iblf_jax.observers import StateObserver
-from iblf_jax.sensors import Direct, Levels
 from independent_arm import TwoLinkArm
 from scipy.integrate import solve_ivp
 
@@ -36,11 +35,7 @@ def reference_rate(w, limit, push, t, z):
     """The rate of (q, q', q_hat, v_hat, d_hat) of this loop, from its equations."""
     q, v, q_hat, v_hat, d_hat = z.reshape(5, 2)
     angle = 1.5 * t + np.array([0.0, 0.4])
-    q_d, dq_d, ddq_d = (
-        0.3 + 0.2 * np.sin(angle),
-        0.3 * np.cos(angle),
-        -0.45 * np.sin(angle),
-    )
+    q_d, dq_d, ddq_d = (0.3 + 0.2 * np.sin(angle), 0.3 * np.cos(angle), -0.45 * np.sin(angle))
     used = np.minimum(np.maximum(d_hat, -limit), limit)
     commanded = ddq_d - KD * (v_hat - dq_d) - KP * (q - q_d) - used
     tau = ARM.inverse_dynamics(q, v_hat, commanded)
@@ -104,24 +99,12 @@ def test_the_trajectory_with_an_active_limit():
     assert dict(run.metrics.units)["peak_level_error"] == "rad; rad/s"
 
 
-PERIOD = ij.Sampling(period=5e-4)
-POSITIONS = Levels((Direct(), None))
-
-
-@pytest.mark.parametrize(
-    "sampled",
-    [pytest.param(False, marks=pytest.mark.slow), pytest.param(True, marks=pytest.mark.release)],
-    ids=["continuous", "sampled"],
-)
-def test_the_loop_tends_to_that_with_measured_velocity(sampled):
+@pytest.mark.slow
+def test_the_loop_tends_to_that_with_measured_velocity():
     """The deviation of q is proportional to 1/w for a high-gain observer, and for one that
     estimates the disturbance if its estimate is limited.  Without the limit it does not vanish,
     because the integral of the peak of d_hat does not depend on w."""
     bare = loop(ij.observers.NoObserver())
-    sensor = {}
-    if sampled:
-        bare = ij.with_parts(bare, sampling=PERIOD)
-        sensor = {"sensor": POSITIONS}
     offset = np.stack([np.zeros(2), V0])
 
     def run(scenario):
@@ -132,7 +115,7 @@ def test_the_loop_tends_to_that_with_measured_velocity(sampled):
 
     def deviations(**fields):
         first = StateObserver(bandwidth=1.0, offset=offset, **fields)
-        scenario = ij.with_parts(bare, observer=first, **sensor)
+        scenario = ij.with_parts(bare, observer=first)
         return [
             np.max(np.abs(run(ij.with_parameters(scenario, {"observer.bandwidth": w})) - measured))
             for w in (75.0, 150.0, 300.0)
@@ -182,37 +165,3 @@ def test_limits_and_metrics_that_do_not_fit_are_refused():
         ij.simulate(
             loop(ij.observers.NoObserver()), duration=0.1, dt=1e-3, metrics=(LevelEstimation(),)
         )
-
-
-@pytest.mark.release
-def test_batches_files_and_gradients(tmp_path):
-    """Monte-Carlo reports the metrics, a file keeps the limits, and a gradient is that of
-    differences."""
-    observer = StateObserver(bandwidth=60.0, limit=(1.0, 2.0), disturbance_limit=5.0)
-    scenario = loop(observer, sampling=PERIOD, sensor=POSITIONS)
-    path = tmp_path / "loop.toml"
-    ij.save_scenario(scenario, path)
-    with notices.muted():
-        again = ij.simulate(ij.load_scenario(path), duration=0.1, dt=5e-4)
-        once = ij.simulate(scenario, duration=0.1, dt=5e-4)
-        study = ij.monte_carlo(
-            scenario,
-            {"plant.mass[1]": ij.factor(ij.uniform(0.9, 1.1))},
-            runs=4,
-            duration=0.1,
-            dt=5e-4,
-            progress=False,
-        )
-    np.testing.assert_array_equal(again.q, once.q)
-    np.testing.assert_array_equal(once.x_hat[:, 1], once.measured.dq)
-    assert study.metrics["peak_level_error"].shape == (4, 2, 2)
-    assert study.metrics["limited_time"].shape == (4,)
-
-    def end(w):
-        part = StateObserver(bandwidth=w, offset=np.stack([np.zeros(2), V0]))
-        run = ij.simulate(loop(part), duration=0.1, dt=1e-3)
-        return jnp.sum(run.q[-1] ** 2)
-
-    slope = jax.grad(end)(60.0)
-    expected = (end(60.01) - end(59.99)) / 0.02
-    np.testing.assert_allclose(slope, expected, rtol=1e-5)

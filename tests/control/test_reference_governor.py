@@ -53,13 +53,8 @@ def independent_rate(name, governor, goal, x):
         + np.maximum(1 - (g - low) / 0.02, 0)
         - np.maximum(1 - (high - g) / 0.02, 0)
     )
-    return np.concatenate(
-        [
-            v,
-            np.linalg.solve(M, tau - C(v) @ v - G),
-            float(governor.eta) * max(level - V, 0.0) * field,
-        ]
-    )
+    acceleration = np.linalg.solve(M, tau - C(v) @ v - G)
+    return np.concatenate([v, acceleration, float(governor.eta) * max(level - V, 0.0) * field])
 
 
 @pytest.mark.slow
@@ -68,14 +63,9 @@ def test_the_run_is_that_of_an_independent_program(name):
     governor = controllers.ReferenceGovernor(law=LAWS[name])
     scenario, t = scenario_of(governor), np.linspace(0.0, 3.0, 61)
     start = [0.75, 0.3, 0, 0, 0.75, 0.3]
+    how = {"method": "DOP853", "t_eval": t, "rtol": 1e-10, "atol": 1e-12}
     found = solve_ivp(
-        lambda t, x: independent_rate(name, governor, (0.25, 0.8), x),
-        (0, 3.0),
-        start,
-        "DOP853",
-        t_eval=t,
-        rtol=1e-10,
-        atol=1e-12,
+        lambda t, x: independent_rate(name, governor, (0.25, 0.8), x), (0, 3.0), start, **how
     )
     run = ij.simulate(scenario, duration=3.0, dt=2.5e-4, record_every=200)
     np.testing.assert_allclose(run.q, found.y[:2].T, atol=1e-7)
@@ -83,16 +73,16 @@ def test_the_run_is_that_of_an_independent_program(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", list(LAWS))
-def test_it_keeps_what_the_law_alone_breaks_from_random_starts(name):
-    governor = controllers.ReferenceGovernor(law=LAWS[name])
+def test_it_keeps_what_the_law_alone_breaks_from_random_starts():
+    law = LAWS["computed_torque"]
+    governor = controllers.ReferenceGovernor(law=law)
     perturbations = {
         "initial.q": ij.value(ij.uniform([0.3, 0.25], [0.8, 0.75])),
         "initial.dq": ij.value(ij.uniform(-0.3, 0.3)),
     }
     options = {"runs": 300, "duration": 3.0, "dt": 1e-3, "progress": False, "seed": 5}
     alone, governed = (
-        ij.monte_carlo(scenario_of(law), perturbations, **options) for law in (LAWS[name], governor)
+        ij.monte_carlo(scenario_of(x), perturbations, **options) for x in (law, governor)
     )
     scenario = scenario_of(governor)
 
@@ -112,6 +102,7 @@ def test_it_keeps_what_the_law_alone_breaks_from_random_starts(name):
     assert np.mean(np.min(np.asarray(alone.metrics["margin"])[fine], axis=1) < 0) > 0.3
 
 
+@pytest.mark.slow
 def test_V_stays_below_Gamma():
     governor = controllers.ReferenceGovernor(law=LAWS["pd"])
     run = ij.simulate(scenario_of(governor), duration=3.0, dt=1e-3)
@@ -122,53 +113,6 @@ def test_V_stays_below_Gamma():
     level = jax.vmap(lambda t, g: governor.level(t, g, context))(run.t, run.controller_state.g)
     assert np.all(level * (1 + 1e-6) + 1e-12 >= V)
     assert float(jnp.max(jnp.abs(run.e1[-1]))) < 0.02  # and it gets there
-
-
-@pytest.mark.slow
-def test_it_lags_behind_a_reference_that_moves():
-    paper = ij.presets.zhang_yan_2024(law="computed_torque", variant="corrected")
-    governed = ij.with_parts(paper, controller=controllers.ReferenceGovernor(law=paper.controller))
-    runs = [ij.simulate(s, duration=6.0, dt=1e-3) for s in (paper, governed)]
-    late = [float(jnp.max(jnp.abs(run.e1[run.t > 4.0]))) for run in runs]
-    assert late[1] > 10 * late[0]
-
-
-@pytest.mark.slow
-def test_files_paths_and_gradients(tmp_path):
-    scenario = scenario_of(controllers.ReferenceGovernor(law=LAWS["pd"]))
-    ij.save_scenario(scenario, tmp_path / "s.toml")
-    assert jax.tree.structure(ij.load_scenario(tmp_path / "s.toml")) == jax.tree.structure(scenario)
-    assert {"controller.eta", "controller.Kp"} <= {p.path for p in ij.parameters(scenario)}
-
-    def loss(eta):
-        run = ij.simulate(
-            ij.with_parameters(scenario, {"controller.eta": eta}),
-            duration=0.2,
-            dt=1e-3,
-            record_every=200,
-        )
-        return jnp.sum(run.metrics.ise)
-
-    found, h = jax.grad(loss)(40.0), 1e-3
-    assert float(found) == pytest.approx(
-        (float(loss(40.0 + h)) - float(loss(40.0 - h))) / (2 * h), rel=1e-5
-    )
-
-
-@pytest.mark.slow
-def test_its_speed_is_tuned():
-    scenario = scenario_of(controllers.ReferenceGovernor(law=LAWS["pd"], eta=2.0))
-    result = ij.tune(
-        scenario,
-        ["controller.eta"],
-        ij.objectives.tracking(),
-        duration=0.4,
-        dt=2e-3,
-        effort=ij.tuning.Effort(iterations=3),
-        progress=False,
-    )
-    assert float(np.min(result.values["controller.eta"])) > 3.0  # a faster one tracks better
-    assert result.nominal[1].metrics.ise.sum() < 0.95 * result.nominal[0].metrics.ise.sum()
 
 
 def test_its_state_starts_inside_the_margin():

@@ -10,7 +10,6 @@ import pytest
 from arm_cases import loop_on
 from independent_arm import TwoLinkArm
 from scipy.integrate import solve_ivp
-from scipy.optimize import brentq
 
 import iblf_jax as ij
 from iblf_jax.core import notices
@@ -30,11 +29,7 @@ def reference(t):
     """q_d, q_d' and q_d" of the loops here."""
     phase = np.array([0.0, 0.4])
     angle = 1.5 * t + phase
-    return (
-        0.3 + 0.2 * np.sin(angle),
-        0.3 * np.cos(angle),
-        -0.45 * np.sin(angle),
-    )
+    return (0.3 + 0.2 * np.sin(angle), 0.3 * np.cos(angle), -0.45 * np.sin(angle))
 
 
 def surface(law, e, v):
@@ -133,42 +128,15 @@ def test_the_trajectory_and_the_band():
     assert np.all(np.abs(v) <= (2.02 * LAW["beta"] * sigma) ** (1.0 / LAW["p"]))
 
 
-def test_the_error_on_the_surface_settles_within_the_stated_time():
-    """sigma = 0: the time from e0 to the size at which the smoothing acts, by quadrature."""
-    for p, beta, delta, e0 in ((1.5, 1.0, 0.01, 0.5), (1.2, 3.0, 0.05, 1.0), (1.8, 0.5, 0.02, 0.3)):
-
-        def speed(e, p=p, beta=beta, delta=delta):
-            return brentq(
-                lambda v: v * (v * v + delta * delta) ** ((p - 1) / 2) - beta * e, 0.0, 50.0
-            )
-
-        smallest = 2.0 ** ((p - 1) / 2) * delta**p / beta
-        grid = np.geomspace(smallest, e0, 2001)
-        rates = np.array([1.0 / speed(e) for e in grid])
-        time = float(np.sum(0.5 * (rates[1:] + rates[:-1]) * np.diff(grid)))
-        stated = p / (p - 1) * (2.0 ** ((p - 1) / 2) / beta) ** (1.0 / p) * e0 ** (1.0 - 1.0 / p)
-        assert 0.3 * stated < time < stated
-
-
-ESTIMATED = ij.observers.StateObserver(bandwidth=100.0, offset=(0.0, 0.3))
-
-
-@pytest.mark.parametrize(
-    ("observer", "term"),
-    [
-        pytest.param(ij.observers.Momentum(kf=20.0), "f_tilde", marks=pytest.mark.slow),
-        pytest.param(ESTIMATED, "tau(x_hat)", marks=pytest.mark.release),
-    ],
-    ids=["measured velocity", "estimated velocity"],
-)
-def test_certify_checks_the_claim_of_the_law(observer, term):
-    """(T.2) is an equality; with estimated velocities the error of the estimates is a part of T."""
+@pytest.mark.slow
+def test_certify_checks_the_claim_of_the_law():
+    """(T.2) is an equality."""
     pushed = ij.disturbances.Sinusoids(amplitude=[0.3, 0.1], frequency=3.0)
-    scenario = loop(LAW, observer=observer, disturbance=pushed)
+    scenario = loop(LAW, observer=ij.observers.Momentum(kf=20.0), disturbance=pushed)
     certificate = ij.certify(scenario, duration=0.1, dt=2e-4)
     line = {line.name: line for line in certificate.lines}["inequality, own V"]
     assert line.verdict == "holds" and abs(line.margin) < 1e-10
-    assert term in line.statement
+    assert "f_tilde" in line.statement
 
 
 def test_an_exponent_without_a_law_is_refused():
@@ -203,12 +171,11 @@ def test_a_sampled_loop_is_assessed_with_the_slope_of_the_layer():
 @pytest.mark.parametrize(
     "wrapped",
     [
-        lambda law: ij.controllers.Saturated(law, limit=1e4),
         lambda law: ij.controllers.Saturated(law, limit=1e-3),
         lambda law: ij.controllers.Saturated(law, limit=1e-3, auxiliary=5.0, edge="smooth"),
         lambda law: ij.controllers.SafetyFilter(law, limit=30.0),
     ],
-    ids=["unreached limit", "limit", "auxiliary state", "filter"],
+    ids=["limit", "auxiliary state", "filter"],
 )
 def test_limits_of_laws_within_others_are_left_out_of_the_linearisation(wrapped):
     """Wherever a limit is active the radius would be at least 1, that of an open loop."""

@@ -1,14 +1,12 @@
 """Bounds on the velocities: watched by metrics, status, requirements and figures, whatever the law
 knows of them."""
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import iblf_jax as ij
 from iblf_jax import bounds, plotting
-from iblf_jax.files.scenario import load_scenario, save_scenario, scenario_to_toml
+from iblf_jax.files.scenario import scenario_to_toml
 from iblf_jax.simulation import metrics
 
 SHORT = {"duration": 1.0, "dt": 1e-3}
@@ -52,9 +50,8 @@ def test_what_is_watched_is_what_the_samples_say(watched):
     np.testing.assert_allclose(run.dq_upper, high, atol=1e-15)
     assert run.ok
     for name, signal in (("velocity_margin", run.dq), ("alpha_margin", run.alpha)):
-        np.testing.assert_allclose(
-            run.metrics[name], np.minimum(signal - low, high - signal).min(axis=0), rtol=1e-12
-        )
+        expected = np.minimum(signal - low, high - signal).min(axis=0)
+        np.testing.assert_allclose(run.metrics[name], expected, rtol=1e-12)
     assert np.isinf(run.metrics.first_velocity_violation_time)
     assert int(run.metrics.first_velocity_violation_joint) == -1
 
@@ -68,6 +65,7 @@ def test_the_law_and_the_loop_do_not_know(watched):
     assert "velocity_margin" not in free.metrics
 
 
+@pytest.mark.slow
 def test_a_violation_is_flagged_with_time_and_joint(violated):
     run = violated
     status = ij.Status(int(run.status))
@@ -82,56 +80,17 @@ def test_a_violation_is_flagged_with_time_and_joint(violated):
 
 
 @pytest.mark.slow
-def test_backends_agree():
-    scenario = paper(NARROW)
-    options = {"runs": 4, "duration": 0.3, "dt": 1e-3, "progress": False}
-    studies = [
-        ij.monte_carlo(
-            scenario, {"initial.q": ij.offset(ij.uniform(-0.05, 0.05))}, backend=b, **options
-        )
-        for b in ("native", "vmap")
-    ]
-    for name in ("velocity_margin", "alpha_margin", "first_velocity_violation_time"):
-        np.testing.assert_allclose(*(np.asarray(s.metrics[name]) for s in studies), rtol=1e-9)
-    assert np.all(studies[0].status & int(ij.Status.VELOCITY_VIOLATED) != 0)
-    np.testing.assert_array_equal(studies[0].status, studies[1].status)
-
-
-@pytest.mark.slow
 def test_a_funnel_of_velocities_follows_the_reference():
     funnel = bounds.Bounds(lower=bounds.Funnel(-1.0, -0.2, 2.0), upper=bounds.Funnel(1.5, 0.2, 2.0))
-    run = ij.simulate(
-        paper(funnel, initial=ij.Initial([0.5, 0.64], [0.14, 0.0])),
-        duration=0.2,
-        dt=1e-3,
-    )
+    scenario = paper(funnel, initial=ij.Initial([0.5, 0.64], [0.14, 0.0]))
+    run = ij.simulate(scenario, duration=0.08, dt=1e-3)
     r = np.exp(-2.0 * np.asarray(run.t))[:, None]
     np.testing.assert_allclose(run.dq_upper, run.dq_d + 1.3 * r + 0.2, rtol=1e-12)
     np.testing.assert_allclose(run.dq_lower, run.dq_d - 0.8 * r - 0.2, rtol=1e-12)
 
 
-@pytest.mark.slow
-def test_the_margin_has_a_derivative():
-    def margin(low):
-        scenario = ij.with_parameters(
-            paper(), {"bounds[1].lower.offset": low, "controller.k1": 2.0 + low}
-        )
-        return jnp.min(
-            ij.simulate(scenario, duration=0.2, dt=1e-3, record_every=200).metrics.velocity_margin
-        )
-
-    found, h = jax.grad(margin)(-1.5), 1e-6
-    assert float(found) == pytest.approx(
-        (float(margin(-1.5 + h)) - float(margin(-1.5 - h))) / (2 * h), rel=1e-6
-    )
-
-
-def test_files_hold_them_and_say_their_unit(tmp_path):
+def test_files_hold_them_and_say_their_unit():
     scenario = paper()
-    save_scenario(scenario, tmp_path / "s.toml")
-    again = load_scenario(tmp_path / "s.toml")
-    assert jax.tree.structure(again) == jax.tree.structure(scenario)
-    jax.tree.map(np.testing.assert_array_equal, again, scenario)
     assert "offset = [-1.6, -1.4]  # rad/s" in scenario_to_toml(scenario)
     assert "[[bounds]]" in scenario_to_toml(scenario)
     assert "[[bounds]]" not in scenario_to_toml(paper(None))
@@ -141,6 +100,7 @@ def test_files_hold_them_and_say_their_unit(tmp_path):
     assert ij.simulation.paths.unit_at(scenario, "bounds[1].upper.amplitude[0]") == "rad/s"
 
 
+@pytest.mark.slow
 def test_a_dataset_has_them(watched):
     data = watched.to_xarray()
     assert data.dq_lower.units == "rad/s"
@@ -151,52 +111,34 @@ def test_a_dataset_has_them(watched):
 def test_requirements_on_velocities():
     scenario = paper(speeds((-0.6, -0.6)))
     objective = ij.objectives.tracking() + ij.objectives.velocity_margin_above(0.02)
-    result = ij.tune(
-        scenario,
-        ["controller.k1"],
-        objective,
-        duration=0.3,
-        dt=1e-3,
-        effort=ij.tuning.Effort(iterations=12),
-        progress=False,
-    )
+    short = {"duration": 0.3, "dt": 1e-3, "progress": False}
+    effort = ij.tuning.Effort(iterations=12)
+    result = ij.tune(scenario, ["controller.k1"], objective, effort=effort, **short)
     line = result.report.verdicts[0]
     assert (line.name, line.unit, line.verdict) == ("velocity margin > 0.02 rad/s", "rad/s", "pass")
     run = result.nominal[1]
     assert float(np.min(run.metrics.velocity_margin)) == pytest.approx(line.value)
     assert float(np.min(result.nominal[0].metrics.velocity_margin)) < 0.02
     with pytest.raises(ValueError, match="bounds of the second level"):
-        ij.tune(
-            paper(None),
-            ["controller.k1"],
-            objective,
-            duration=0.3,
-            dt=1e-3,
-            progress=False,
-        )
+        ij.tune(paper(None), ["controller.k1"], objective, **short)
 
 
+@pytest.mark.slow
 def test_figures(watched, violated):
     figure = plotting.velocities({"wide": watched, "narrow": violated})
     assert len(figure.axes) == 4
-    drawn = [
-        line.get_ydata() for line in figure.axes[0].get_lines() if line.get_label() == "bounds"
-    ]
-    np.testing.assert_allclose(drawn[0][0], watched.dq_lower[0, 0])
-    box = next(
-        line
-        for line in plotting.velocity_portrait(watched, 1).axes[0].get_lines()
-        if line.get_label() == "bounds"
-    )
+
+    def drawn(figure):
+        lines = figure.axes[0].get_lines()
+        return next(line for line in lines if line.get_label() == "bounds")
+
+    np.testing.assert_allclose(drawn(figure).get_ydata()[0], watched.dq_lower[0, 0])
+    box = drawn(plotting.velocity_portrait(watched, 1))
     np.testing.assert_allclose(box.get_ydata(), [-1.4, -1.4, 0.5, 0.5, -1.4])
     np.testing.assert_allclose(box.get_xdata()[:2], [watched.lower[0, 1], watched.upper[0, 1]])
     free = ij.simulate(paper(None), **SHORT)
-    assert "bounds" not in [
-        line.get_label() for line in plotting.velocities(free).axes[0].get_lines()
-    ]
-    assert (
-        len(plotting.velocity_portrait(free).axes[0].get_lines()) == 7
-    )  # position bounds at the start and all they reach, reference, run, start
+    labels = [line.get_label() for line in plotting.velocities(free).axes[0].get_lines()]
+    assert "bounds" not in labels
     assert len(watched.plot().axes) == len(free.plot().axes) + 2
 
 
@@ -204,10 +146,7 @@ def test_figures(watched, violated):
     ("parts", "words"),
     [
         ({"velocities": 3.0}, r"bounds\[1\]: got 3\.0?, .*a Bounds, or None"),
-        (
-            {"velocities": speeds((-1.6, -1.4), (-1.7, 0.5), (0.0, 0.0))},
-            r"bounds\[1\] of joint 0",
-        ),
+        ({"velocities": speeds((-1.6, -1.4), (-1.7, 0.5), (0.0, 0.0))}, r"bounds\[1\] of joint 0"),
         ({"initial": ij.Initial([0.8, 0.8], [0.0, 0.6])}, r"initial\.dq\[1\]"),
         (
             {"velocities": speeds((-1.6, -1.4, 0.0), (0.6, 0.5, 0.0), (0.1, 0.0, 0.0))},
@@ -232,9 +171,7 @@ def test_limits_of_a_robot():
     np.testing.assert_allclose(found.lower.value, -np.asarray(found.upper.value))
     with pytest.raises(ValueError, match="speed limits"):
         bounds.from_speed_limits(ij.presets.customary_two_link())
+    zero, inertia = [[0, 0, 0]], [[1, 1, 1, 0, 0, 0]]
+    fast = ij.robots.Arm(mass=[1.0], centre=zero, inertia=inertia, position=zero)
     with pytest.raises(ValueError, match="unlimited"):
-        bounds.from_speed_limits(
-            ij.robots.Arm(
-                mass=[1.0], centre=[[0, 0, 0]], inertia=[[1, 1, 1, 0, 0, 0]], position=[[0, 0, 0]]
-            )
-        )
+        bounds.from_speed_limits(fast)

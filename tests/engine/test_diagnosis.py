@@ -12,6 +12,7 @@ from iblf_jax.engine import diagnosis
 from iblf_jax.engine.diagnosis import SimulationWarning
 
 TransformedError, Quadratic = ij.barriers.TransformedError, ij.barriers.Quadratic
+WIDE = symmetric(999.0)
 
 
 def law(*barriers):
@@ -29,7 +30,7 @@ def message_of(scenario, duration=0.5, dt=1e-3) -> str:
 @pytest.mark.slow
 def test_a_violated_level_is_named_with_time_margin_unit_and_remedy():
     plain = law(TransformedError(), Quadratic(), Quadratic())
-    text = message_of(pendulum(controller=plain, bounds=(ANGLES, None, symmetric(2.0))))
+    text = message_of(pendulum(controller=plain, bounds=(ANGLES, WIDE, symmetric(2.0))))
     assert "Level 3 (current) of pendulum left its bounds first, at t = 0.0" in text
     assert " A. The law has barriers.Quadratic() on that level" in text
     assert "give it barriers.TransformedError() there" in text
@@ -38,7 +39,7 @@ def test_a_violated_level_is_named_with_time_margin_unit_and_remedy():
 @pytest.mark.slow
 def test_a_violated_second_level_has_the_unit_of_the_level():
     plain = law(TransformedError(), Quadratic(), Quadratic())
-    text = message_of(pendulum(controller=plain, bounds=(ANGLES, symmetric(0.1))))
+    text = message_of(pendulum(controller=plain, bounds=(ANGLES, symmetric(0.1), WIDE)))
     assert "a bound of the second level was violated" in text
     assert "Level 2 (speed) of pendulum left its bounds first" in text
     assert "rad/s. The law has barriers.Quadratic()" in text

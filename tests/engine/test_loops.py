@@ -16,7 +16,7 @@ import pytest
 import iblf_jax as ij
 from iblf_jax.core import programs
 from iblf_jax.core.status import Status
-from iblf_jax.engine import compile, native, plan, registry, thresholds
+from iblf_jax.engine import native, plan, registry, thresholds
 from iblf_jax.engine.batch import Batch, run_all
 from iblf_jax.engine.carry import Inputs
 from iblf_jax.engine.loops import checkpointed, kernel_stepper, scan
@@ -67,7 +67,7 @@ def assert_same(one, other):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "run",
-    [RunRequest(50, "heun", 7), RunRequest(50, "euler", 1), RunRequest(50, "euler")],
+    [RunRequest(50, "heun", 7), RunRequest(50, "euler")],
     ids=lambda run: f"{run.method}-{run.record_every}",
 )
 def test_every_loop_makes_the_same_run(short_loop, run):
@@ -75,14 +75,8 @@ def test_every_loop_makes_the_same_run(short_loop, run):
     inputs = inputs_of(ij.with_parameters(short_loop, {"initial.dq": [0.3, -0.2]}))
     alone = outcome(inputs, run)
     together = outcome(inputs, run, varied=DRAWS)
-    first = outcome(
-        inputs._replace(
-            scenario=ij.with_parameters(
-                inputs.scenario, {"controller.Kp": DRAWS["controller.Kp"][0]}
-            )
-        ),
-        run,
-    )
+    first = {path: x[0] for path, x in DRAWS.items()}
+    first = outcome(inputs._replace(scenario=ij.with_parameters(inputs.scenario, first)), run)
     assert_same(jax.tree.map(lambda x: x[0], together), first)
     assert_same(outcome(inputs, run, DRAWS, ROLLED), together)
     assert_same(outcome(inputs, run, loop=ROLLED), alone)
@@ -95,14 +89,8 @@ def test_any_explicit_method_is_a_row_of_the_table(short_loop, monkeypatch):
     """Kutta's 3/8 rule, whose last stages look back at all slopes before them: written out, as a
     loop, and as a scalar program."""
     rows = ((), (1 / 3,), (-1 / 3, 1.0), (1.0, -1.0, 1.0))
-    kutta = Tableau(
-        (0.0, 1 / 3, 2 / 3, 1.0),
-        rows,
-        (1 / 8, 3 / 8, 3 / 8, 1 / 8),
-        4,
-        2.785,
-        (1.0, -3.0, 3.0, -1.0),
-    )
+    instants, weights = (0.0, 1 / 3, 2 / 3, 1.0), (1 / 8, 3 / 8, 3 / 8, 1 / 8)
+    kutta = Tableau(instants, rows, weights, 4, 2.785, (1.0, -3.0, 3.0, -1.0))
     monkeypatch.setitem(TABLEAUS, "kutta", kutta)
     inputs, run = inputs_of(short_loop), RunRequest(50, "kutta", 10)
     written_out = outcome(inputs, run)
@@ -111,13 +99,9 @@ def test_any_explicit_method_is_a_row_of_the_table(short_loop, monkeypatch):
         start = {"initial.q": inputs.scenario.initial.q[None]}
         lowered = outcome(inputs, run, varied=start, loop=kernel_stepper(registry.NATIVE))
         assert_same(jax.tree.map(lambda x: x[0], lowered), written_out)
-    off = np.max(
-        np.abs(
-            written_out.records.signals["x"][:, 0]
-            - outcome(inputs, RunRequest(50, "rk4", 10)).records.signals["x"][:, 0]
-        )
-    )
-    assert 0 < off < 1e-6
+    other = outcome(inputs, RunRequest(50, "rk4", 10))
+    q, other_q = (x.records.signals["x"][:, 0] for x in (written_out, other))
+    assert 0 < np.max(np.abs(q - other_q)) < 1e-6
 
 
 @pytest.mark.slow
@@ -132,10 +116,9 @@ def test_a_state_frozen_at_the_last_step_is_no_flag(paper):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("throw", [False, True])
-def test_a_failed_run_is_not_reported_inside_a_transformation(short_loop, throw):
+def test_a_failed_run_is_not_reported_inside_a_transformation(short_loop):
     """Its status is a number under `jacfwd`, and its metrics are traced."""
-    failing = {"duration": 0.02, "dt": 1e-3, "method": "euler", "throw": throw, "backend": "vmap"}
+    failing = {"duration": 0.02, "dt": 1e-3, "method": "euler", "throw": True, "backend": "vmap"}
     fast = ij.with_parameters(short_loop, {"initial.dq": [30.0, 0.0]})
 
     def margin(Kp):
@@ -148,39 +131,7 @@ def test_a_failed_run_is_not_reported_inside_a_transformation(short_loop, throw)
         slope = jax.jacfwd(margin)(jnp.asarray([60.0, 60.0]))
     assert np.all(np.isfinite(slope)) and slope.shape == (2, 2)
     with pytest.raises(ij.SimulationError, match="left its bounds"):
-        ij.simulate(fast, **{**failing, "throw": True})
-
-
-@pytest.mark.slow
-def test_the_stages_of_a_long_loop_are_rolled(paper, monkeypatch):
-    """By its length alone; a batch from outside and derivatives work as ever."""
-    before = ij.simulate(paper, duration=0.011, dt=1e-3, backend="vmap")
-    monkeypatch.setattr(thresholds, "LONG_EVALUATION", 0)
-    compile.plan_of_single_run.cache_clear()
-    try:
-
-        def ise(K2):
-            return ij.simulate(
-                ij.with_parameters(paper, {"controller.K2": K2}),
-                duration=0.011,
-                dt=1e-3,
-                backend="vmap",
-            ).metrics.ise.sum()
-
-        compact = ij.simulate(paper, duration=0.011, dt=1e-3, backend="vmap")
-        K2 = jnp.array([20.0, 30.0])
-        slope = jax.grad(ise)(K2)
-        values = jax.vmap(ise)(K2[:, None] * jnp.ones(2))
-    finally:
-        compile.plan_of_single_run.cache_clear()
-    np.testing.assert_allclose(before.q, compact.q, rtol=0, atol=1e-12)
-    step = 1e-3
-    for i in range(2):
-        move = step * np.eye(2)[i]
-        assert float(slope[i]) == pytest.approx(
-            float(ise(K2 + move) - ise(K2 - move)) / (2 * step), rel=1e-5
-        )
-    assert float(values[0]) == pytest.approx(float(before.metrics.ise.sum()), rel=1e-9)
+        ij.simulate(fast, **failing)
 
 
 @pytest.mark.parametrize("steps", [1, 2, 7, 100, 501, 4001, 20_001])
@@ -242,7 +193,7 @@ before = programs.count_maps()
 low = programs.ProgramBound(before + 4 * ROOM, before + ROOM)
 jax.monitoring.register_event_duration_secs_listener(low)
 most = 0
-for joints in range(3, STRUCTURES):
+for joints in range(3, 9):
     value = mean(joints)
     most = max(most, programs.count_maps())
 print(before, most, low.released, float(value))
@@ -251,13 +202,11 @@ print(before, most, low.released, float(value))
 
 @pytest.mark.slow
 @pytest.mark.skipif(programs.most_maps() is None, reason="this system has no limit of memory maps")
-@pytest.mark.parametrize(
-    ("structures", "room"), [(9, 20), pytest.param(52, 100, marks=pytest.mark.slow)]
-)
-def test_programs_are_released_before_the_memory_maps_run_out(structures, room):
+def test_programs_are_released_before_the_memory_maps_run_out():
     """Each compiled program takes some, and Linux gives a process 65,530: a process with a few
     dozen arms ended in a segmentation fault."""
-    code = MANY_STRUCTURES.replace("STRUCTURES", str(structures)).replace("ROOM", str(room))
+    room = 20
+    code = MANY_STRUCTURES.replace("ROOM", str(room))
     found = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=200
     ).stdout

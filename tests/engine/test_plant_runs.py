@@ -19,9 +19,8 @@ CASES = loops_of_plants.CASES
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", ["user class", "electric drive"])
-def test_names_and_a_solution_of_scipy(case):
-    scenario = CASES[case]()
+def test_names_and_a_solution_of_scipy():
+    scenario = CASES["electric drive"]()
     field = ij.vector_field(scenario)
     assert "x[2, 0]" in field.names
     found = solve_ivp(
@@ -34,16 +33,12 @@ def test_names_and_a_solution_of_scipy(case):
 
 LEAVES = {
     "user class": ("plant.D", "model.N", "controller.k[2]", "initial.higher"),
-    "electric drive": ("plant.inductance", "plant.robot.mass[1]", "bounds[2].upper.value"),
     "flexible joint": ("plant.stiffness", "model.motor_inertia", "initial.q"),
 }
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "case",
-    [x if x == "user class" else pytest.param(x, marks=pytest.mark.slow) for x in LEAVES],
-)
+@pytest.mark.parametrize("case", LEAVES)
 def test_derivatives_by_leaves_are_differences(case):
     scenario = CASES[case]()
     for path in LEAVES[case]:
@@ -72,23 +67,8 @@ def test_float32_follows_float64():
 
 
 @pytest.mark.slow
-def test_a_batch_is_its_runs():
-    scenario = CASES["user class"]()
-    starts = jnp.asarray([[[0.2], [0.0], [0.0]], [[0.1], [0.1], [-0.2]]])
-
-    def run(x):
-        return ij.simulate(ij.with_parts(scenario, initial=ij.Initial(x=x)), **SHORT).x
-
-    batch = jax.vmap(run)(starts)
-    np.testing.assert_allclose(batch[1], run(starts[1]), atol=1e-12)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "case", ["user class", pytest.param("flexible joint", marks=pytest.mark.slow)]
-)
-def test_a_step_and_a_period_are_found(case):
-    scenario = CASES[case]()
+def test_a_step_and_a_period_are_found():
+    scenario = CASES["flexible joint"]()
     dt = ij.recommended_dt(scenario, duration=2.0)
     run = ij.simulate(scenario, duration=2.0, dt=dt)
     assert int(run.status) == 0

@@ -60,11 +60,10 @@ def added(monkeypatch):
 
 @pytest.mark.slow
 @needs_compiler
-@pytest.mark.parametrize("backend", ["mine", "auto"])
-def test_an_added_executor_runs_a_single_run(scenario, added, backend):
+def test_an_added_executor_runs_a_single_run(scenario, added):
     expected = ij.simulate(scenario, **SHORT, backend="vmap")
     assert added == []
-    found = ij.simulate(scenario, **SHORT, backend=backend)
+    found = ij.simulate(scenario, **SHORT)
     np.testing.assert_allclose(found.q, expected.q, rtol=1e-12)
     assert added == ["run"] * 3, "the start, the steps, the end"
 

@@ -16,7 +16,6 @@ from conftest import SHORT
 from independent import Loop
 
 import iblf_jax as ij
-from iblf_jax.control.actuators._base import Delivered
 from iblf_jax.core import linalg
 from iblf_jax.core.status import Status
 from iblf_jax.engine import RunRequest, run_batch, run_batch_jvp, run_batch_vjp, step_size
@@ -68,12 +67,9 @@ def positions(scenario, varied, dt, steps, method):
     )
     found = run({path: jnp.asarray(x) for path, x in varied.items()}, jnp.asarray(dt))
     arrays = found.records.signals
-    return (
-        np.asarray(arrays["x"][..., 0, :]),
-        np.asarray(arrays["level_upper"] - arrays["level_lower"])[..., 0, :],
-        np.asarray(found.metrics[RELATIVE]),
-        np.asarray(found.status),
-    )
+    width = arrays["level_upper"] - arrays["level_lower"]
+    signals = (arrays["x"][..., 0, :], width[..., 0, :], found.metrics[RELATIVE], found.status)
+    return tuple(map(np.asarray, signals))
 
 
 @pytest.mark.slow
@@ -96,11 +92,9 @@ def test_the_estimate_is_about_the_error(shaken, rng, method):
         fine_run = (error < TOLERANCE / 50) & sound
         big = (error > 1e-3) & (error < 0.1) & sound
         assert np.all(estimate[big] > 0.3 * error[big])
-        flagged, good, alarms = (
-            flagged + np.sum(error > TOLERANCE),
-            good + np.sum(fine_run),
-            alarms + np.sum(fine_run & found),
-        )
+        flagged += np.sum(error > TOLERANCE)
+        good += np.sum(fine_run)
+        alarms += np.sum(fine_run & found)
     assert flagged > 0
     assert good > 0 or method == "euler"
     assert alarms <= {"rk4": 0.1, "heun": 0.4, "euler": 1.0}[method] * good
@@ -114,15 +108,12 @@ def test_a_good_run_says_how_good(short_run):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("frequency", [6283.0, 4e3 * np.pi])
-def test_a_signal_that_the_stages_cannot_see_is_flagged_with_a_step_that_will_do(shaken, frequency):
+def test_a_signal_that_the_stages_cannot_see_is_flagged_with_a_step_that_will_do(shaken):
     """4000 pi rad/s goes through whole periods between the stages of a step of 1 ms: every stage
     sees one and the same torque."""
-    scenario = ij.with_parameters(shaken, {"disturbance.frequency": frequency})
-    with pytest.warns(
-        ij.SimulationWarning,
-        match=r"error is estimated at .* rad, .* % of the tube.* Take dt=0\.000[25]",
-    ):
+    scenario = ij.with_parameters(shaken, {"disturbance.frequency": 4e3 * np.pi})
+    words = r"error is estimated at .* rad, .* % of the tube.* Take dt=0\.000[25]"
+    with pytest.warns(ij.SimulationWarning, match=words):
         run = ij.simulate(scenario, **SHORT)
     assert int(run.status) == Status.INACCURATE
     dt = ij.recommended_dt(scenario, duration=SHORT["duration"])
@@ -148,9 +139,8 @@ def test_the_guard_beyond_the_first_instant_is_told(paper):
     near = ij.with_parameters(
         dataclasses.replace(paper, controller=wide), {"initial.q": [1.03, 0.8]}
     )
-    with pytest.warns(
-        ij.SimulationWarning, match=r"guard stayed active.*another law.*smaller guard"
-    ):
+    words = r"guard stayed active.*another law.*smaller guard"
+    with pytest.warns(ij.SimulationWarning, match=words):
         run = ij.simulate(near, **SHORT)
     assert int(run.status) & Status.GUARD_STAYED
 
@@ -168,22 +158,6 @@ def test_the_recommended_step_is_one_that_the_run_itself_is_content_with(paper):
     assert not int(run.status) & (Status.INACCURATE | Status.STEP_TOO_LARGE)
 
 
-@pytest.mark.slow
-def test_the_two_runs_side_by_side(shaken):
-    """The difference that decides is that between the run and one at a sixteenth of the step, but
-    for what the third leaves."""
-    scenario = canonical(shaken)
-    pair = step_size.side_by_side(scenario, 1e-3, 500, method="rk4")
-    fine = ij.simulate(scenario, duration=0.5, dt=5e-5, record_every=20)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        run = ij.simulate(scenario, **SHORT)
-    error = np.max(np.abs(run.q - fine.q) / (run.upper - run.lower))
-    assert float(pair.difference) == pytest.approx(error, rel=0.5)
-    assert float(pair.accuracy.relative) == pytest.approx(float(run.metrics[RELATIVE]), rel=0.05)
-    np.testing.assert_allclose(pair.coarse[:2], run.q[-1], atol=1e-9)
-
-
 def test_no_step_will_do(shaken, monkeypatch):
     """A torque that no affordable step resolves: the advice of the loop's modes, and a warning."""
     monkeypatch.setattr(step_size, "MAX_TRIED", 20_000)
@@ -195,13 +169,10 @@ def test_no_step_will_do(shaken, monkeypatch):
 @pytest.mark.slow
 def test_a_study_names_the_step_that_its_runs_need(paper):
     perturbations = {"controller.K2": ij.factor(ij.uniform(0.5, 6.0))}
-    with pytest.warns(
-        UserWarning,
-        match=(
-            r"dt = 0\.001 s is too large for \d+ of 256 runs.* Take dt=0\.000[12];"
-            r" ij\.recommended_dt"
-        ),
-    ):
+    words = (
+        r"dt = 0\.001 s is too large for \d+ of 256 runs.* Take dt=0\.000[12]; ij\.recommended_dt"
+    )
+    with pytest.warns(UserWarning, match=words):
         ij.monte_carlo(paper, perturbations, runs=256, duration=0.1)
     dt = ij.recommended_dt(paper, duration=0.1, perturbations=perturbations)
     assert dt in (1e-4, 2e-4)
@@ -261,13 +232,8 @@ def test_folds_may_not_take_its_names(paper):
 
 
 def test_round_steps():
-    assert [step_size.round_down(x) for x in (1e-3, 9.99e-4, 2.1e-3, 0.05, 1.7)] == [
-        1e-3,
-        5e-4,
-        2e-3,
-        0.05,
-        1.0,
-    ]
+    rounded = [step_size.round_down(x) for x in (1e-3, 9.99e-4, 2.1e-3, 0.05, 1.7)]
+    assert rounded == [1e-3, 5e-4, 2e-3, 0.05, 1.0]
     assert step_size.smaller(1e-3, 1.1, 4) == 5e-4
     assert step_size.smaller(1e-3, np.inf, 4) == 1e-4
 
@@ -279,33 +245,6 @@ def test_solve(rng, size):
     np.testing.assert_allclose(
         linalg.solve(jnp.asarray(matrix), jnp.asarray(rhs)), np.linalg.solve(matrix, rhs), rtol=1e-9
     )
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("method", ["rk4", "heun"])
-@pytest.mark.parametrize(
-    "actuator", [ij.actuators.Ideal(), ij.actuators.Motor(bandwidth=600.0)], ids=["ideal", "lag"]
-)
-def test_a_sampled_run_says_how_accurate_it_is(method, actuator):
-    """The torque jumps from step to step: the stages of each step tell its error, which is never
-    told too small."""
-    scenario = ij.with_parameters(
-        ij.presets.zhang_yan_2024(variant="corrected"), {"controller.K2": 4.0, "observer.kf": 5.0}
-    )
-    scenario = ij.with_parts(
-        scenario, sampling=ij.Sampling(period=4e-3, delay=1.3e-3), actuator=actuator
-    )
-    for dt in (2e-3, 1e-3):
-        run, fine = (
-            ij.simulate(
-                scenario, duration=0.5, dt=step, method=method, record_every=round(4e-3 / step)
-            )
-            for step in (dt, dt / 8)
-        )
-        error = np.max(np.abs(run.q - fine.q) / (run.upper - run.lower))
-        told = float(run.metrics.relative_numerical_error)
-        assert told > error
-        assert told < 200 * error or told < 1e-6
 
 
 @ij.component
@@ -348,15 +287,6 @@ def test_an_infinite_slope_at_one_instant_is_no_fast_mode(paper):
     assert int(run.status) & ij.Status.INFINITE_SLOPE
 
 
-def test_a_slope_beside_an_infinite_one_is_no_fast_mode(paper):
-    """Here e2 is 1e-4 at the instant that is looked at: differences of 6e-6 and 6e-5 both give the
-    local slope."""
-    law = PowerOfE2(K2=5.0, c=1.5, a=0.5)
-    scenario = ij.with_parts(paper, controller=law, observer=ij.observers.NoObserver())
-    run = ij.simulate(scenario, duration=0.3, dt=1e-3, record_every=300)
-    assert run.ok
-
-
 # ---------------------------------------------------------------------- what jumps within a step
 
 SLOW = ij.with_parameters(ij.presets.zhang_yan_2024(), {"controller.K2": 4.0, "observer.kf": 4.0})
@@ -378,15 +308,8 @@ def with_steps(scenario, steps):
 
 def split(steps, **fields):
     """The end of the loop `SLOW` under steps, by a program that shares nothing with the package."""
-    loop = Loop(
-        K2=np.full(2, 4.0),
-        kf=np.full(2, 4.0),
-        force_a=(0.0, 0.0, 1.0, 0.0),
-        force_b=(0.0, 0.0, 1.0, 0.0),
-        steps=steps,
-        **fields,
-    )
-    return loop.end(0.4)
+    four, still = np.full(2, 4.0), (0.0, 0.0, 1.0, 0.0)
+    return Loop(K2=four, kf=four, force_a=still, force_b=still, steps=steps, **fields).end(0.4)
 
 
 @pytest.mark.slow
@@ -400,15 +323,6 @@ def test_a_step_is_divided_where_a_disturbance_jumps():
         assert np.all(error < most), (dt, error)
         assert np.all(run.metrics.numerical_error > 0.3 * error)
         assert run.ok
-
-
-@pytest.mark.slow
-def test_many_jumps_at_all_places_of_a_step():
-    truth, scenario = split(MANY), with_steps(SLOW, MANY)
-    runs = {dt: ij.simulate(scenario, duration=0.4, dt=dt) for dt in (8e-3, 4e-3, 2e-3)}
-    np.testing.assert_allclose(np.append(runs[4e-3].q[-1], runs[4e-3].dq[-1]), truth[:4], atol=2e-6)
-    errors = [np.max(np.abs(runs[dt].q[-1] - truth[:2])) for dt in (8e-3, 2e-3)]
-    assert np.log2(errors[0] / errors[1]) / 2 > 3.5, errors
 
 
 @pytest.mark.slow
@@ -429,12 +343,11 @@ def test_more_jumps_than_a_step_is_divided_at_are_flagged():
         warnings.simplefilter("ignore")
         run = ij.simulate(with_steps(SLOW, steps), duration=0.3, dt=1e-2)
     assert int(run.status) & Status.INACCURATE
-    assert (
-        not int(ij.simulate(with_steps(SLOW, steps), duration=0.3, dt=2e-3).status)
-        & Status.INACCURATE
-    )
+    fine = ij.simulate(with_steps(SLOW, steps), duration=0.3, dt=2e-3)
+    assert not int(fine.status) & Status.INACCURATE
 
 
+@pytest.mark.slow
 def test_jumps_at_one_time_are_one_cut():
     """Six parts that jump together divide a step once, so it is not one with more jumps than it is
     divided at."""
@@ -453,17 +366,14 @@ def test_a_recommended_step_is_divided_at_every_jump():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "time", [LATE, pytest.param(0.2, marks=pytest.mark.slow)], ids=["within a step", "at its end"]
-)
+@pytest.mark.parametrize("time", [LATE, 0.2], ids=["within a step", "at its end"])
 def test_derivatives_by_a_jump_time_are_those_of_the_split_flow(time):
     """By time and size, against differences of the independent program."""
     scenario = with_steps(SLOW, ((time, (20.0, 5.0)),))
 
     def end(values):
-        return ij.simulate(
-            ij.with_parameters(scenario, values), duration=0.4, dt=4e-3, record_every=100
-        ).q[-1]
+        changed = ij.with_parameters(scenario, values)
+        return ij.simulate(changed, duration=0.4, dt=4e-3, record_every=100).q[-1]
 
     here = {
         "disturbance.parts[0].time": jnp.asarray(time),
@@ -473,38 +383,24 @@ def test_derivatives_by_a_jump_time_are_those_of_the_split_flow(time):
     by_time = (split(((time + 1e-5, (20.0, 5.0)),)) - split(((time - 1e-5, (20.0, 5.0)),))) / 2e-5
     by_size = (split(((time, (20.01, 5.0)),)) - split(((time, (19.99, 5.0)),))) / 0.02
     np.testing.assert_allclose(slopes["disturbance.parts[0].time"], by_time[:2], rtol=1e-5)
-    np.testing.assert_allclose(
-        slopes["disturbance.parts[0].size"][:, 0], by_size[:2], rtol=1e-5, atol=1e-7
-    )
+    found = slopes["disturbance.parts[0].size"][:, 0]
+    np.testing.assert_allclose(found, by_size[:2], rtol=1e-5, atol=1e-7)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "sampling",
-    [
-        pytest.param(None, marks=pytest.mark.release),
-        ij.Sampling(period=1e-2, delay=0.0033),
-    ],
-    ids=["continuous", "sampled"],
-)
-def test_tangents_beside_a_batch_and_reverse_mode_go_through_a_jump(sampling):
+def test_tangents_beside_a_batch_and_reverse_mode_go_through_a_jump():
     """What `tune` and `sensitivity` use: losses and their derivatives by jump time and gain,
     against differences."""
-    scenario = canonical(with_steps(dataclasses.replace(SLOW, sampling=sampling), MANY[2:3]))
+    sampled = dataclasses.replace(SLOW, sampling=ij.Sampling(period=1e-2, delay=0.0033))
+    scenario = canonical(with_steps(sampled, MANY[2:3]))
     objective = ij.objectives.tracking() + ij.objectives.effort() + ij.objectives.torque_rate()
-    folds, dt, run, path = (
-        (Quantities(objective.quantities),),
-        jnp.asarray(1e-2),
-        RunRequest(30),
-        "disturbance.parts[0].time",
-    )
+    folds, dt = (Quantities(objective.quantities),), jnp.asarray(1e-2)
+    run, path = RunRequest(30), "disturbance.parts[0].time"
     directions = {path: np.array([1.0, 0.0]), "controller.K2": np.array([[0.0, 0.0], [1.0, 0.0]])}
-    found = jax.jit(lambda v: run_batch_jvp(scenario, {path: v}, directions, folds, dt, run))(
-        jnp.array([LATE, 0.05])
-    )
-    ends = jax.jit(
-        lambda v: run_batch(scenario, {path: v}, folds, dt, run).metrics["tuning_exact"]
-    )(jnp.array([LATE - 1e-6, LATE + 1e-6]))
+    tangents = jax.jit(lambda v: run_batch_jvp(scenario, {path: v}, directions, folds, dt, run))
+    found = tangents(jnp.array([LATE, 0.05]))
+    values = jax.jit(lambda v: run_batch(scenario, {path: v}, folds, dt, run).metrics)
+    ends = values(jnp.array([LATE - 1e-6, LATE + 1e-6]))["tuning_exact"]
     expected = np.asarray(ends[1] - ends[0]) / 2e-6
     np.testing.assert_allclose(found.tangents["tuning_exact"][0, 0], expected, rtol=1e-5)
 
@@ -522,36 +418,24 @@ def test_tangents_beside_a_batch_and_reverse_mode_go_through_a_jump(sampling):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "backend",
-    [
-        "native",
-        pytest.param("vmap", marks=pytest.mark.slow),
-    ],
-)
-def test_every_run_of_a_batch_has_its_own_jumps(backend):
+def test_every_run_of_a_batch_has_its_own_jumps():
     """Also under a sampled law whose command arrives within a step; one run jumps at a sample, one
     after the end."""
-    scenario = canonical(
-        with_steps(
-            dataclasses.replace(SLOW, sampling=ij.Sampling(period=1e-2, delay=0.0037)), MANY[2:3]
-        )
-    )
+    sampled = dataclasses.replace(SLOW, sampling=ij.Sampling(period=1e-2, delay=0.0037))
+    scenario = canonical(with_steps(sampled, MANY[2:3]))
     folds, times = as_folds(None, jnp.float64), np.array([LATE, 0.1, 0.0537, 0.9])
     varied = {"disturbance.parts[0].time": jnp.asarray(times)}
-    request = RunRequest(30, backend=backend)
+    request = RunRequest(30, backend="native")
     run = jax.jit(lambda v: run_batch(scenario, v, folds, jnp.asarray(1e-2), request))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # no compiler
         together = run(varied)
     for i, time in enumerate(times):
-        one = ij.simulate(
-            ij.with_parameters(scenario, {"disturbance.parts[0].time": time}), duration=0.3, dt=1e-2
-        )
+        moved = ij.with_parameters(scenario, {"disturbance.parts[0].time": time})
+        one = ij.simulate(moved, duration=0.3, dt=1e-2)
         for name in ("rmse", "effort", "peak_torque", "torque_variation", "numerical_error"):
-            np.testing.assert_allclose(
-                together.metrics[name][i], one.metrics[name], rtol=1e-9, atol=1e-14, err_msg=name
-            )
+            found, alone = together.metrics[name][i], one.metrics[name]
+            np.testing.assert_allclose(found, alone, rtol=1e-9, atol=1e-14, err_msg=name)
 
 
 @ij.component
@@ -569,72 +453,24 @@ class Switched:
         return self.time
 
 
-@ij.component
-class Failing:
-    """A drive that gives a share of its torque from a time on."""
-
-    share: jax.Array = ij.leaf("1", shape="scalar")
-    time: jax.Array = ij.leaf("s", shape="scalar")
-    lost: jax.Array = ij.leaf("1", shape="scalar", default=0.0)
-
-    def at(self, t):
-        return dataclasses.replace(self, lost=jnp.where(t >= self.time, 1.0 - self.share, 0.0))
-
-    def jump_times(self):
-        return self.time
-
-    def init(self, tau):
-        return ()
-
-    def deliver(self, asked, dq, state):
-        return Delivered((1.0 - self.lost) * asked, jnp.zeros(asked.shape, bool), ())
-
-
-@ij.component
-@ij.robots.from_energy
-class Loaded:
-    """The two-link arm, whose tip takes up a load at a time."""
-
-    arm: ij.robots.TwoLink
-    load: jax.Array = ij.leaf("kg", shape="scalar")
-    time: jax.Array = ij.leaf("s", shape="scalar")
-
-    def at(self, t):
-        return dataclasses.replace(self.arm, payload=jnp.where(t >= self.time, self.load, 0.0))
-
-    def jump_times(self):
-        return self.time
-
-    n = property(lambda self: self.arm.n)
-
-    def mass_matrix(self, q):
-        return self.arm.mass_matrix(q)
-
-    def potential(self, q):
-        return self.arm.potential(q)
-
-    def tip(self, q):
-        return self.arm.tip(q)
-
-
 PARTS = {
     "reference": lambda: {
         "reference": Switched(before=[0.7, 0.7], after=[0.72, 0.69], time=0.0537)
     },
-    "actuator": lambda: {"actuator": Failing(share=0.8, time=0.0537)},
-    "chain": lambda: {
+    "actuator": lambda: {
         "actuator": ij.actuators.Chain(
-            (Failing(share=0.8, time=0.0537), ij.actuators.Motor(bandwidth=300.0))
+            (ij.actuators.Fault(0.8, time=0.0537), ij.actuators.Motor(bandwidth=300.0))
         )
     },
-    "plant": lambda: {"plant": Loaded(SLOW.plant, load=0.5, time=0.0537), "model": SLOW.plant},
+    "plant": lambda: {
+        "plant": ij.plants.Switched(SLOW.plant, {"payload": (0.0, 0.5)}, [0.0537]),
+        "model": SLOW.plant,
+    },
 }
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "part", [x if x == "actuator" else pytest.param(x, marks=pytest.mark.slow) for x in PARTS]
-)
+@pytest.mark.parametrize("part", PARTS)
 def test_every_part_may_jump(part):
     """What is switched at 0.0537 s costs no order: the errors at 4 and 1 ms are those of a smooth
     loop."""
@@ -651,19 +487,15 @@ def test_every_part_may_jump(part):
 
 def test_jump_times_that_are_none_are_refused():
     with pytest.raises(ValueError, match=r"reference.jump_times\(\).*expected times \[s\]"):
-        ij.simulate(
-            dataclasses.replace(SLOW, reference=NoTimes(SLOW.reference)), duration=0.01, dt=1e-3
-        )
+        ij.simulate(dataclasses.replace(SLOW, reference=NoTimes()), duration=0.01, dt=1e-3)
 
 
 @ij.component
 class NoTimes:
     """A reference that says nonsense about its jumps."""
 
-    inner: ij.references.Sinusoid
-
     def position(self, t):
-        return self.inner.position(t)
+        return SLOW.reference.position(t)
 
     def jump_times(self):
         return "never"

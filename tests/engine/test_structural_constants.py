@@ -91,6 +91,7 @@ def test_a_mechanism_of_right_angles_saves_a_fifth_of_the_operations_of_two_join
     assert moving(lowered(scenario)[2]) < 0.8 * moving(lowered(scenario, (), False)[2])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part", range(6))
 def test_every_number_of_an_arm_counts_once_it_is_changed(part):
     """Zeros, ones and equal numbers, each made a number of its own: the program is that of the new
@@ -105,9 +106,8 @@ def test_every_number_of_an_arm_counts_once_it_is_changed(part):
     np.testing.assert_allclose(by_program, expected, rtol=1e-10, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    "path", ["plant.axis", "model.rotation", "plant.g", "plant.position[0]", "model.tip_position"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("path", ["plant.axis", "model.rotation", "plant.position[0]"])
 def test_what_differs_between_runs_is_never_compiled_in(path):
     """The same program for other numbers: a run beside it may have anything there."""
     scenario = square_arm()
@@ -124,17 +124,16 @@ def test_what_differs_between_runs_is_never_compiled_in(path):
 
 
 @pytest.mark.parametrize(
-    "path",
+    ("path", "value"),
     [
-        "plant.mass",
-        "model.mass[0]",
-        "plant.payload",
-        "plant.carried.mass",
-        "controller.K2",
-        "model.armature",
+        ("plant.mass", 1e-6),
+        ("model.mass[0]", 1.0),
+        ("plant.payload", 0.7),
+        ("plant.carried.mass", 2.0),
+        ("controller.K2", 1.0),
+        ("model.armature", 1.0),
     ],
 )
-@pytest.mark.parametrize("value", [1e-6, 1.0, 2.0, 0.7])
 def test_new_masses_gains_and_loads_compile_nothing(path, value):
     scenario = square_arm()
     changed = with_parameters(scenario, {path: jnp.full_like(get(scenario, path), value)})
@@ -168,12 +167,8 @@ def test_a_robot_of_a_user_may_have_a_field_of_that_name():
 
     arm = square_arm().plant
     fields = {f.name: getattr(arm, f.name) for f in dataclasses.fields(arm)}
-    assert (
-        robot_constants(
-            dataclasses.replace(square_arm(), plant=Mine(**fields), model=Mine(**fields))
-        )
-        is None
-    )
+    mine = dataclasses.replace(square_arm(), plant=Mine(**fields), model=Mine(**fields))
+    assert robot_constants(mine) is None
 
 
 @pytest.mark.release
@@ -235,41 +230,30 @@ def metrics_of(scenario, *, run):
 
 def test_robots_without_a_geometry_and_tracers_have_none():
     assert robot_constants(canonical(PRESET)) is None
-    jax.jit(
-        lambda s: (
-            jnp.asarray([robot_constants(s) is None])
-            if robot_constants(s) is None
-            else pytest.fail("read a tracer")
-        )
-    )(square_arm())
+
+    @jax.jit
+    def read(scenario):
+        assert robot_constants(scenario) is None
+        return jnp.zeros(())
+
+    read(square_arm())
 
 
 @partial(jax.jit, static_argnames="run")
 def status_of(scenario, *, run):
-    return execute.run_batch(
-        scenario,
-        {"initial.q": scenario.initial.q[None]},
-        STANDARD,
-        jnp.asarray(DT),
-        run._replace(backend="native"),
-    ).status[0]
+    start, run = {"initial.q": scenario.initial.q[None]}, run._replace(backend="native")
+    return execute.run_batch(scenario, start, STANDARD, jnp.asarray(DT), run).status[0]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "path", ["initial.q", "initial.dq", "plant.mass", "plant.position", "model.g", "controller.K2"]
-)
+@pytest.mark.parametrize("path", ["initial.dq", "plant.position", "controller.K2"])
 def test_a_run_that_is_not_finite_is_seen_to_be_so(path):
     """A product with a zero of the mechanism is left out, whatever the other factor: no run may
     look sound by it."""
     scenario = square_arm()
     value = get(scenario, path)
     for number, expected in ((value, 0), (jnp.full_like(value, jnp.nan), int(Status.NOT_FINITE))):
-        changed = jax.jit(lambda s, x: with_parameters(s, {path: x}))(
-            scenario, number
-        )  # where nothing looks at the number
-        assert (
-            int(status_of(changed, run=RunRequest(5, "euler", constants=robot_constants(changed))))
-            & int(Status.NOT_FINITE)
-            == expected
-        )
+        # Compiled, so that nothing looks at the number.
+        changed = jax.jit(lambda s, x: with_parameters(s, {path: x}))(scenario, number)
+        run = RunRequest(5, "euler", constants=robot_constants(changed))
+        assert int(status_of(changed, run=run)) & int(Status.NOT_FINITE) == expected

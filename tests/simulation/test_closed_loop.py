@@ -79,31 +79,21 @@ def scenario_of(loop: independent.Loop) -> ij.Scenario:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("law", ["integral", "log"])
-@pytest.mark.parametrize("variant", ["printed", "corrected"])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    ("seed", "law", "variant"), [(0, "integral", "printed"), (1, "log", "corrected")]
+)
 def test_other_numbers_against_scipy(seed, law, variant):
     loop = random_loop(seed, law, variant)
     expected = loop.solve(TIMES, rtol=1e-9)
     run = ij.simulate(scenario_of(loop), **PAPER)
     assert run.ok
-    tolerances = {
-        "q": 1e-7,
-        "dq": 5e-5,
-        "e1": 1e-7,
-        "xi": 1e-6,
-        "alpha": 1e-6,
-        "e2": 5e-5,
-        "tau": 2e-3,
-        "V": 1e-5,
-    }
+    names = {"disturbance": "f", "disturbance_estimate": "f_hat"}
+    tolerances = {"q": 1e-7, "dq": 5e-5, "e1": 1e-7, "xi": 1e-6, "alpha": 1e-6, "e2": 5e-5}
+    tolerances |= {"tau": 2e-3, "V": 1e-5} | dict.fromkeys(names, 1e-4)
     for name, tolerance in tolerances.items():
-        error = np.max(np.abs(np.asarray(getattr(run, name))[: TIMES.size] - expected[name]))
+        found = np.asarray(getattr(run, name))[: TIMES.size]
+        error = np.max(np.abs(found - expected[names.get(name, name)]))
         assert error <= tolerance, (name, error)
-    for name, key in (("disturbance", "f"), ("disturbance_estimate", "f_hat")):
-        assert (
-            np.max(np.abs(np.asarray(getattr(run, name))[: TIMES.size] - expected[key])) <= 1e-4
-        ), name
 
 
 @pytest.mark.slow
@@ -130,40 +120,6 @@ def test_a_matched_start_of_the_observer():
         np.testing.assert_allclose(
             observer.estimate(0.0, q, dq, model, observer.init(q, dq, model)), expected, atol=1e-12
         )
-
-
-def test_alpha_rate_against_finite_differences(short_run):
-    """Solve (3.14) for alpha' from the recorded torque, and compare with differences of the
-    recorded alpha."""
-    scenario, run = short_run.scenario, short_run
-    import jax
-
-    model = scenario.model
-
-    def alpha_rate(q, dq, tau, f_hat, e2, slope):
-        rest = (
-            tau
-            + f_hat
-            + scenario.controller.K2 * e2
-            + slope
-            - model.coriolis(q, dq, dq)
-            - model.gravity(q)
-        )
-        return jax.numpy.linalg.solve(model.mass_matrix(q), rest)
-
-    k = np.where(
-        np.asarray(run.e1) > 0, np.asarray(run.upper - run.q_d), np.asarray(run.q_d - run.lower)
-    )
-    slope = 2 * np.asarray(run.e1) / (k**2 - np.asarray(run.e1) ** 2)
-    got = np.asarray(
-        jax.vmap(alpha_rate)(run.q, run.dq, run.tau, run.disturbance_estimate, run.e2, slope)
-    )
-    a, dt = np.asarray(run.alpha), float(run.dt)
-    difference = (a[:-4] - 8 * a[1:-3] + 8 * a[3:-1] - a[4:]) / (12 * dt)
-    after = slice(
-        100, -100
-    )  # the first 0.1 s hold modes of 1000 1/s, which differences at 1 ms do not resolve
-    np.testing.assert_allclose(got[2:-2][after], difference[after], atol=1e-6)
 
 
 def test_plant_error_is_the_uncertain_term(rng):

@@ -24,7 +24,6 @@ BASE = ij.with_parameters(
     ij.presets.zhang_yan_2024(variant="corrected"), {"controller.K2": 4.0, "observer.kf": 4.0}
 )
 DIFFERENCE = ij.sensors.FilteredDifference(cutoff=192.57)
-MOTOR = ij.actuators.Motor(bandwidth=150.0)
 
 
 def sampled(sensor=None, actuator=None, **timing):
@@ -44,21 +43,14 @@ def quantiser(step=1.5):
 LOOPS = {
     "ideal": lambda: sampled(),
     "difference": lambda: sampled(encoder()),
-    "noisy difference": lambda: sampled(encoder(noise=1e-3)),
     "tracking": lambda: sampled(encoder(ij.sensors.Tracking(bandwidth=150.0))),
-    "measured velocity": lambda: sampled(encoder(ij.sensors.Measured(noise=0.01))),
-    "levels": lambda: sampled(ij.sensors.Levels((encoder(),))),
     "two directs": lambda: sampled(
         ij.sensors.Levels((ij.sensors.Direct(resolution=1e-3), ij.sensors.Direct()))
     ),
     "quantiser": lambda: sampled(actuator=quantiser()),
     "quantiser and delay": lambda: sampled(actuator=quantiser(), delay=1.3e-3),
-    "quantiser before a motor": lambda: sampled(actuator=ij.actuators.Chain((quantiser(), MOTOR))),
-    "quantiser behind a motor": lambda: sampled(actuator=ij.actuators.Chain((MOTOR, quantiser()))),
     "both": lambda: sampled(encoder(), quantiser()),
     "limited motor": lambda: sampled(actuator=ij.actuators.Motor(bandwidth=150.0, limit=25.0)),
-    "fault": lambda: sampled(actuator=ij.actuators.Fault(effectiveness=0.7, time=0.3)),
-    "dead zone": lambda: sampled(actuator=ij.actuators.DeadZone(lower=-3.0, upper=3.0)),
     "backlash": lambda: sampled(actuator=ij.actuators.Backlash(gap=0.5, bandwidth=150.0)),
     "trigger": lambda: sampled(trigger=ij.EventTrigger(relative=0.05, absolute=0.5)),
     "continuous quantiser": lambda: ij.with_parts(BASE, actuator=quantiser()),
@@ -70,8 +62,10 @@ LOOPS = {
     ),
 }
 RUNS = 5
-"""Random loops of each structure: 100 in all."""
-SMOOTH = ("ideal", "limited motor", "fault")
+"""Random loops of each structure: 55 in all."""
+PARTS_OF_OTHERS = {"quantiser", "continuous backlash"}
+"""Loops whose parts are all in others."""
+SMOOTH = ("ideal", "limited motor")
 
 
 def random_values(scenario, rng):
@@ -114,9 +108,9 @@ def is_flagged(found):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", LOOPS)
+@pytest.mark.parametrize("name", [x for x in LOOPS if x not in PARTS_OF_OTHERS])
 def test_the_stated_error_holds(name, rng):
-    """100 random loops with every sensor and actuator."""
+    """55 random loops with every kind of sensor and actuator."""
     loop, ratios = LOOPS[name](), []
     for _ in range(RUNS):
         scenario = ij.with_parameters(loop, random_values(loop, rng))
@@ -132,7 +126,7 @@ def test_the_stated_error_holds(name, rng):
 
 @pytest.mark.slow
 def test_a_fine_encoder_on_an_arm_of_six_joints_is_no_fault():
-    """At 500 Hz, where a code may differ: 131,072 counts are accurate, and 1,024 are so stated."""
+    """At 500 Hz, where a code may differ: 131,072 counts are accurate."""
     velocity = ij.sensors.FilteredDifference(cutoff=400.0)
     arm = ij.with_parts(
         ij.presets.ur5(),
@@ -142,11 +136,6 @@ def test_a_fine_encoder_on_an_arm_of_six_joints_is_no_fault():
     found, error = assess(arm, duration=6.0)
     assert found.ok
     assert error < float(found.metrics[RELATIVE]) < TOLERANCE
-    coarse, error = assess(ij.with_parameters(arm, {"sensor.counts": 1024.0}), duration=6.0)
-    stated = float(coarse.metrics[RELATIVE])
-    assert error < stated
-    assert is_flagged(coarse) == (not stated <= TOLERANCE)
-    print(stated, error, coarse.metrics[error_growth.BOUND], found.metrics[error_growth.BOUND])
 
 
 @pytest.mark.slow
@@ -206,9 +195,8 @@ def test_the_message_says_why_a_code_may_differ():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["difference", "quantiser"])
-def test_in_float32_the_stated_error_is_above_the_distance_from_float64(name):
-    scenario = LOOPS[name]()
+def test_in_float32_the_stated_error_is_above_the_distance_from_float64():
+    scenario = LOOPS["difference"]()
     exact = run(scenario, 1.0, 1e-3)
     single = run(ij.astype(scenario, "float32"), 1.0, 1e-3)
     assert single.q.dtype == jnp.float32
@@ -217,7 +205,7 @@ def test_in_float32_the_stated_error_is_above_the_distance_from_float64(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["difference", "quantiser", "backlash", "trigger"])
+@pytest.mark.parametrize("name", ["difference", "trigger"])
 def test_the_executors_agree(name):
     """While the codes are certain; a run whose codes are not amplifies the last bit."""
     found = [run(LOOPS[name](), 0.4, 1e-3, backend=backend) for backend in ("native", "vmap")]
@@ -302,13 +290,7 @@ def test_the_bound_of_a_jump_does_not_depend_on_the_step(error):
 
 @pytest.mark.parametrize(
     ("bounds", "error", "by_step"),
-    [
-        (0.02, 1e-3, 0.0),
-        (0.02, 0.01, 0.01),
-        (1e12, 1e-3, 0.0),
-        (np.inf, 1e-3, 0.0),
-        (0.003, 0.004, 0.007),
-    ],
+    [(0.02, 1e-3, 0.0), (0.02, 0.01, 0.01), (np.inf, 1e-3, 0.0), (0.003, 0.004, 0.007)],
 )
 def test_a_smaller_step_reduces_what_is_no_bound(bounds, error, by_step):
     assert assessed(1.0, bounds, error)[2] == pytest.approx(by_step, rel=1e-9)
@@ -360,6 +342,6 @@ def test_distance_to_the_next_level():
 def test_smooth_loops_have_no_growing_error():
     for name in SMOOTH:
         assert not error_growth.is_interrupted(LOOPS[name]())
-    for name in ("difference", "dead zone", "trigger", "continuous backlash"):
+    for name in ("difference", "continuous dead zone", "trigger", "continuous backlash"):
         assert error_growth.is_interrupted(LOOPS[name]())
     assert error_growth.rounds_continuously(LOOPS["continuous quantiser"]())

@@ -65,15 +65,6 @@ def test_a_current_sensor_in_the_loop():
     assert 0.8 * 0.02 < error.std() < 1.2 * 0.02 and abs(error.mean()) < 5e-3
 
 
-@pytest.mark.slow
-def test_the_same_sensor_as_a_part_and_alone_give_the_same_run():
-    """With an ordinary sensor the levels from the third on are measured without error."""
-    alone = simulated(loop(DRIVE, sensor=FILTERED), duration=0.1)
-    part = simulated(loop(DRIVE, sensor=Levels((FILTERED, Direct()))), duration=0.1)
-    np.testing.assert_allclose(part.x, alone.x, rtol=1e-12)
-    np.testing.assert_array_equal(alone.measured.higher[::2], alone.x[::2, 2:])
-
-
 @pytest.mark.parametrize(
     ("parts", "observer", "text"),
     [
@@ -123,22 +114,6 @@ def test_unmeasured_levels_of_a_flexible_joint(motor):
     np.testing.assert_allclose(run.measured.higher[late, 0], theta, atol=1e-5)
 
 
-@pytest.mark.release
-def test_a_continuous_loop_by_output_feedback():
-    """The law of a continuous loop receives the estimates, too: their error at the start changes
-    the voltage, and the loop converges to the one that measures all levels."""
-    observer = ij.observers.StateObserver(bandwidth=300.0, offset=(0.0, 0.1, 0.5))
-    silent = ij.disturbances.Nothing()
-    scenario = loop(DRIVE, sampling=None, observer=observer, disturbance=silent)
-    run = simulated(scenario, duration=0.3)
-    x = run.x[0] + np.array([[0.0], [0.1], [0.5]])
-    command, _ = scenario.controller.command(
-        jnp.asarray(0.0), jnp.asarray(x), jnp.zeros((3, 1)), scenario.context, ()
-    )
-    np.testing.assert_allclose(run.tau[0], command.tau, rtol=1e-12)
-    np.testing.assert_allclose(run.observer_state.x_hat[-1], run.x[-1], atol=1e-4)
-
-
 @pytest.mark.slow
 def test_a_law_of_robots_without_a_velocity_sensor():
     """A StateObserver on a robot estimates q' and f from positions."""
@@ -146,19 +121,9 @@ def test_a_law_of_robots_without_a_velocity_sensor():
     push = ij.disturbances.Step(size=[0.5, -0.3], time=0.0)
     sensor = Levels((Direct(), None))
     observer = ij.observers.StateObserver(bandwidth=300.0)
-    slow = {"controller.K2": 4.0}
-    run = simulated(
-        ij.with_parameters(
-            ij.with_parts(
-                paper,
-                sampling=ij.Sampling(period=1e-3),
-                observer=observer,
-                sensor=sensor,
-                disturbance=push,
-            ),
-            slow,
-        )
-    )
+    parts = {"observer": observer, "sensor": sensor, "disturbance": push}
+    sampled = ij.with_parts(paper, sampling=ij.Sampling(period=1e-3), **parts)
+    run = simulated(ij.with_parameters(sampled, {"controller.K2": 4.0}))
     assert run.disturbance_estimate.shape == run.q.shape
     np.testing.assert_allclose(run.disturbance_estimate[-1], [0.5, -0.3], atol=0.01)
     np.testing.assert_allclose(run.measured.dq[-2], run.dq[-2], atol=0.01)

@@ -344,15 +344,6 @@ def test_pathwise_derivative_by_the_intensity():
     assert abs(float(slope)) > 1e-4
 
 
-def test_a_file_gives_the_noise_back():
-    from iblf_jax.files.scenario import from_dict, scenario_to_dict
-
-    tables = scenario_to_dict(link(process_noise.Proportional([[0.3]], levels=(1,), substeps=2)))
-    assert tables["process_noise"]["kind"] == "proportional"
-    noise = from_dict(tables).scenario.process_noise
-    assert (noise.levels, noise.substeps) == ((1,), 2)
-
-
 @pytest.mark.slow
 def test_a_certificate_claims_nothing_under_noise():
     scenario = ij.with_parts(ij.presets.zhang_yan_2024(), process_noise=process_noise.Additive(0.2))
@@ -433,12 +424,11 @@ def test_the_independent_probability_is_that_of_the_series():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("dt", [4e-3, 1e-3])
 @pytest.mark.parametrize(("level", "rate"), [(1, 0.0), (2, EXIT_RATE)], ids=["Brownian", "OU"])
-def test_exits_between_two_instants_count(level, rate, dt):
+def test_exits_between_two_instants_count(level, rate):
     exact = probability_of_exit(rate, 1.0)
     # Without a rate a small damping lets the velocity stay 0.
-    study = exits(rate or 1.0, dt, level)
+    study = exits(rate or 1.0, 4e-3, level)
     found = np.asarray(study.violation_probability.estimate)
     deviation = np.sqrt(exact * (1 - exact) / EXIT_RUNS)
     assert 0.2 < exact < 0.8
@@ -453,6 +443,7 @@ def test_exits_between_two_instants_count(level, rate, dt):
         assert missed > 4 * deviation
 
 
+@pytest.mark.slow
 def test_extremes_between_two_instants_do_not_depend_on_the_executor():
     native, vmap = (exits(1.0, 4e-3, 1, runs=64, backend=name) for name in ("native", "vmap"))
     for name in ("margin", "xi_margin", "first_violation_time"):

@@ -6,7 +6,6 @@ import dataclasses
 
 import chain_cases
 import independent_chains as other
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -37,6 +36,7 @@ def test_equal_to_the_independent_program(name):
     np.testing.assert_allclose(found.V, run["V"], rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_errors_and_uncertain_terms_of_the_levels():
     """e_i = x_i - alpha_{i-1}, and d_i is the disturbance where plant and model agree."""
     run = ij.simulate(closed_loop("coupled"), duration=1.0, dt=1e-3, record_every=50)
@@ -155,44 +155,6 @@ def test_a_rigid_law_controls_a_flexible_arm():
     assert run.disturbance.shape[1:] == (2,)
     expected = ij.simulate(preset, duration=1.0, dt=1e-3, record_every=100)
     np.testing.assert_allclose(run.q[::500], expected.q, atol=0.01)
-
-
-@pytest.mark.slow
-def test_derivatives_of_a_run_by_its_leaves():
-    """By the gains, the stiffness, a weight, a bound and the start, against differences."""
-    scenario = chain_cases.scenario("flexible", initial=ij.Initial(q=other.ARM_START))
-    paths = ("controller.k[3][0]", "plant.stiffness[1]", "controller.weights[1][0]", "initial.q[0]")
-
-    def final(values):
-        changed = ij.with_parameters(scenario, dict(zip(paths, values, strict=True)))
-        run = ij.simulate(changed, duration=0.2, dt=1e-3, record_every=200)
-        return jnp.sum(run.q[-1] * jnp.asarray([1.0, 0.7]))
-
-    values = [float(ij.paths.get(scenario, path)) for path in paths]
-    found = jax.grad(final)(jnp.asarray(values))
-    for i, value in enumerate(values):
-        h = 1e-4 * abs(value)
-        sides = [[*values[:i], value + sign * h, *values[i + 1 :]] for sign in (1.0, -1.0)]
-        expected = (final(sides[0]) - final(sides[1])) / (2.0 * h)
-        np.testing.assert_allclose(found[i], expected, rtol=2e-4, atol=1e-10)
-
-
-@pytest.mark.slow
-def test_bounds_of_a_level_are_recorded_under_every_law():
-    preset = ij.presets.zhang_yan_2024()
-    plant = stiff_arm(preset.plant)
-    narrow = ij.Bounds(lower=bounds.Constant(-0.5), upper=bounds.Constant(0.5))
-    scenario = ij.with_parts(
-        preset,
-        plant=plant,
-        bounds=(preset.bounds[0], None, None, narrow),
-        controller=preset.controller,
-    )
-    with pytest.warns(ij.SimulationWarning):
-        run = ij.simulate(scenario, duration=0.5, dt=2e-4)
-    assert int(run.status) & ij.Status.STATE_BOUND_VIOLATED
-    np.testing.assert_array_equal(run.level_upper[:, 3], 0.5)
-    assert np.all(np.isinf(run.level_upper[:, 2]))
 
 
 @pytest.mark.slow

@@ -38,14 +38,6 @@ def test_diffrax_and_scipy_agree_with_simulate(page, converged):
     np.testing.assert_allclose(page["tau"], converged.tau, rtol=0, atol=1e-6)
 
 
-@pytest.mark.release
-def test_an_implicit_solver_agrees_too(page, converged):
-    solution = page["solve"](page["field"], page["diffrax"].Kvaerno5(), page["ts"][:6])
-    np.testing.assert_allclose(
-        page["field"].unpack(solution.ys).q, converged.q[:6], rtol=0, atol=1e-9
-    )
-
-
 @pytest.mark.slow
 def test_the_gradient_through_the_solver(page):
     gains, step = jnp.array([20.0, 20.0]), 1e-3
@@ -57,25 +49,10 @@ def test_the_gradient_through_the_solver(page):
     assert np.all(np.abs(np.diag(page["slope"])) > 1e-5)
 
 
-@pytest.mark.release
-def test_the_gradient_in_reverse(page):
-    back = jax.grad(
-        lambda K2: page["final_error"](K2, page["diffrax"].RecursiveCheckpointAdjoint())[0]
-    )(jnp.array([20.0, 20.0]))
-    np.testing.assert_allclose(back, page["slope"][0], rtol=0, atol=1e-8)
-
-
 @pytest.mark.slow
 def test_the_equilibrium(page):
     np.testing.assert_allclose(page["error"], [3.0 / 60.0, -1.5 / 60.0], atol=1e-9)
     assert np.all(np.real(page["modes"]) < 0)
-
-
-@pytest.mark.slow
-def test_what_the_page_says_of_its_numbers(page):
-    assert page["field"].names == ("q[0]", "q[1]", "dq[0]", "dq[1]", "observer[0]", "observer[1]")
-    assert page["q"].shape == (51, 2)
-    assert page["control"].jump_ts.shape == (1,)
 
 
 def test_scipy_agrees_with_an_independent_program(paper, reference_data):
@@ -152,14 +129,8 @@ def test_bad_arguments(paper):
         with pytest.raises(ValueError, match="t: "):
             field.sample(t, field.start)
     state = field.unpack(field.start)
-    for wrong in (
-        3.0,
-        None,
-        state._replace(x=np.zeros((2, 3))),
-        state._replace(controller=np.zeros(2)),
-        state._replace(x="ab"),
-        (1, 2, 3, 4),
-    ):
+    changed = ({"x": np.zeros((2, 3))}, {"controller": np.zeros(2)}, {"x": "ab"})
+    for wrong in (3.0, None, (1, 2, 3, 4), *(state._replace(**change) for change in changed)):
         with pytest.raises(ValueError, match="state: "):
             field.pack(wrong)
     with pytest.raises(ValueError, match=r"VectorField.scenario: .* ij.vector_field"):

@@ -15,7 +15,6 @@ from iblf_jax.robots import Arm, Payload, coriolis_from_mass_matrix
 from members import TWO_LINK
 
 import iblf_jax as ij
-from iblf_jax.core.linalg import solve_spd
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
 from iblf_jax.simulation.scenario import canonical
@@ -39,11 +38,6 @@ def everything(arm, q, v):
     )
 
 
-@jax.jit
-def acceleration(arm, q, v):
-    return solve_spd(arm.mass_matrix(q), -arm.coriolis(q, v, v) - arm.gravity(q))
-
-
 def relative(a, b) -> float:
     return float(np.max(np.abs(np.asarray(a) - b)) / np.max(np.abs(b)))
 
@@ -60,7 +54,7 @@ def real(name: str):
 @pytest.mark.parametrize("name", REAL)
 def test_real_arms_have_the_dynamics_that_mujoco_gives(name):
     arm, model = real(name)
-    rng, states = np.random.default_rng(0), 1000
+    rng, states = np.random.default_rng(0), 200
     q, v = rng.uniform(-np.pi, np.pi, (states, arm.n)), rng.normal(size=(states, arm.n)) * 2
     ours = [np.asarray(x) for x in dynamics(arm, q, v)]
     for i in range(states):
@@ -69,42 +63,6 @@ def test_real_arms_have_the_dynamics_that_mujoco_gives(name):
         assert relative(ours[0][i], M) < 1e-9
         assert relative(ours[1][i], bias) < 1e-9
         assert relative(ours[2][i], G) < 1e-9
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", REAL)
-def test_motion_is_mujocos(name):
-    arm, model = real(name)
-    rng = np.random.default_rng(1)
-    data = mujoco.MjData(model)
-    q, v = rng.uniform(-1, 1, arm.n), rng.normal(size=arm.n)
-    data.qpos[:], data.qvel[:] = q, v
-    h = model.opt.timestep
-
-    def rate(x):
-        return np.concatenate([x[1], acceleration(arm, *x)]).reshape(2, -1)
-
-    x = np.stack([q, v])
-    for _ in range(1000):
-        k1 = rate(x)
-        k2 = rate(x + h / 2 * k1)
-        k3 = rate(x + h / 2 * k2)
-        k4 = rate(x + h * k3)
-        x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-        mujoco.mj_step(model, data)
-    np.testing.assert_allclose(x[0], data.qpos, rtol=0, atol=1e-9)
-
-
-@pytest.mark.slow
-def test_armature_is_on_the_diagonal():
-    arm, model = real("ur5")
-    armature = np.linspace(0.1, 2.0, arm.n)
-    model.dof_armature[:] = armature
-    q, v = np.random.default_rng(2).normal(size=(2, arm.n))
-    M, bias = dynamics_of(model, q, v)
-    ours = dynamics(dataclasses.replace(arm, armature=armature), q[None], v[None])
-    assert relative(ours[0][0], M) < 1e-9
-    assert relative(ours[1][0], bias) < 1e-9
 
 
 @pytest.mark.slow
@@ -130,10 +88,9 @@ def test_random_chains_have_the_dynamics_that_mujoco_gives(n, seed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(3))
-def test_c_is_the_one_of_the_christoffel_symbols(seed):
-    arm = random_arm(4, seed)
-    q, v, u = jnp.asarray(np.random.default_rng(seed).normal(size=(3, 4)))
+def test_c_is_the_one_of_the_christoffel_symbols(rng):
+    arm = random_arm(4, 0)
+    q, v, u = jnp.asarray(rng.normal(size=(3, 4)))
     ours, theirs = jax.jit(
         lambda a: (a.coriolis(q, v, u), coriolis_from_mass_matrix(a.mass_matrix, q, v, u))
     )(arm)
@@ -143,13 +100,12 @@ def test_c_is_the_one_of_the_christoffel_symbols(seed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(3))
-def test_momentum_and_inverse_dynamics_are_the_products_of_the_matrices(seed):
+def test_momentum_and_inverse_dynamics_are_the_products_of_the_matrices(rng):
     load = ij.robots.Payload(
         mass=0.7, centre=[0.1, -0.2, 0.3], inertia=[0.1, 0.2, 0.2, 0.0, 0.0, 0.1]
     )
-    arm = dataclasses.replace(random_arm(4, seed), payload=0.4, carried=load, armature=0.1)
-    q, v, u, a = jnp.asarray(np.random.default_rng(seed).normal(size=(4, 4)))
+    arm = dataclasses.replace(random_arm(4, 1), payload=0.4, carried=load, armature=0.1)
+    q, v, u, a = jnp.asarray(rng.normal(size=(4, 4)))
 
     @jax.jit
     def differences(arm):
@@ -192,35 +148,14 @@ def looked_at(arm, q, v, u):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("payload", [0.0, 0.8])
-def test_two_link_in_space_is_the_planar_one(payload):
-    flat, arm = dataclasses.replace(TWO_LINK, payload=payload), two_link_in_space(payload=payload)
-    q, v, u = jnp.asarray(np.random.default_rng(3).normal(size=(3, 2)))
+def test_two_link_in_space_is_the_planar_one(rng):
+    flat, arm = dataclasses.replace(TWO_LINK, payload=0.8), two_link_in_space(payload=0.8)
+    q, v, u = jnp.asarray(rng.normal(size=(3, 2)))
     M, C, G, points = looked_at(arm, q, v, u)
     np.testing.assert_allclose(M, flat.mass_matrix(q), rtol=1e-12)
     np.testing.assert_allclose(C, flat.coriolis(q, v, u), rtol=1e-11, atol=1e-13)
     np.testing.assert_allclose(G, flat.gravity(q), rtol=1e-12)
     np.testing.assert_allclose(points[:, [0, 2]], flat.skeleton(q), atol=1e-13)
-
-
-@pytest.mark.slow
-def test_derivatives_by_inertial_parameters_are_finite_differences():
-    arm = random_arm(3, 5)
-    q, v, a = jnp.asarray(np.random.default_rng(5).normal(size=(3, 3)))
-
-    @jax.jit
-    def torque(mass, centre, inertia):
-        other = dataclasses.replace(arm, mass=mass, centre=centre, inertia=inertia)
-        return other.mass_matrix(q) @ a + other.coriolis(q, v, v) + other.gravity(q)
-
-    point = (arm.mass, arm.centre, arm.inertia)
-    slopes = jax.jit(jax.jacfwd(torque, argnums=(0, 1, 2)))(*point)
-    for k, (x, slope) in enumerate(zip(point, slopes, strict=True)):
-        for index in np.ndindex(x.shape):
-            ends = [torque(*point[:k], x.at[index].add(h), *point[k + 1 :]) for h in (1e-5, -1e-5)]
-            np.testing.assert_allclose(
-                slope[(slice(None), *index)], (ends[0] - ends[1]) / 2e-5, atol=1e-6
-            )
 
 
 # ---------------------------------------------------------------------------- in the closed loop
@@ -285,43 +220,10 @@ def test_the_model_does_not_know_when():
 SHORT_RUN = {"duration": 0.1, "dt": 1e-3}
 
 
-@pytest.mark.slow
-def test_runs_as_the_planar_robot_does():
-    planar = dataclasses.replace(
-        ij.presets.zhang_yan_2024(variant="corrected"), plant=TWO_LINK, model=TWO_LINK
-    )
-    run, other = (
-        ij.simulate(scenario_with(two_link_in_space()), **SHORT_RUN),
-        ij.simulate(planar, **SHORT_RUN),
-    )
-    np.testing.assert_allclose(run.q, other.q, atol=1e-11)
-    np.testing.assert_allclose(run.tau, other.tau, atol=1e-7)
-
-
-@pytest.mark.slow
-def test_batches_of_arms_agree_with_single_runs():
-    scenario, timing = scenario_with(two_link_in_space()), SHORT_RUN | {"method": "euler"}
-    study = ij.monte_carlo(
-        scenario,
-        {
-            "plant.link[link2].mass": ij.factor(ij.uniform(0.7, 1.3)),
-            "plant.joint[0].damping": ij.value(ij.uniform(0.0, 0.5)),
-        },
-        runs=3,
-        seed=0,
-        **timing,
-    )
-    for i in range(3):
-        values = {path: np.asarray(x)[i] for path, x in study.samples.items()}
-        alone = ij.simulate(ij.with_parameters(scenario, values), **timing)
-        np.testing.assert_allclose(study.metrics["rmse"][i], alone.metrics["rmse"], rtol=1e-9)
-
-
 # ------------------------------------------------------------------------------ names and checks
 
 
 def test_rows_have_names():
-    arm = ij.robots.load(ARMS / "ur5.urdf")
     scenario = scenario_with(
         two_link_in_space(links=("upper arm", "fore/arm"), joints=("shoulder", "elbow"))
     )
@@ -342,7 +244,6 @@ def test_rows_have_names():
     assert paths.sign_at(scenario, "plant.link[1].mass") == "nonnegative"
     assert paths.unit_at(scenario, "plant.joint[elbow].damping") == "N m s/rad"
     assert paths.sign_at(scenario, "plant.joint[elbow].effort") == "positive"
-    assert ij.parameters(dataclasses.replace(scenario, plant=two_link_in_space())), arm
 
 
 @pytest.mark.parametrize(
@@ -351,7 +252,6 @@ def test_rows_have_names():
         "plant.link[forearms].mass",
         "plant.link[9].mass",
         "plant.link[link1].damping",
-        "plant.link[link1]",
         "plant.link",
         "plant[link1].mass",
     ],
@@ -399,14 +299,3 @@ def test_fields_that_do_not_fit_are_refused(fields, message):
     kept = {f.name: getattr(arm, f.name) for f in dataclasses.fields(arm)}
     with pytest.raises(ValueError, match=message):
         Arm(**{**kept, **fields})
-
-
-def test_scenario_files_hold_arms(tmp_path):
-    scenario = scenario_with(
-        two_link_in_space(carried=Payload(mass=0.5, start=1.0), upper=[1.0, np.inf], lower=-3.0)
-    )
-    ij.save_scenario(scenario, tmp_path / "arm.toml")
-    again = ij.load_scenario(tmp_path / "arm.toml")
-    assert jax.tree.structure(again) == jax.tree.structure(scenario)
-    for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(scenario), strict=True):
-        np.testing.assert_array_equal(a, b)

@@ -47,26 +47,14 @@ def robot(*parts: str) -> str:
     return f'<robot name="r">{"".join(parts)}</robot>'
 
 
+FINGER = '<limit lower="0" upper="0.04" effort="3" velocity="1"/>'
 GRIPPER = (
     *(link("base", ""), link("upper"), link("fore"), link("tool", ""), link("left"), link("right")),
     joint("shoulder", "base", "upper", inside=LIMIT + '<dynamics damping="0.4" friction="0.2"/>'),
     joint("elbow", "upper", "fore", "continuous", ""),
     joint("flange", "fore", "tool", "fixed", ""),
-    joint(
-        "finger",
-        "tool",
-        "left",
-        "prismatic",
-        '<limit lower="0" upper="0.04" effort="3" velocity="1"/>',
-    ),
-    joint(
-        "other",
-        "tool",
-        "right",
-        "prismatic",
-        '<limit lower="0" upper="0.04" effort="3" velocity="1"/><mimic joint="finger"'
-        ' multiplier="2"/>',
-    ),
+    joint("finger", "tool", "left", "prismatic", FINGER),
+    joint("other", "tool", "right", "prismatic", FINGER + '<mimic joint="finger" multiplier="2"/>'),
 )
 """Two joints, and a gripper with a finger that follows the other."""
 
@@ -142,11 +130,10 @@ def test_gravity_can_be_given(file):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(3))
-def test_mjcf_gives_the_arm_that_it_was_written_from(seed, file):
-    arm = random_arm(4, seed, armature=[0.1, 0.0, 0.3, 0.2])
+def test_mjcf_gives_the_arm_that_it_was_written_from(file, rng):
+    arm = random_arm(4, 0, armature=[0.1, 0.0, 0.3, 0.2])
     again = ij.robots.load(file(as_mjcf(arm)), tip="tip")
-    q = np.random.default_rng(seed).normal(size=4)
+    q = rng.normal(size=4)
     np.testing.assert_allclose(again.mass_matrix(q), arm.mass_matrix(q), rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(again.tip(q), arm.tip(q), atol=1e-12)
     np.testing.assert_allclose(again.pose(q).rotation, arm.pose(q).rotation, atol=1e-12)
@@ -188,22 +175,8 @@ def test_mjcf_without_gravity(file):
 
 
 CORNERS = np.array([(x, y, z) for x in (-0.1, 0.1) for y in (-0.2, 0.2) for z in (0.0, 0.3)])
-FACES = np.array(
-    [
-        (0, 1, 3),
-        (0, 3, 2),
-        (4, 6, 7),
-        (4, 7, 5),
-        (0, 4, 5),
-        (0, 5, 1),
-        (2, 3, 7),
-        (2, 7, 6),
-        (0, 2, 6),
-        (0, 6, 4),
-        (1, 5, 7),
-        (1, 7, 3),
-    ]
-)
+FACES = ["013", "032", "467", "475", "045", "051", "237", "276", "026", "064", "157", "173"]
+FACES = np.array([[int(corner) for corner in face] for face in FACES])
 """A box, its corners [m] and its triangles."""
 MESHED = """<mujoco><compiler meshdir="meshes"/><default><mesh scale="0.5 0.5 0.5"/></default>
 <asset><mesh file="box.obj"/><mesh name="cube" file="deep/box.stl" inertia="shell"/><mesh name="unused" file="nowhere.stl"/></asset>
@@ -341,23 +314,23 @@ MASS_ONLY = '<inertial><mass value="1"/></inertial>'
 WEIGHTLESS = '<inertial><mass value="0"/><inertia ixx="1" iyy="1" izz="1"/></inertial>'
 
 
+def one_link(inside: str) -> str:
+    return robot(link("base", ""), link("a", inside), joint("ja", "base", "a"))
+
+
 def bad_inertia(text: str) -> str:
-    return robot(
-        link("base", ""),
-        link("a", SOLID.replace('ixx="0.02" iyy="0.03" izz="0.01"', text)),
-        joint("ja", "base", "a"),
-    )
+    return one_link(SOLID.replace('ixx="0.02" iyy="0.03" izz="0.01"', text))
 
 
 BAD = {
-    "no inertia": (robot(link("base", ""), link("a", MASS_ONLY), joint("ja", "base", "a")), "link 'a'.*no <inertia>"),
+    "no inertia": (one_link(MASS_ONLY), "link 'a'.*no <inertia>"),
     "zero inertia": (bad_inertia('ixx="0" iyy="0" izz="0"'), "link 'a'.*positive definite"),
     "indefinite inertia": (bad_inertia('ixx="0.02" iyy="-0.03" izz="0.01"'), "link 'a'.*positive definite"),
     "impossible inertia": (bad_inertia('ixx="0.02" iyy="0.09" izz="0.01"'), "link 'a'.*sum of the two others"),
     "missing moment": (bad_inertia('ixx="0.02" iyy="0.09"'), "link 'a': inertia izz"),
     "nan": (bad_inertia('ixx="nan" iyy="0.09" izz="0.01"'), "link 'a': inertia ixx.*finite"),
-    "inertia without mass": (robot(link("base", ""), link("a", WEIGHTLESS), joint("ja", "base", "a")), "link 'a'.*without a mass"),
-    "negative mass": (robot(link("base", ""), link("a", SOLID.replace("1.5", "-1.5")), joint("ja", "base", "a")), "link 'a': mass"),
+    "inertia without mass": (one_link(WEIGHTLESS), "link 'a'.*without a mass"),
+    "negative mass": (one_link(SOLID.replace("1.5", "-1.5")), "link 'a': mass"),
     "no mass that moves": (robot(link("base", ""), link("a", ""), link("b"), *CHAIN), "'a'"),
     "no mass at the end": (robot(link("base", ""), link("a"), link("b", ""), *CHAIN), "'b'"),
     "mimic": (robot(*PLAIN, CHAIN[0], joint("jb", "a", "b", inside=LIMIT + '<mimic joint="ja"/>')), "joint 'jb'.*mimic"),
@@ -397,69 +370,28 @@ SPHERE = '<geom size="0.1" mass="1"/>'
 
 
 def mjcf(inside: str, outside: str = "") -> str:
-    return (
-        '<mujoco><worldbody><body name="a"><joint'
-        f' name="ja"/>{SPHERE}{inside}</body></worldbody>{outside}</mujoco>'
-    )
+    body = f'<body name="a"><joint name="ja"/>{SPHERE}{inside}</body>'
+    return f"<mujoco><worldbody>{body}</worldbody>{outside}</mujoco>"
 
 
 BAD_MJCF = {
     "no bodies": ("<mujoco/>", "no <body>"),
-    "ball": (
-        mjcf(f'<body name="b"><joint name="jb" type="ball"/>{SPHERE}</body>'),
-        "joint 'jb'.*ball",
-    ),
-    "free": (
-        (
-            '<mujoco><worldbody><body name="a"><freejoint'
-            f' name="f"/>{SPHERE}</body></worldbody></mujoco>'
-        ),
-        "joint 'f'.*free",
-    ),
+    "ball": (mjcf(f'<body name="b"><joint name="jb" type="ball"/>{SPHERE}</body>'), "joint 'jb'.*ball"),
+    "free": (f'<mujoco><worldbody><body name="a"><freejoint name="f"/>{SPHERE}</body></worldbody></mujoco>', "joint 'f'.*free"),
     "mesh": (mjcf('<body name="b"><joint/><geom type="mesh" mesh="m"/></body>'), "body 'b'.*mesh"),
-    "missing mesh": (
-        mjcf(
-            '<body name="b"><joint/><geom type="mesh" mesh="m"/></body>',
-            '<asset><mesh name="m" file="m.stl"/></asset>',
-        ),
-        "body 'b': mesh 'm': got .*m.stl'.*Nothing is there.*<inertial>",
-    ),
-    "height field": (
-        mjcf('<body name="b"><joint/><geom type="hfield" hfield="h"/></body>'),
-        "body 'b'.*height field 'h'",
-    ),
-    "compensated gravity": (
-        mjcf(f'<body name="b" gravcomp="1"><joint/>{SPHERE}</body>'),
-        "body 'b': gravcomp: got 1.0.*repair=True",
-    ),
+    "missing mesh": (mjcf('<body name="b"><joint/><geom type="mesh" mesh="m"/></body>', '<asset><mesh name="m" file="m.stl"/></asset>'), "body 'b': mesh 'm': got .*m.stl'.*Nothing is there.*<inertial>"),
+    "height field": (mjcf('<body name="b"><joint/><geom type="hfield" hfield="h"/></body>'), "body 'b'.*height field 'h'"),
+    "compensated gravity": (mjcf(f'<body name="b" gravcomp="1"><joint/>{SPHERE}</body>'), "body 'b': gravcomp: got 1.0.*repair=True"),
     "no mass": (mjcf('<body name="b"><joint/></body>'), "'b'"),
-    "spring": (
-        mjcf(f'<body name="b"><joint name="jb" stiffness="3"/>{SPHERE}</body>'),
-        "joint 'jb': stiffness",
-    ),
-    "connect": (
-        mjcf(
-            f'<body name="b"><joint/>{SPHERE}</body>',
-            '<equality><connect name="c" body1="a" body2="b" anchor="0 0 0"/></equality>',
-        ),
-        "equality 'c'.*tied together",
-    ),
-    "weld": (
-        mjcf("", '<equality><weld name="c" body1="a"/></equality>'),
-        "equality 'c'.*tied together",
-    ),
-    "coupled": (
-        mjcf("", '<equality><joint name="c" joint1="ja"/></equality>'),
-        "equality 'c'.*'ja' tied",
-    ),
-    "replicate": (
-        '<mujoco><worldbody><replicate count="1000000000"><body/></replicate></worldbody></mujoco>',
-        "replicate",
-    ),
+    "spring": (mjcf(f'<body name="b"><joint name="jb" stiffness="3"/>{SPHERE}</body>'), "joint 'jb': stiffness"),
+    "connect": (mjcf(f'<body name="b"><joint/>{SPHERE}</body>', '<equality><connect name="c" body1="a" body2="b" anchor="0 0 0"/></equality>'), "equality 'c'.*tied together"),
+    "weld": (mjcf("", '<equality><weld name="c" body1="a"/></equality>'), "equality 'c'.*tied together"),
+    "coupled": (mjcf("", '<equality><joint name="c" joint1="ja"/></equality>'), "equality 'c'.*'ja' tied"),
+    "replicate": ('<mujoco><worldbody><replicate count="1000000000"><body/></replicate></worldbody></mujoco>', "replicate"),
     "repeated": (mjcf(f'<body name="a">{SPHERE}</body>'), "repeated name 'a'"),
     "infinite": (mjcf(f'<body name="b" pos="0 inf 0">{SPHERE}</body>'), "body 'b': pos.*finite"),
     "no such include": ('<mujoco><include file="nowhere.xml"/></mujoco>', "nowhere.xml"),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", [*BAD, *BAD_MJCF])
@@ -467,9 +399,10 @@ def test_bad_files_are_refused_by_name(name, file):
     text, message = {**BAD, **BAD_MJCF}[name]
     path = file(text)
     start = time.perf_counter()
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=message) as caught:
         ij.robots.load(path)
     assert time.perf_counter() - start < 1.0
+    assert str(caught.value).count(str(path)) == 1
 
 
 STRANGE_NUMBERS = (
@@ -486,21 +419,13 @@ PLACES = {
 @pytest.mark.parametrize("text", STRANGE_NUMBERS)
 def test_numbers_that_are_not_decimal_are_refused_with_file_element_and_attribute(text, file):
     for place, inside in PLACES.items():
-        path = file(
-            robot(link("base", ""), link("a", inside.format(text)), joint("ja", "base", "a"))
-        )
+        path = file(one_link(inside.format(text)))
         with pytest.raises(ValueError, match=f"arm.urdf: {place}: got .*, expected .*finite"):
             ij.robots.load(path)
-    path = file(
-        robot(
-            link("base", ""),
-            link("a"),
-            joint("ja", "base", "a", inside=LIMIT.replace('"2"', f'"{text}"')),
-        )
-    )
-    with pytest.raises(
-        ValueError, match=r"arm.urdf: joint 'ja': limit upper: got .*, expected .*finite"
-    ):
+    limit = LIMIT.replace('"2"', f'"{text}"')
+    path = file(robot(link("base", ""), link("a"), joint("ja", "base", "a", inside=limit)))
+    message = r"arm.urdf: joint 'ja': limit upper: got .*, expected .*finite"
+    with pytest.raises(ValueError, match=message):
         ij.robots.load(path)
     path = file(mjcf(f'<body name="b" pos="0 {text} 0">{SPHERE}</body>'))
     with pytest.raises(ValueError, match=r"arm.urdf: body 'b': pos: got .*, expected .*finite"):
@@ -509,33 +434,8 @@ def test_numbers_that_are_not_decimal_are_refused_with_file_element_and_attribut
 
 @pytest.mark.parametrize("text", ["2.5", "+2.5", "25e-1", "2.5E+0", ".25e1", "\n\t2.5 "])
 def test_decimal_numbers_are_read(text, file):
-    arm = ij.robots.load(
-        file(
-            robot(
-                link("base", ""),
-                link("a", SOLID.replace('"1.5"', f'"{text}"')),
-                joint("ja", "base", "a"),
-            )
-        )
-    )
+    arm = ij.robots.load(file(one_link(SOLID.replace('"1.5"', f'"{text}"'))))
     np.testing.assert_array_equal(arm.mass, [2.5])
-
-
-def test_every_refusal_of_a_field_names_the_file(file):
-    for name, (text, _) in {**BAD, **BAD_MJCF}.items():
-        path = file(text)
-        with pytest.raises(ValueError, match=r"arm\.urdf") as caught:
-            ij.robots.load(path)
-        assert str(caught.value).count(str(path)) == 1, name
-    for arguments in (
-        {"base": "bases"},
-        {"tip": "tool", "gravity": 9.81},
-        {"tip": "tool", "locked": {"elbows": 0.0}},
-    ):
-        with pytest.raises(
-            ValueError, match=rf"^{list(arguments)[-1]}: got .* The file is .*arm\.urdf"
-        ):
-            ij.robots.load(file(robot(*GRIPPER)), **arguments)
 
 
 @pytest.mark.parametrize(
@@ -554,8 +454,9 @@ def test_every_refusal_of_a_field_names_the_file(file):
     ],
 )
 def test_bad_arguments_are_refused(arguments, message, file):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=message) as caught:
         ij.robots.load(file(robot(*GRIPPER)), **arguments)
+    assert "arm.urdf" in str(caught.value)
 
 
 def test_paths_that_are_no_files(tmp_path):
@@ -603,23 +504,8 @@ SOURCES = [
     MJCF.format(finger='<joint name="jf" axis="1 0 0"/>'),
 ]
 NUMBER = re.compile(r"-?\d+\.?\d*(?:e-?\d+)?")
-VALUES = [
-    "nan",
-    "inf",
-    "-1",
-    "0",
-    "1e308",
-    "1e-308",
-    "1e400",
-    "",
-    "abc",
-    "0 0",
-    "1 2 3 4 5",
-    "9" * 400,
-    "1e9",
-    "-1e-3",
-    "true",
-]
+VALUES = ["nan", "inf", "-1", "0", "1e308", "1e-308", "1e400", "", "abc", "0 0", "1 2 3 4 5"]
+VALUES += ["9" * 400, "1e9", "-1e-3", "true"]
 
 
 @st.composite
@@ -627,10 +513,8 @@ def mutated(draw) -> bytes:
     """A description with bytes, numbers, passages or elements changed, lost, doubled or moved."""
     text = draw(st.sampled_from(SOURCES))
     for _ in range(draw(st.integers(1, 3))):
-        kind, place = (
-            draw(st.sampled_from(["bytes", "number", "passage", "element"])),
-            draw(st.integers(0, len(text) - 1)),
-        )
+        kind = draw(st.sampled_from(["bytes", "number", "passage", "element"]))
+        place = draw(st.integers(0, len(text) - 1))
         if kind == "bytes":
             text = text[:place] + draw(st.text(max_size=3)) + text[place + 1 :]
         elif kind == "number":
@@ -678,7 +562,7 @@ def _element_changed(draw, text: str, place: int) -> str:
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:Inertia matrix is too close to singular")
-@settings(max_examples=400)
+@settings(max_examples=200)
 @given(data=mutated())
 def test_mutated_files_load_or_are_refused(tmp_path_factory, data):
     path = tmp_path_factory.getbasetemp() / "mutated.xml"
@@ -721,39 +605,22 @@ def arm_with(*more: str, a: str = SOLID, ja: str = LIMIT) -> str:
     )
 
 
-NO_INERTIA, NEGATIVE, IMPOSSIBLE = (
-    weighing("0 0 0"),
-    weighing("0.02 -0.03 0.01"),
-    weighing("0.02 0.09 0.01"),
-)
+NO_INERTIA, NEGATIVE = weighing("0 0 0"), weighing("0.02 -0.03 0.01")
+IMPOSSIBLE = weighing("0.02 0.09 0.01")
 
 NO_MATTER = {
-    "inertia of what the base carries": arm_with(
-        link("x", IMPOSSIBLE), joint("jx", "base", "x", "fixed", "")
-    ),
+    "inertia of what the base carries": arm_with(link("x", IMPOSSIBLE), joint("jx", "base", "x", "fixed", "")),
     "inertia on another branch": arm_with(link("x", NEGATIVE), joint("jx", "base", "x")),
-    "numbers on another branch": arm_with(
-        link("x", SOLID.replace("0.02", "nan")), joint("jx", "base", "x").replace("0.3 0 0", "$(x)")
-    ),
-    "no range on another branch": arm_with(
-        link("x"), joint("jx", "base", "x", inside='<limit lower="0" upper="0" effort="-1"/>')
-    ),
+    "numbers on another branch": arm_with(link("x", SOLID.replace("0.02", "nan")), joint("jx", "base", "x").replace("0.3 0 0", "$(x)")),
+    "no range on another branch": arm_with(link("x"), joint("jx", "base", "x", inside='<limit lower="0" upper="0" effort="-1"/>')),
     "a free body on another branch": arm_with(link("x"), joint("jx", "base", "x", "floating", "")),
-    "no range of a finger": arm_with(
-        link("x", weighing("0 0 0", "0")), joint("jx", "b", "x", "prismatic", "")
-    ),
-    "a point welded on": arm_with(
-        link("x", NO_INERTIA.replace("1.5", "0.2")), joint("jx", "b", "x", "fixed", "")
-    ),
-    "a moment of rounding": arm_with(
-        link("x", weighing("-2e-35 0.01 0.01")), joint("jx", "b", "x", "fixed", "")
-    ),
+    "no range of a finger": arm_with(link("x", weighing("0 0 0", "0")), joint("jx", "b", "x", "prismatic", "")),
+    "a point welded on": arm_with(link("x", NO_INERTIA.replace("1.5", "0.2")), joint("jx", "b", "x", "fixed", "")),
+    "a moment of rounding": arm_with(link("x", weighing("-2e-35 0.01 0.01")), joint("jx", "b", "x", "fixed", "")),
     "a rod that moves": arm_with(a=weighing("-2e-35 0.01 0.01")),
-    "a speck": arm_with(
-        link("x", weighing("1e-22 1e-22 1e-22", "1e-18")), joint("jx", "b", "x", "fixed", "")
-    ),
+    "a speck": arm_with(link("x", weighing("1e-22 1e-22 1e-22", "1e-18")), joint("jx", "b", "x", "fixed", "")),
     "an endless wheel": arm_with(ja='<limit lower="-1e16" upper="1e16" effort="7"/>'),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", NO_MATTER)
@@ -762,19 +629,15 @@ def test_what_does_not_matter_refuses_no_file(name, file, recwarn):
     arm = ij.robots.load(file(NO_MATTER[name]), tip="b")
     assert not recwarn.list
     assert arm.repaired == ()
-    if (
-        "point" not in name and "moment" not in name and "rod" not in name
-    ):  # these have a weight, and it counts
+    if not any(word in name for word in ("point", "moment", "rod")):  # their weight counts
         np.testing.assert_allclose(arm.mass, plain.mass, rtol=1e-15)
         np.testing.assert_allclose(arm.inertia, plain.inertia, rtol=0, atol=1e-17)
 
 
 def test_a_point_that_is_welded_on_counts(file):
     arm = ij.robots.load(file(NO_MATTER["a point welded on"]), tip="b")
-    c, s = (
-        np.cos(0.3),
-        np.sin(0.3),
-    )  # in the frame of b: the joint's place, then the point's in the frame of x
+    # In the frame of b: the joint's place, then the point's in the frame of x.
+    c, s = np.cos(0.3), np.sin(0.3)
     point, own = np.array([0, -0.1 * s, 0.2 + 0.1 * c]), np.array([0, 0, 0.1])
     centre = (0.2 * point + 1.5 * own) / 1.7
     d, e = point - centre, own - centre
@@ -783,90 +646,30 @@ def test_a_point_that_is_welded_on_counts(file):
     )
     np.testing.assert_allclose(arm.mass[1], 1.7, rtol=1e-15)
     np.testing.assert_allclose(arm.centre[1], centre, atol=1e-15)
-    np.testing.assert_allclose(
-        arm.inertia[1],
-        [J[0, 0], J[1, 1], J[2, 2], J[0, 1], J[0, 2], J[1, 2]],
-        rtol=1e-12,
-        atol=1e-15,
-    )
+    numbers = [J[0, 0], J[1, 1], J[2, 2], J[0, 1], J[0, 2], J[1, 2]]
+    np.testing.assert_allclose(arm.inertia[1], numbers, rtol=1e-12, atol=1e-15)
 
 
+BY_ITSELF = "one that moves by itself"
 WITH_REPAIR = {
-    "impossible inertia": (
-        arm_with(a=IMPOSSIBLE),
-        r"link 'a': inertia: from principal moments 0.01, 0.02, 0.09 to",
-    ),
-    "negative inertia": (
-        arm_with(a=NEGATIVE),
-        "link 'a': inertia: from principal moments -0.03, 0.01, 0.02 to",
-    ),
+    "impossible inertia": (arm_with(a=IMPOSSIBLE), "link 'a': inertia: from principal moments 0.01, 0.02, 0.09 to"),
+    "negative inertia": (arm_with(a=NEGATIVE), "link 'a': inertia: from principal moments -0.03, 0.01, 0.02 to"),
     "no inertia": (arm_with(a=NO_INERTIA), "link 'a': inertia: from principal moments 0, 0, 0 to"),
-    "no <inertia>": (
-        arm_with(link("x", MASS_ONLY), joint("jx", "b", "x", "fixed", "")),
-        "link 'x': inertia: from nothing to that of a point",
-    ),
-    "inertia without mass": (
-        arm_with(link("x", WEIGHTLESS), joint("jx", "b", "x", "fixed", "")),
-        "link 'x'.*without a mass to",
-    ),
-    "no mass between": (
-        arm_with(a="").replace('"0 1 0"', '"1 0 0"', 1),
-        "link 'a': from no mass to no mass, as it is",
-    ),
-    "no range": (
-        arm_with(ja='<limit lower="0" upper="0"/>'),
-        r"joint 'ja': limit: from \(0.0, 0.0\) to no limits",
-    ),
+    "no <inertia>": (arm_with(link("x", MASS_ONLY), joint("jx", "b", "x", "fixed", "")), "link 'x': inertia: from nothing to that of a point"),
+    "inertia without mass": (arm_with(link("x", WEIGHTLESS), joint("jx", "b", "x", "fixed", "")), "link 'x'.*without a mass to"),
+    "no mass between": (arm_with(a="").replace('"0 1 0"', '"1 0 0"', 1), "link 'a': from no mass to no mass, as it is"),
+    "no range": (arm_with(ja='<limit lower="0" upper="0"/>'), r"joint 'ja': limit: from \(0.0, 0.0\) to no limits"),
     "no <limit>": (arm_with(ja=""), "joint 'ja': limit: from nothing to no limits"),
-    "negative torque": (
-        arm_with(ja=LIMIT.replace("7", "-1")),
-        "joint 'ja': effort: from -1.0 to no limit",
-    ),
-    "negative speed": (
-        arm_with(ja=LIMIT.replace('velocity="1"', 'velocity="-1"')),
-        "joint 'ja': velocity: from -1.0 to no limit",
-    ),
-    "mimic of nothing": (
-        arm_with(ja=LIMIT + '<mimic joint="x"/>'),
-        "joint 'ja': from a mimic of 'x' in the chain to one that moves by itself",
-    ),
-    "mimic": (
-        arm_with(ja=LIMIT + '<mimic joint="jb"/>'),
-        "joint 'ja': from a mimic of 'jb' in the chain to one that moves by itself",
-    ),
-    "spring": (
-        mjcf(f'<body name="b"><joint name="jb" stiffness="3"/>{SPHERE}</body>'),
-        "joint 'jb': stiffness: from 3.0 to 0",
-    ),
-    "coupled": (
-        BAD_MJCF["coupled"][0],
-        "joint 'ja': from one tied to another by equality 'c' to one that moves by itself",
-    ),
-    "tendon": (
-        mjcf(
-            "",
-            '<tendon><fixed name="t"><joint joint="ja" coef="1"/></fixed></tendon><equality><tendon'
-            ' name="e" tendon1="t"/></equality>',
-        ),
-        "joint 'ja': from one tied to another by tendon 'e' to one that moves by itself",
-    ),
-    "motion capture": (
-        mjcf("", '<equality><weld name="w" body1="m" body2="a"/></equality>').replace(
-            "<worldbody>", '<worldbody><body name="m" mocap="true"/>'
-        ),
-        "equality 'w': from 'm' and 'a' tied together to no tie",
-    ),
-    "mjcf inertia": (
-        mjcf(
-            '<body name="b"><joint/><inertial pos="0 0 .1" euler="0 30 0" mass="1" diaginertia=".01'
-            ' .01 .03"/></body>'
-        ),
-        (
-            "body 'b': inertia: from principal moments 0.01, 0.01, 0.03 to principal moments 0.015,"
-            " 0.015, 0.03"
-        ),
-    ),
-}
+    "negative torque": (arm_with(ja=LIMIT.replace("7", "-1")), "joint 'ja': effort: from -1.0 to no limit"),
+    "negative speed": (arm_with(ja=LIMIT.replace('velocity="1"', 'velocity="-1"')), "joint 'ja': velocity: from -1.0 to no limit"),
+    "mimic of nothing": (arm_with(ja=LIMIT + '<mimic joint="x"/>'), f"joint 'ja': from a mimic of 'x' in the chain to {BY_ITSELF}"),
+    "mimic": (arm_with(ja=LIMIT + '<mimic joint="jb"/>'), f"joint 'ja': from a mimic of 'jb' in the chain to {BY_ITSELF}"),
+    "spring": (BAD_MJCF["spring"][0], "joint 'jb': stiffness: from 3.0 to 0"),
+    "coupled": (BAD_MJCF["coupled"][0], f"joint 'ja': from one tied to another by equality 'c' to {BY_ITSELF}"),
+    "tendon": (mjcf("", '<tendon><fixed name="t"><joint joint="ja" coef="1"/></fixed></tendon><equality><tendon name="e" tendon1="t"/></equality>'), f"joint 'ja': from one tied to another by tendon 'e' to {BY_ITSELF}"),
+    "motion capture": (mjcf("", '<equality><weld name="w" body1="m" body2="a"/></equality>').replace("<worldbody>", '<worldbody><body name="m" mocap="true"/>'), "equality 'w': from 'm' and 'a' tied together to no tie"),
+    "mjcf inertia": (mjcf('<body name="b"><joint/><inertial pos="0 0 .1" euler="0 30 0" mass="1" diaginertia=".01 .01 .03"/></body>'), "body 'b': inertia: from principal moments 0.01, 0.01, 0.03 to principal moments 0.015, 0.015, 0.03"),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", WITH_REPAIR)
@@ -887,25 +690,21 @@ def test_repair_mends_and_lists(name, file):
 def test_the_change_is_the_smallest(inertia, also, file):
     """No positive matrix is nearer to the second moments of the file, and mass and centre stay."""
     solid = weighing(inertia, also=also)
+    path = file(arm_with(link("x", solid), joint("jx", "b", "x", "fixed", "")))
     with pytest.warns(UserWarning, match="repaired"):
-        arm = ij.robots.load(
-            file(arm_with(link("x", solid), joint("jx", "b", "x", "fixed", ""))),
-            tip="b",
-            repair=True,
-        )
+        arm = ij.robots.load(path, tip="b", repair=True)
     assert len(arm.repaired) == 1
     plain = ij.robots.load(file(arm_with()), tip="b")
     numbers = ("mass", "centre", "inertia")
-    gained = sum(
-        sign
-        * np.asarray(ij.robots.spatial.pseudo_inertia(*(getattr(x, name)[1] for name in numbers)))
-        for sign, x in ((1, arm), (-1, plain))
+    after, before = (
+        np.asarray(ij.robots.spatial.pseudo_inertia(*(getattr(x, name)[1] for name in numbers)))
+        for x in (arm, plain)
     )
     turned, place = np.eye(4), np.eye(4)
     turned[:3, :3] = rpy(0.3, 0.2, 0.1)
     turned[:3, 3], place[:3, :3], place[:3, 3] = [0, 0, 0.1], rpy(0.3, 0, 0), [0, 0, 0.2]
     back = np.linalg.inv(place @ turned)
-    P = back @ gained @ back.T
+    P = back @ (after - before) @ back.T
     np.testing.assert_allclose(P[3], [0, 0, 0, 1.5], atol=1e-14)
     (xx, yy, zz), (xy, xz, yz) = (map(float, x.split()) for x in (inertia, also))
     J = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
@@ -952,49 +751,23 @@ def test_what_no_rule_mends_is_refused(text, file):
 def test_mjcf_what_is_not_on_the_chain_refuses_no_file(file, recwarn):
     """Weights of meshes, springs, actuators without a joint, ties of tendons, bodies without
     weight: all beside the chain."""
-    beside = (
-        '<body name="x"><joint name="jx" stiffness="3" damping="1e11"/><geom type="mesh"'
-        ' mesh="m"/></body>'
-    )
-    beside += (
-        '<body name="y"><joint name="jy" type="ball"/><inertial pos="0 0 0" mass="0" diaginertia="0'
-        ' 0 0"/></body>'
-    )
-    beside += (
-        '<body name="z"><joint name="jz"/><inertial pos="0 0 0" mass="1" diaginertia="1 1 9"/><geom'
-        ' type="mesh" mesh="m"/></body>'
-    )
-    outside = (
-        '<tendon><fixed name="t"><joint joint="jx" coef="1"/><joint joint="jz"'
-        ' coef="1"/></fixed></tendon>'
-    )
-    outside += (
-        '<equality><tendon tendon1="t"/></equality><actuator><motor tendon="t"/><motor joint="ja"'
-        ' ctrlrange="-2 2"/></actuator>'
-    )
-    outside += '<default><default class="seen"><geom type="mesh" density="0"/></default>'
-    outside += (
-        '<default class="drawn"><geom type="capsule" fromto="0 0 0 0 0 1" size="0.1"'
-        ' mass="0"/></default></default>'
-    )
-    seen = (
-        '<body name="b"><joint name="jb" axis="0 1 0" range="-1 1"/><geom class="seen"'
-        ' mesh="m"/><geom size="0.2" pos="0 0 1"/>{}</body>'
-    )
+    beside = """<body name="x"><joint name="jx" stiffness="3" damping="1e11"/><geom type="mesh" mesh="m"/></body>
+      <body name="y"><joint name="jy" type="ball"/><inertial pos="0 0 0" mass="0" diaginertia="0 0 0"/></body>
+      <body name="z"><joint name="jz"/><inertial pos="0 0 0" mass="1" diaginertia="1 1 9"/><geom type="mesh" mesh="m"/></body>"""
+    outside = """<tendon><fixed name="t"><joint joint="jx" coef="1"/><joint joint="jz" coef="1"/></fixed></tendon>
+      <equality><tendon tendon1="t"/></equality><actuator><motor tendon="t"/><motor joint="ja" ctrlrange="-2 2"/></actuator>
+      <default><default class="seen"><geom type="mesh" density="0"/></default>
+      <default class="drawn"><geom type="capsule" fromto="0 0 0 0 0 1" size="0.1" mass="0"/></default></default>"""
+    seen = """<body name="b"><joint name="jb" axis="0 1 0" range="-1 1"/><geom class="seen" mesh="m"/>
+      <geom size="0.2" pos="0 0 1"/>{}</body>"""
     drawn = seen.format('<geom class="drawn"/>')
-    arm = ij.robots.load(
-        file(mjcf(drawn, outside).replace("<worldbody>", f"<worldbody>{beside}")), tip="b"
-    )
-    plain = ij.robots.load(
-        file(mjcf(seen.format("").replace('<geom class="seen" mesh="m"/>', ""))), tip="b"
-    )
+    path = file(mjcf(drawn, outside).replace("<worldbody>", f"<worldbody>{beside}"))
+    arm = ij.robots.load(path, tip="b")
+    undrawn = seen.format("").replace('<geom class="seen" mesh="m"/>', "")
+    plain = ij.robots.load(file(mjcf(undrawn), "plain.xml"), tip="b")
     assert not recwarn.list
     np.testing.assert_array_equal(arm.mass, plain.mass)
     np.testing.assert_array_equal(arm.inertia, plain.inertia)
     np.testing.assert_allclose(arm.effort, [2.0, np.inf])
     with pytest.raises(ValueError, match=r"body 'x'.*mesh"):
-        ij.robots.load(
-            file(mjcf(drawn, outside).replace("<worldbody>", f"<worldbody>{beside}")),
-            tip="x",
-            repair=True,
-        )
+        ij.robots.load(path, tip="x", repair=True)

@@ -58,18 +58,10 @@ def test_what_the_file_leaves_out_follows_from_the_arm(folder):
 
 
 def test_what_it_says_counts(folder):
-    text = (
-        ROBOT
-        + REFERENCE
-        + '[controller]\nkind = "computed_torque"\nKp = 30.0\nKd = 11.0\n[initial]\nq = [0.1, -1,'
-        " 1.4, -1.2, -1.5, 0.2]\n"
-    )
-    scenario = ij.load_scenario(
-        written(
-            folder,
-            text + '[parameters]\n"plant.payload" = 2.0\n"plant.link[forearm_link].mass" = 3.0\n',
-        )
-    )
+    text = ROBOT + REFERENCE + '[controller]\nkind = "computed_torque"\nKp = 30.0\nKd = 11.0\n'
+    text += "[initial]\nq = [0.1, -1, 1.4, -1.2, -1.5, 0.2]\n"
+    text += '[parameters]\n"plant.payload" = 2.0\n"plant.link[forearm_link].mass" = 3.0\n'
+    scenario = ij.load_scenario(written(folder, text))
     assert scenario.controller.law.Kp[3] == 30.0
     assert scenario.initial.q[0] == 0.1
     assert (float(scenario.plant.payload), float(scenario.model.payload)) == (2.0, 0.0)
@@ -95,29 +87,15 @@ def test_saved_it_needs_no_other_file(folder):
     ij.save_scenario(scenario, folder / "saved.toml")
     again = ij.load_scenario(folder / "saved.toml")
     assert jax.tree.structure(again) == jax.tree.structure(scenario)
-    assert all(
-        np.array_equal(a, b)
-        for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(scenario), strict=True)
-    )
+    jax.tree.map(np.testing.assert_array_equal, again, scenario)
     assert "urdf" not in (folder / "saved.toml").read_text()
 
 
 @pytest.mark.slow
 def test_simulate_from_the_command_line(folder, capsys):
     path = written(folder, ROBOT + REFERENCE + RUN)
-    assert (
-        main(
-            [
-                "simulate",
-                str(path),
-                "--set",
-                "plant.link[wrist_1_link].mass=1.3",
-                "--out",
-                str(folder / "out"),
-            ]
-        )
-        == 0
-    )
+    changed = ["--set", "plant.link[wrist_1_link].mass=1.3", "--out", str(folder / "out")]
+    assert main(["simulate", str(path), *changed]) == 0
     assert "status: ok" in capsys.readouterr().out
     saved = ij.load_scenario(folder / "out" / "scenario.toml")
     assert float(saved.plant.mass[3]) == 1.3
@@ -126,27 +104,14 @@ def test_simulate_from_the_command_line(folder, capsys):
 
 
 def test_studies_and_tuning_read_it_too(folder):
-    study = (
-        ROBOT
-        + REFERENCE
-        + RUN
-        + '[perturbations]\n"plant.link[forearm_link].mass" = { factor = "uniform", low = 0.8, high'
-        " = 1.2 }\n"
-    )
-    path = written(folder, study + "[study]\nruns = 4\n")
-    assert list(load_study_file(path, "study").perturbations) == ["plant.link[forearm_link].mass"]
-    path = written(
-        folder,
-        ROBOT + REFERENCE + RUN + '[sweep]\n[grid]\n"plant.link[forearm_link].mass" = [2.0, 3.0]\n',
-    )
-    assert list(load_study_file(path, "sweep").grid) == ["plant.link[forearm_link].mass"]
-    path = written(
-        folder,
-        ROBOT
-        + REFERENCE
-        + RUN
-        + '[tune]\nparameters = ["controller.K2"]\n[[objective]]\nkind = "tracking"\n',
-    )
+    mass, base = "plant.link[forearm_link].mass", ROBOT + REFERENCE + RUN
+    draws = f'[perturbations]\n"{mass}" = {{ factor = "uniform", low = 0.8, high = 1.2 }}\n'
+    path = written(folder, base + draws + "[study]\nruns = 4\n")
+    assert list(load_study_file(path, "study").perturbations) == [mass]
+    path = written(folder, base + f'[sweep]\n[grid]\n"{mass}" = [2.0, 3.0]\n')
+    assert list(load_study_file(path, "sweep").grid) == [mass]
+    tune = '[tune]\nparameters = ["controller.K2"]\n[[objective]]\nkind = "tracking"\n'
+    path = written(folder, base + tune)
     assert load_tuning_file(path)["scenario"].n == 6
 
 

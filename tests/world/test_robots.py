@@ -1,5 +1,5 @@
-"""Robots against independent sources: the closed form, kinetic energy from positions, energy
-balance, the identities of C."""
+"""Robots against independent sources: the closed form, kinetic energy from positions, the
+identities of C."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from iblf_jax.robots import (
 )
 
 import iblf_jax as ij
-from iblf_jax.simulation import integrators
 
 
 def random_links(n, rng):
@@ -45,20 +44,16 @@ def everything(robot, q, v, u):
     )
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_chain_of_two_is_the_closed_form(seed):
-    rng = np.random.default_rng(seed)
-    links = random_links(2, rng)
-    q, v, u = rng.uniform(-3, 3, (3, 2))
-    for a, b in zip(
-        everything(PlanarChain(**links), q, v, u),
-        everything(TwoLink(**links), q, v, u),
-        strict=True,
-    ):
-        np.testing.assert_allclose(a, b, rtol=0, atol=1e-12)
+def test_chain_of_two_is_the_closed_form(rng):
+    for _ in range(5):
+        links = random_links(2, rng)
+        q, v, u = rng.uniform(-3, 3, (3, 2))
+        pair = (everything(kind(**links), q, v, u) for kind in (PlanarChain, TwoLink))
+        for a, b in zip(*pair, strict=True):
+            np.testing.assert_allclose(a, b, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("n", [1, 2, 3, 5, 7])
+@pytest.mark.parametrize("n", [1, 3, 7])
 def test_mass_rate_minus_two_c_is_skew(n, rng):
     robot = PlanarChain(**random_links(n, rng))
 
@@ -74,21 +69,12 @@ def test_mass_rate_minus_two_c_is_skew(n, rng):
         assert modes[0] > 0
 
 
-def test_closed_form_is_skew_too(rng):
-    robot = TwoLink(**random_links(2, rng))
-    for _ in range(20):
-        q, v, x = rng.uniform(-3, 3, (3, 2))
-        N = np.asarray(mass_matrix_rate(robot, q, v)) @ x - 2 * np.asarray(robot.coriolis(q, v, x))
-        assert abs(x @ N) <= 1e-12
-
-
-@pytest.mark.parametrize("n", [2, 4])
-def test_kinetic_and_potential_energy_from_positions(n, rng):
+def test_kinetic_and_potential_energy_from_positions(rng):
     """1/2 q'^T M q' = sum 1/2 m |velocity of the centre|^2 + 1/2 I omega^2, from where the centres
     are."""
-    links = random_links(n, rng)
+    links = random_links(4, rng)
     robot = PlanarChain(**links)
-    q, v = rng.uniform(-3, 3, (2, n))
+    q, v = rng.uniform(-3, 3, (2, 4))
 
     def centres(q):
         theta = np.cumsum(q)
@@ -104,7 +90,7 @@ def test_kinetic_and_potential_energy_from_positions(n, rng):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("n", [1, 2, 5, 12])
+@pytest.mark.parametrize("n", [1, 5])
 def test_sums_along_a_chain_are_the_products_of_its_matrices(n, rng):
     """H_ij = A_ij cos(phi_i - phi_j) of the absolute angles, with the lever arms of all masses."""
     links = random_links(n, rng)
@@ -138,51 +124,7 @@ def test_lumped_parameters_of_the_customary_arm():
     np.testing.assert_allclose(p, [0.226625, 0.0408425, 0.0461125, 0.6475, 0.13175], rtol=1e-12)
 
 
-def test_energy_of_a_falling_arm_is_kept_and_friction_takes_it(rng):
-    """No torque: dE/dt = 0 along the motion, and with viscous friction dE/dt = -viscous |q'|^2, by
-    RK4 over a second."""
-    robot = TwoLink(**random_links(2, rng))
-
-    @jax.jit
-    def fall(viscous):
-        def slope(t, x):
-            q, v, _ = x
-            force = -viscous * v - robot.coriolis(q, v, v) - robot.gravity(q)
-            return v, jnp.linalg.solve(robot.mass_matrix(q), force), viscous * v @ v
-
-        def one(x, i):
-            return (
-                integrators.step("rk4", lambda t, x: (slope(t, x), None), i * 1e-3, x, 1e-3).state,
-                None,
-            )
-
-        x0 = (jnp.asarray([0.3, -0.4]), jnp.asarray([0.5, 1.0]), jnp.zeros(()))
-        x1, _ = jax.lax.scan(one, x0, jnp.arange(1000.0))
-        energy = [0.5 * v @ robot.mass_matrix(q) @ v + robot.potential(q) for q, v, _ in (x0, x1)]
-        return energy[1] - energy[0], x1[2]
-
-    for viscous in (0.0, 0.3):
-        gained, lost = fall(viscous)
-        assert float(gained) == pytest.approx(-float(lost), abs=1e-7)
-    assert float(lost) > 0.1
-
-
-@pytest.mark.slow
-def test_payload_hangs_at_the_tip(rng):
-    """A payload m adds J^T m J to M and -J^T (0, -m g) to G."""
-    links = random_links(3, rng) | {"payload": 0.0}
-    empty, loaded = PlanarChain(**links), PlanarChain(**(links | {"payload": 0.6}))
-    q = jnp.asarray(rng.uniform(-3, 3, 3))
-    J = np.asarray(empty.jacobian(q))
-    np.testing.assert_allclose(
-        loaded.mass_matrix(q) - empty.mass_matrix(q), 0.6 * J.T @ J, atol=1e-12
-    )
-    np.testing.assert_allclose(
-        loaded.gravity(q) - empty.gravity(q), J.T @ [0, 0.6 * 9.81], atol=1e-12
-    )
-
-
-@pytest.mark.parametrize("n", [1, 2, 4, 7])
+@pytest.mark.parametrize("n", [2, 7])
 def test_small_algebra_against_numpy(n, rng):
     from iblf_jax.core.linalg import solve_spd
 

@@ -85,18 +85,6 @@ def test_trajectory_and_order_with_switches_between_the_instants():
     assert float(fine.metrics["mean_dwell_time"]) == pytest.approx(0.7021 / 2)
 
 
-@pytest.mark.release
-def test_derivative_by_a_switching_time():
-    def end(time):
-        plant = plants.Switched(LINK, {"mass[0]": MASSES[:2]}, [0.31])
-        scenario = ij.with_parameters(scenario_of(plant), {"plant.times[0]": time})
-        return ij.simulate(scenario, duration=0.5, dt=1e-2, backend="vmap").q[-1, 0]
-
-    slope = float(jax.grad(end)(0.313))
-    assert slope == pytest.approx(float(end(0.314) - end(0.312)) / 2e-3, rel=1e-4)
-    assert abs(slope) > 1e-3
-
-
 def test_members_of_the_inner_plant_are_passed_through():
     drive = plants.ElectricDrive(
         LINK, torque_constant=0.9, inductance=0.025, resistance=5.0, back_emf=0.9
@@ -112,16 +100,6 @@ def test_members_of_the_inner_plant_are_passed_through():
     assert scenario.model is LINK or scenario.model.mass is LINK.mass
     both = ij.with_parameters(scenario, {"robot.mass[0]": 0.9})
     assert float(both.model.mass[0]) == 0.9 == float(both.plant.mass[0])
-
-
-def test_a_file_gives_plants_with_modes_back():
-    from iblf_jax.files.scenario import from_dict, scenario_to_dict
-
-    markov = plants.MarkovSwitched(LINK, {"mass[0]": MASSES}, rates=Q, switches=4)
-    for plant in (SWITCHED, markov):
-        loaded = from_dict(scenario_to_dict(scenario_of(plant))).scenario
-        assert type(loaded.plant) is type(plant)
-        assert loaded.plant.parameters[0].path == "mass[0]"
 
 
 # --- a Markov chain -------------------------------------------------------------------------------
@@ -174,16 +152,9 @@ def test_every_run_of_a_study_has_a_path_of_its_own():
     plant = plants.MarkovSwitched(LINK, {"mass[0]": MASSES}, rates=Q, switches=2)
 
     def make(runs, chunk):
-        return ij.monte_carlo(
-            scenario_of(plant),
-            {},
-            runs=runs,
-            duration=0.5,
-            dt=1e-2,
-            metrics=(ij.metrics.Tracking(),),
-            progress=False,
-            executor=ij.studies.LocalExecutor(chunk=chunk),
-        )
+        how = {"duration": 0.5, "dt": 1e-2, "metrics": (ij.metrics.Tracking(),), "progress": False}
+        executor = ij.studies.LocalExecutor(chunk=chunk)
+        return ij.monte_carlo(scenario_of(plant), {}, runs=runs, executor=executor, **how)
 
     every, some = make(600, None), make(300, 256)
     for name in ("ise", "switches", "shortest_dwell_time"):

@@ -12,7 +12,7 @@ from iblf_jax.bounds import tube_at
 from scipy.interpolate import make_interp_spline
 
 import iblf_jax as ij
-from iblf_jax import bounds, controllers, disturbances, references
+from iblf_jax import bounds, disturbances, references
 from iblf_jax.simulation import closed_loop
 
 TWO_LINK = ij.presets.customary_two_link()
@@ -80,7 +80,7 @@ def test_spline_passes_its_waypoints_and_rests_at_the_ends():
             )
 
 
-@pytest.mark.parametrize("m", [1, 3, 4])
+@pytest.mark.parametrize("m", [1, 4])
 def test_spline_with_more_derivatives_rests_at_its_ends(m):
     """Its first m derivatives vanish at the ends, where the next one jumps."""
     spline = references.WaypointSpline(TIMES, POINTS, derivatives=m)
@@ -98,7 +98,7 @@ def test_spline_with_more_derivatives_rests_at_its_ends(m):
             np.testing.assert_allclose(before[order], after[order], atol=1e-5 * 10**order)
 
 
-@pytest.mark.parametrize("m", [1, 2, 4])
+@pytest.mark.parametrize("m", [1, 4])
 def test_smooth_step_has_the_derivatives_that_it_states(m):
     start, end, duration = np.asarray([0.1, 0.5]), np.asarray([0.9, -0.2]), 2.5
     step = references.SmoothStep(start, end, duration, derivatives=m)
@@ -121,21 +121,12 @@ def test_smooth_step_of_two_derivatives_is_the_quintic():
         np.testing.assert_allclose(one.position(t), other.position(t), atol=1e-14)
 
 
-@pytest.mark.parametrize(
-    ("reference", "name"),
-    [
-        (lambda m: references.SmoothStep(0.0, 1.0, 1.0, derivatives=m), "SmoothStep"),
-        (
-            lambda m: references.WaypointSpline((0.0, 1.0), [[0.0], [1.0]], derivatives=m),
-            "WaypointSpline",
-        ),
-    ],
-    ids=["step", "spline"],
-)
 @pytest.mark.parametrize("m", [0, 13, 2.5])
-def test_numbers_of_derivatives_that_are_refused(reference, name, m):
-    with pytest.raises(ValueError, match=f"{name}.derivatives: got {m}"):
-        reference(m)
+def test_numbers_of_derivatives_that_are_refused(m):
+    with pytest.raises(ValueError, match=f"SmoothStep.derivatives: got {m}"):
+        references.SmoothStep(0.0, 1.0, 1.0, derivatives=m)
+    with pytest.raises(ValueError, match=f"WaypointSpline.derivatives: got {m}"):
+        references.WaypointSpline((0.0, 1.0), [[0.0], [1.0]], derivatives=m)
 
 
 def test_the_heading_on_an_ellipse_is_along_its_tangent():
@@ -177,18 +168,10 @@ def test_tube_rates_against_finite_differences(sides):
     h = 1e-6
     for t in (0.0, 0.8, 7.1):
         tube, ahead, behind = at(t), at(t + h), at(t - h)
-        for value, rate in (
-            ("q_d", "dq_d"),
-            ("dq_d", "ddq_d"),
-            ("lower", "dlower"),
-            ("upper", "dupper"),
-            ("k_l", "dk_l"),
-            ("k_u", "dk_u"),
-        ):
-            difference = (
-                np.asarray(getattr(ahead, value)) - np.asarray(getattr(behind, value))
-            ) / (2 * h)
-            np.testing.assert_allclose(getattr(tube, rate), difference, atol=1e-8)
+        for value in ("q_d", "dq_d", "lower", "upper", "k_l", "k_u"):
+            difference = (getattr(ahead, value) - getattr(behind, value)) / (2 * h)
+            rate = getattr(tube, "ddq_d" if value == "dq_d" else f"d{value}")
+            np.testing.assert_allclose(rate, difference, atol=1e-8)
         np.testing.assert_allclose(tube.xi(tube.upper), 1.0, rtol=1e-12)
         np.testing.assert_allclose(tube.xi(tube.lower), -1.0, rtol=1e-12)
         np.testing.assert_allclose(tube.xi(tube.q_d), 0.0)
@@ -207,24 +190,6 @@ def test_the_tube_has_the_acceleration_of_its_reference(reference):
     at, tube = derivatives(reference.position, 2), jax.jit(lambda t: tube_at(reference, sides, t))
     for t in (0.3, 1.7, 2.4):
         np.testing.assert_allclose(tube(t).ddq_d, at(t)[2], rtol=1e-12, atol=1e-12)
-
-
-@pytest.mark.slow
-def test_an_acceleration_that_is_not_used_costs_nothing(paper, monkeypatch):
-    """The same operations as without it.  Two guards, so that the second program is not the first
-    one from a cache."""
-
-    def counted(guard):
-        law = ij.controllers.Backstepping(
-            k1=2.0, K2=20.0, barrier=ij.barriers.Integral(guard=guard)
-        )
-        return ij.explain(ij.with_parts(paper, controller=law)).counts
-
-    with_it = counted(1.1e-3)
-    monkeypatch.setattr(
-        controllers._base, "tube_at", lambda *args, acceleration: tube_at(*args, acceleration=False)
-    )
-    assert counted(1.2e-3) == with_it
 
 
 def test_a_reference_needs_two_derivatives_and_no_third():
@@ -290,12 +255,6 @@ def test_disturbances_by_hand(rng):
     np.testing.assert_array_equal(both.jump_times(), [3.0, 5.0])
 
 
-def test_friction_takes_power(rng):
-    friction = disturbances.Friction(viscous=0.5, coulomb=0.2)
-    for dq in rng.normal(size=(50, 2)):
-        assert dq @ torque(friction, 0.0, np.zeros(2), dq) < 0
-
-
 def test_tip_force_does_the_work_that_it_should(rng):
     """Virtual work: F . d tip = tau . dq."""
     push = disturbances.TipForce(
@@ -319,17 +278,10 @@ def test_the_papers_disturbance(rng):
     f = ij.presets.zhang_yan_2024().disturbance
     q, dq, t = rng.uniform(-1, 1, 2), rng.normal(size=2), 1.7
     M, C, _, _ = independent.Loop().arm(q)
-    a, b = (
-        0.3 * np.asarray([np.sin(t), np.cos(t)]),
-        0.3 * np.asarray([np.cos(t / 2), np.sin(t / 2)]),
-    )
-    np.testing.assert_allclose(torque(f, t, q, dq), M @ a + C(dq) @ b, rtol=1e-12)
+    for phase in (0.0, 1.0):
+        a = 0.3 * np.asarray([np.sin(t + phase), np.cos(t + phase)])
+        b = 0.3 * np.asarray([np.cos(t / 2 + phase), np.sin(t / 2 + phase)])
+        shifted = dataclasses.replace(f, phase=phase)
+        np.testing.assert_allclose(torque(shifted, t, q, dq), M @ a + C(dq) @ b, rtol=1e-12)
     heavy = dataclasses.replace(TWO_LINK, mass=[5.0, 5.0])
     np.testing.assert_array_equal(torque(f, t, q, dq, heavy), torque(f, t, q, dq))
-    shifted = dataclasses.replace(f, phase=1.0)
-    np.testing.assert_allclose(
-        torque(shifted, t, q, dq),
-        M @ (0.3 * np.asarray([np.sin(t + 1), np.cos(t + 1)]))
-        + C(dq) @ (0.3 * np.asarray([np.cos(t / 2 + 1), np.sin(t / 2 + 1)])),
-        rtol=1e-12,
-    )
