@@ -64,9 +64,7 @@ PLANTS = {
     ),
     "vessel": ij.presets.cybership_ii(),
     "switched": plants.Switched(
-        ij.presets.motor_driven_pendulum().plant,
-        {"D": (1.0, 1.5, 0.8)},
-        times=[0.3, 0.9],
+        ij.presets.motor_driven_pendulum().plant, {"D": (1.0, 1.5, 0.8)}, times=[0.3, 0.9]
     ),
     "markov_switched": plants.MarkovSwitched(
         ij.presets.cybership_ii(),
@@ -312,11 +310,7 @@ LAWS = {
     ),
     "adaptive_rbf": controllers.AdaptiveRBF(k1=2.0, K2=[20.0, 15.0], o=0.1, nodes=8),
     "adaptive_rbf_fuzzy": controllers.AdaptiveRBF(
-        k1=2.0,
-        K2=[20.0, 15.0],
-        nodes=8,
-        barrier=barriers.PrescribedPerformance(),
-        normalised=True,
+        k1=2.0, K2=[20.0, 15.0], nodes=8, barrier=barriers.PrescribedPerformance(), normalised=True
     ),
     "adaptive_network": controllers.AdaptiveNetwork(
         k1=2.0, K2=[20.0, 15.0], nodes=4, barrier=barriers.TransformedError(), weight=[0.5, 2.0]
@@ -390,7 +384,7 @@ INPUT_MAPS = {
         drive=plants.ElectricDrive(
             TWO_LINK, torque_constant=[2.0, 1.5], inductance=0.02, resistance=1.0, back_emf=0.5
         ),
-    ),
+    )
 }
 """Laws that command another input than a torque, for a plant of their own."""
 
@@ -416,11 +410,7 @@ FAMILIES = {
     "side": (SIDES, bounds.MEMBERS, ij.testing.check_side),
     "region": (REGIONS, regions.MEMBERS, ij.testing.check_region),
     "disturbance": (DISTURBANCES, disturbances.MEMBERS, ij.testing.check_disturbance),
-    "process_noise": (
-        PROCESS_NOISES,
-        process_noise.MEMBERS,
-        ij.testing.check_process_noise,
-    ),
+    "process_noise": (PROCESS_NOISES, process_noise.MEMBERS, ij.testing.check_process_noise),
     "barrier": (BARRIERS, barriers.MEMBERS, ij.testing.check_barrier),
     "decay": (DECAYS, decays.MEMBERS, ij.testing.check_decay),
     "observer": (OBSERVERS | LEVEL_OBSERVERS, observers.MEMBERS, ij.testing.check_observer),

@@ -29,7 +29,6 @@ CALM = SWEEP.replace("std = 0.05", "std = 0.001").replace("300", "3")
 def command(capsys, monkeypatch, tmp_path):
     """Runs the CLI in a folder of its own; returns exit code, stdout and stderr."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     for name, text in (("study.toml", STUDY), ("sweep.toml", SWEEP), ("calm.toml", CALM)):
         (tmp_path / name).write_text(text)
 
@@ -42,13 +41,8 @@ def command(capsys, monkeypatch, tmp_path):
 
 def test_files_are_the_arguments_of_the_functions():
     file = study_file.study_from_dict(tomllib.loads(SWEEP), "sweep")
-    assert file.options == {
-        "duration": 0.02,
-        "method": "euler",
-        "runs": 300,
-        "seed": 3,
-        "unit": 256,
-    }
+    expected = {"duration": 0.02, "method": "euler", "runs": 300, "seed": 3, "unit": 256}
+    assert file.options == expected
     assert file.grid == {"controller.K2": [10.0, 20.0, 40.0], "observer.kf": [10.0, 20.0]}
     expected = cases.perturbations()
     assert list(file.perturbations) == list(expected)
@@ -64,15 +58,8 @@ def test_files_are_the_arguments_of_the_functions():
 def test_montecarlo(command, tmp_path):
     code, out, err = command("montecarlo", "study.toml", "--out", "runs.nc", "--quiet")
     assert code == 1, err
-    for word in (
-        "300 runs",
-        "95% interval",
-        "worst runs",
-        "rank correlation",
-        "plant.mass[1]",
-        "initial.q[1]",
-        "settling_time",
-    ):
+    words = ("300 runs", "95% interval", "worst runs", "rank correlation")
+    for word in (*words, "plant.mass[1]", "initial.q[1]", "settling_time"):
         assert word in out
     xarray = pytest.importorskip("xarray")
     data = xarray.load_dataset(tmp_path / "runs.nc", engine="scipy")
@@ -278,7 +265,6 @@ def test_a_distribution_of_ones_own_is_named_in_files(tmp_path, monkeypatch):
         ("montecarlo", "study.toml", "--out", "runs.csv"),
         ("montecarlo", "study.toml", "--runs", "0"),
         ("montecarlo", "study.toml", "--chunk", "0"),
-        ("montecarlo", "study.toml", "--devices", "100000"),
         ("montecarlo", "study.toml", "--devices", "200"),
         ("sweep", "study.toml"),
     ],
@@ -302,19 +288,3 @@ def test_a_scheduler_that_cannot_be_reached_ends_with_2_and_one_line(
     assert code == 2
     assert ("127.0.0.1:1" in err) if installed else ("pip install distributed" in err)
     assert err.count("iblf-jax: error") == 1
-
-
-def test_ij_names_are_there():
-    names = (
-        "monte_carlo",
-        "sweep",
-        "load_sweep",
-        "sensitivity",
-        "Study",
-        "StoreError",
-        "uniform",
-        "normal",
-        "log_uniform",
-        "choice",
-    )
-    assert all(hasattr(ij, name) for name in (*names, "factor", "offset", "value"))

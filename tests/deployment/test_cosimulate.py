@@ -11,7 +11,6 @@ from arm_cases import ARMS
 import iblf_jax as ij
 
 mujoco = pytest.importorskip("mujoco")
-from iblf_jax.deployment.film import has_shapes
 from iblf_jax.deployment.mujoco_plant import MujocoPlant
 
 TIMING = {"duration": 0.4, "dt": 5e-4}
@@ -61,18 +60,13 @@ def largest_difference(a, b) -> float:
 
 
 CHAINED = ij.with_parts(
-    DRIVEN,
-    actuator=ij.actuators.Chain(
-        (ij.actuators.Motor(bandwidth=900.0), ij.actuators.Motor(limit=[15.0, 5.0]))
-    ),
+    DRIVEN, actuator=ij.actuators.Chain((ij.actuators.Motor(bandwidth=900.0), DRIVEN.actuator))
 )
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "scenario",
-    [ij.with_parts(PAPER, sampling=ij.Sampling(2e-3)), DRIVEN, CHAINED],
-    ids=["ideal", "driven", "chained"],
+    "scenario", [ij.with_parts(PAPER, sampling=ij.Sampling(2e-3)), CHAINED], ids=["ideal", "driven"]
 )
 def test_on_the_nominal_arm_it_is_simulate(scenario):
     run = ij.simulate(scenario, **TIMING, seed=3)
@@ -137,24 +131,6 @@ FINGER = (
     '<body name="finger" pos="0.1 0 0"><joint name="grip" type="slide" axis="0 1 0"/><geom'
     ' size="0.01" mass="0.2"/></body>'
 )
-
-
-@pytest.mark.release
-def test_what_else_moves_on_the_arm_is_locked_and_what_stands_apart_is_free():
-    ball = '<body name="ball" pos="9 9 9"><freejoint/><geom size="0.1"/></body>'
-    named = ij.robots.load(_written("arm.xml", two_link(PAPER.plant, inside=FINGER)), tip="fore")
-    scenario = ij.with_parts(PAPER, robot=named, sampling=ij.Sampling(1e-3))
-    expected = ij.simulate(scenario, **TIMING)
-    spec = spec_of(PAPER.plant, inside=FINGER, outside=ball)
-    found = ij.cosimulate(scenario, spec, **TIMING)
-    assert largest_difference(found.q, expected.q) < 1e-9
-    elsewhere = ij.robots.load(
-        _written("arm.xml", two_link(PAPER.plant, inside=FINGER)), tip="fore", locked={"grip": 0.2}
-    )
-    away = ij.simulate(ij.with_parts(scenario, plant=elsewhere, model=named), **TIMING)
-    found = ij.cosimulate(scenario, spec, locked={"grip": 0.2}, **TIMING)
-    assert largest_difference(found.q, away.q) < 1e-9
-    assert largest_difference(found.q, expected.q) > 1e-5
 
 
 @pytest.mark.slow
@@ -274,48 +250,30 @@ def test_a_run_that_flies_away_is_told():
 
 
 @pytest.mark.slow
-def test_records_and_films(tmp_path):
-    from PIL import Image
-
+def test_records(tmp_path):
     short = {"duration": 0.2, "dt": 1e-3, "period": 1e-3}
     every = ij.cosimulate(DRIVEN, spec_of(PAPER.plant), **short)
-    some = ij.cosimulate(
-        DRIVEN, spec_of(PAPER.plant), record_every=10, film=tmp_path / "arm.gif", **short
-    )
+    some = ij.cosimulate(DRIVEN, spec_of(PAPER.plant), record_every=10, **short)
     assert some.t.shape == (21,)
     np.testing.assert_array_equal(some.q, every.q[::10])
     np.testing.assert_array_equal(some.actuator_state, every.actuator_state[::10])
     np.testing.assert_array_equal(some.metrics.rmse, every.metrics.rmse)
     some.to_xarray()
     ij.save_rollouts(some, tmp_path / "run.nc")
-    with Image.open(tmp_path / "arm.gif") as film:
-        assert film.n_frames == 6
-
-
-def test_an_arm_without_shapes_is_drawn_as_its_skeleton():
-    shapes = spec_of(PAPER.plant)
-    bare = mujoco.MjModel.from_xml_path(str(ARMS / "iiwa14.urdf"))
-    assert has_shapes(shapes.compile())
-    assert not has_shapes(bare)
-    shapes.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.1, 0.1, 0.1])
-    for geom in shapes.geoms:
-        geom.group = 0 if geom.parent == shapes.worldbody else 3
-    assert not has_shapes(shapes.compile()), "a table does not move, and other groups are not drawn"
 
 
 @pytest.mark.slow
 def test_films_may_follow_each_other(tmp_path):
     """Without a display MuJoCo's renderer fails once, and ends the process at the second try."""
+    from PIL import Image
+
+    run = {"period": 1e-3, "duration": 0.08, "dt": 1e-3}
     for ending in ("gif", "html"):
-        ij.cosimulate(
-            PAPER,
-            spec_of(PAPER.plant),
-            period=1e-3,
-            duration=0.05,
-            dt=1e-3,
-            film=tmp_path / f"arm.{ending}",
-        )
-        assert (tmp_path / f"arm.{ending}").stat().st_size > 1000
+        film = tmp_path / f"arm.{ending}"
+        ij.cosimulate(PAPER, spec_of(PAPER.plant), film=film, **run)
+        assert film.stat().st_size > 1000
+    with Image.open(tmp_path / "arm.gif") as film:
+        assert film.n_frames == 3
 
 
 @pytest.mark.slow
@@ -328,21 +286,16 @@ def test_a_shorter_period_finds_room_for_its_commands():
     assert largest_difference(run.q, expected.q) < 1e-12
 
 
+BRIEF = {"duration": 0.1, "period": 1e-3}
 BAD = {
     "no period": ({}, {}, "period"),
     "steps": ({}, {"period": 1e-3, "dt": 3e-4}, "Take dt=0.00025"),
     "integrator": ({}, {"period": 1e-3, "integrator": "rk4"}, "RK4"),
     "joints": ({"inside": FINGER}, {"period": 1e-3}, "3 joints that move"),
     "locked": ({}, {"period": 1e-3, "locked": {"wrist": 0.0}}, "wrist.*shoulder"),
-    "floating": (
-        {"outside": ""},
-        {"period": 1e-3, "locked": {"shoulder": 0.0}},
-        "1 joints that move",
-    ),
     "too few": ({}, {"period": 1e-3, "locked": {"elbow": 0.0}}, "1 joints that move.*Only hinges"),
     "film": ({}, {"period": 1e-3, "film": "arm.mp4"}, "film.*gif"),
     "no number": ({}, {"period": 1e-3, "locked": {"elbow": float("nan")}}, "locked"),
-    "a word": ({}, {"period": 1e-3, "locked": {"elbow": "a"}}, "locked"),
     "duration": ({}, {"period": 7e-4, "duration": 0.1}, r"Take duration=0\.10\d*\.$"),
 }
 
@@ -356,10 +309,10 @@ def test_what_does_not_fit_is_named(case):
 
 def test_what_is_no_model_or_no_single_scenario_is_named():
     with pytest.raises(ValueError, match=r"plant.*MjSpec"):
-        ij.cosimulate(PAPER, 3, duration=0.1, period=1e-3)
+        ij.cosimulate(PAPER, 3, **BRIEF)
     many = jax.tree.map(lambda x: np.stack([x, x]), PAPER)
     with pytest.raises(ValueError, match="one scenario"):
-        ij.cosimulate(many, spec_of(PAPER.plant), duration=0.1, period=1e-3)
+        ij.cosimulate(many, spec_of(PAPER.plant), **BRIEF)
 
 
 @pytest.mark.slow
@@ -376,33 +329,24 @@ def test_a_urdf_whose_meshes_are_not_there_touches_nothing():
 
 def test_files_and_names_that_do_not_fit():
     with pytest.raises(ValueError, match=r"nowhere\.xml"):
-        ij.cosimulate(PAPER, "nowhere.xml", duration=0.1, period=1e-3)
+        ij.cosimulate(PAPER, "nowhere.xml", **BRIEF)
     with pytest.raises(ValueError, match="body"):
         ij.cosimulate(
             PAPER,
             _written("bad.xml", "<mujoco><worldbody><body pos='a'/></worldbody></mujoco>"),
-            duration=0.1,
-            period=1e-3,
+            **BRIEF,
         )
     arm = ij.robots.load(_written("arm.xml", two_link(PAPER.plant)))
     other = _written("other.xml", two_link(PAPER.plant).replace("elbow", "elbows"))
     with pytest.raises(ValueError, match=r"elbow.*elbows"):
-        ij.cosimulate(ij.with_parts(PAPER, robot=arm), other, duration=0.1, period=1e-3)
+        ij.cosimulate(ij.with_parts(PAPER, robot=arm), other, **BRIEF)
     floating = two_link(PAPER.plant).replace(
         '<body name="upper">', '<body name="base"><freejoint/><geom size="0.1"/><body name="upper">'
     )
     text = floating.replace("</body></body>", "</body></body></body>")
     with pytest.raises(ValueError, match="base that stands still"):
-        ij.cosimulate(
-            ij.with_parts(PAPER, robot=arm),
-            _written("floating.xml", text),
-            duration=0.1,
-            period=1e-3,
-        )
+        ij.cosimulate(ij.with_parts(PAPER, robot=arm), _written("floating.xml", text), **BRIEF)
     with pytest.raises(ValueError, match="MjModel"):
         ij.cosimulate(
-            ij.with_parts(PAPER, robot=arm),
-            spec_of(PAPER.plant, inside=FINGER).compile(),
-            duration=0.1,
-            period=1e-3,
+            ij.with_parts(PAPER, robot=arm), spec_of(PAPER.plant, inside=FINGER).compile(), **BRIEF
         )

@@ -17,7 +17,7 @@ from iblf_jax.deployment import export
 from iblf_jax.simulation.scenario import canonical
 
 SAMPLING = ij.Sampling(period=1e-3)
-DURATION = 0.1
+DURATION = 0.08
 STRICT = ("-O0", "-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-Wconversion")
 
 
@@ -49,7 +49,7 @@ def noisy():
 def switched():
     """A loop whose plant changes its mass."""
     plant = ij.presets.zhang_yan_2024().plant
-    return robot(plant=ij.plants.Switched(plant, {"mass[1]": (0.85, 1.5)}, [0.05]))
+    return robot(plant=ij.plants.Switched(plant, {"mass[1]": (0.85, 1.5)}, [0.04]))
 
 
 FILTERED = Encoder(velocity=FilteredDifference(cutoff=200.0))

@@ -4,13 +4,13 @@
 from __future__ import annotations
 
 import json
-import subprocess
 
 import jax
 import jax.numpy as jnp
 import loops_of_plants
 import numpy as np
 import pytest
+from test_export_parts import self_test
 
 import iblf_jax as ij
 from iblf_jax.deployment import control_law
@@ -19,32 +19,17 @@ from iblf_jax.deployment.signal_units import one_unit, per_time
 from iblf_jax.simulation.closed_loop import initial_state
 from iblf_jax.simulation.scenario import canonical
 
-STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-Wconversion")
 PERIOD = 1e-3
 CASES = loops_of_plants.CASES | {"rigid law": loops_of_plants.rigid_law}
 
 
-def self_test(folder):
-    """Builds and runs the self-test of a folder."""
-    command = ["gcc", *STRICT, "iblf_law.c", "selftest.c", "-lm", "-o", "selftest"]
-    built = subprocess.run(command, cwd=folder, capture_output=True, text=True)
-    assert built.returncode == 0, built.stderr
-    ran = subprocess.run(["./selftest"], cwd=folder, capture_output=True, text=True)
-    assert ran.returncode == 0, ran.stdout
-    return ran.stdout
-
-
-QUICK = ("user class", "electric drive")
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("reference", ["inside", "given"])
 @pytest.mark.parametrize(
-    "case", [x if x in QUICK else pytest.param(x, marks=pytest.mark.slow) for x in CASES]
+    ("case", "reference"), [*((case, "inside") for case in CASES), ("electric drive", "given")]
 )
 @pytest.mark.filterwarnings("ignore:the simulated run")
 def test_the_c_of_a_law_gives_the_inputs_of_simulate(tmp_path, case, reference, monkeypatch):
-    monkeypatch.setattr("iblf_jax.deployment.export.VECTORS_DURATION", 0.2)
+    monkeypatch.setattr("iblf_jax.deployment.export.VECTORS_DURATION", 0.08)
     ij.export(CASES[case](), tmp_path, period=PERIOD, reference=reference)
     self_test(tmp_path)
     header = (tmp_path / "iblf_law.h").read_text()
@@ -77,7 +62,7 @@ def test_a_law_as_an_fmu_receives_all_levels(tmp_path):
     ij.export(scenario, tmp_path, target="fmu")
     file = str(tmp_path / "iblf_law.fmu")
     assert fmpy.validation.validate_fmu(file) == []
-    run = ij.simulate(scenario, duration=0.2, dt=PERIOD)
+    run = ij.simulate(scenario, duration=0.08, dt=PERIOD)
     levels = {"q": run.measured.q, "dq": run.measured.dq, "x_3": run.measured.higher[:, 0]}
     kinds = [("time", float), *((name, float, (2,)) for name in levels)]
     inputs = np.zeros(run.t.size, kinds)
@@ -85,12 +70,7 @@ def test_a_law_as_an_fmu_receives_all_levels(tmp_path):
     for name, values in levels.items():
         inputs[name] = values
     found = fmpy.simulate_fmu(
-        file,
-        stop_time=0.2,
-        step_size=PERIOD,
-        output_interval=PERIOD,
-        output=["tau"],
-        input=inputs,
+        file, stop_time=0.08, step_size=PERIOD, output_interval=PERIOD, output=["tau"], input=inputs
     )
     np.testing.assert_allclose(found["tau"][1:], run.tau[:-1], atol=1e-9)
     variables = {v.name: v for v in fmpy.read_model_description(file).modelVariables}
@@ -99,20 +79,17 @@ def test_a_law_as_an_fmu_receives_all_levels(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "case", [pytest.param("flexible joint", marks=pytest.mark.slow), "user functions"]
-)
-def test_a_closed_loop_as_an_fmu_is_simulate(tmp_path, case):
+def test_a_closed_loop_as_an_fmu_is_simulate(tmp_path):
     fmpy = pytest.importorskip("fmpy")
     pytest.importorskip("fmpy.validation")
-    scenario = CASES[case]()
+    scenario = loops_of_plants.user_functions()
     ij.export(scenario, tmp_path, target="fmu-loop")
     file = str(tmp_path / "iblf_loop.fmu")
     assert fmpy.validation.validate_fmu(file) == []
-    run = ij.simulate(scenario, duration=0.2, dt=1e-3, record_every=10)
+    run = ij.simulate(scenario, duration=0.08, dt=1e-3, record_every=10)
     names = {"q": run.q, "tau": run.tau, "x_3": run.x[:, 2], "d_2": run.disturbance[:, 1]}
     found = fmpy.simulate_fmu(
-        file, stop_time=0.2, step_size=1e-3, output_interval=1e-2, output=list(names)
+        file, stop_time=0.08, step_size=1e-3, output_interval=1e-2, output=list(names)
     )
     for name, expected in names.items():
         values = np.reshape(found[name], np.shape(expected))
@@ -134,12 +111,12 @@ def test_a_closed_loop_in_webassembly_is_simulate(tmp_path):
     settings = np.asarray(table["settings"], float).tobytes()
     loop["memory"].write(store, settings, loop["settings"](store))
     loop["start"](store)
-    rows = loop["run"](store, 201, 10)
+    rows = loop["run"](store, 81, 10)
     place = loop["records"](store)
     numbers = loop["memory"].read(store, place, place + 8 * rows * table["record"])
     numbers = np.frombuffer(numbers, float).reshape(rows, -1)
     found = {x["name"]: numbers[:, x["offset"] :][:, : x["size"]] for x in table["records"]}
-    run = ij.simulate(scenario, duration=0.2, dt=1e-3, record_every=10)
+    run = ij.simulate(scenario, duration=0.08, dt=1e-3, record_every=10)
     for name, expected in (("q", run.q), ("tau", run.tau), ("x_3", run.x[:, 2])):
         np.testing.assert_allclose(found[name], expected, atol=1e-10, err_msg=name)
     assert {x["name"]: x["unit"] for x in table["records"]}["x_3"] == "A"

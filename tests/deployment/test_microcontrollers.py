@@ -12,7 +12,6 @@ import sys
 from importlib.resources import files
 
 import jax
-import members
 import numpy as np
 import pytest
 from conftest import ROOT
@@ -55,6 +54,14 @@ def writable(path):
     return re.findall(r" [bBdDcC] (\w+)", run(["nm", path], path.parent))
 
 
+def names_needed_by(name, folder, *options):
+    """The names that a law needs from elsewhere; it has no writable data."""
+    object_ = f"{name}.o"
+    run(["cc", *BARE, "-fno-stack-protector", *options, "-c", f"{name}.c", "-o", object_], folder)
+    assert writable(folder / object_) == []
+    return undefined(folder / object_) - {"_GLOBAL_OFFSET_TABLE_"}
+
+
 def block_of(name):
     """The block of C or JavaScript on the page whose comment begins with a file name."""
     (text,) = re.findall(rf"```(?:c|js)\n(/\* {name}: .*?)```", PAGE, re.DOTALL)
@@ -75,8 +82,7 @@ def folder_of(scenario, folder):
 @pytest.fixture(scope="module")
 def sampled():
     scenario = ij.with_parameters(
-        ij.presets.zhang_yan_2024(variant="corrected"),
-        {"controller.K2": 4.0, "observer.kf": 4.0},
+        ij.presets.zhang_yan_2024(variant="corrected"), {"controller.K2": 4.0, "observer.kf": 4.0}
     )
     return ij.with_parts(scenario, sampling=ij.Sampling(1e-3, delay=1e-3))
 
@@ -186,10 +192,8 @@ def test_the_check_of_the_page_prints_the_end_of_the_run(sampled, tmp_path):
 @pytest.mark.parametrize("suffix", ["", "f"])
 def test_the_law_of_the_page_needs_the_functions_that_it_lists(suffix, law, small_law):
     folder = small_law if suffix else law
-    run(["cc", *BARE, "-O2", "-fno-stack-protector", "-c", "arm_law.c", "-o", "law.o"], folder)
-    needed = undefined(folder / "law.o") - {"_GLOBAL_OFFSET_TABLE_"}
+    needed = names_needed_by("arm_law", folder, "-O2")
     assert needed == MEMORY | {f"{name}{suffix}" for name in OWN}
-    assert writable(folder / "law.o") == []
     others = re.search(
         r"The others that can occur in other laws are (.*?)\. newlib", PAGE, re.DOTALL
     )[1]
@@ -224,37 +228,6 @@ def test_a_law_links_without_a_c_library(law):
         [*link, "arm_law.o", "-lm", "-o", "none.so"], cwd=law, capture_output=True, text=True
     )
     assert missing.returncode != 0 and "memcpy" in missing.stderr
-
-
-FURTHER = members.further(members.LAWS)
-
-
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(x, marks=[pytest.mark.slow] if x in FURTHER else []) for x in members.LAWS],
-)
-def test_every_law_needs_only_memory_and_mathematics(name, sampled, tmp_path):
-    speeds = ij.Bounds(ij.bounds.Constant(-2.0), ij.bounds.Constant(2.5))
-    bounds = (sampled.bounds[0], speeds)
-    scenario = canonical(ij.with_parts(sampled, controller=members.LAWS[name], bounds=bounds))
-    none = vectors_of_nothing(scenario)
-    law = Law(scenario, control_law(scenario, False), "arm_law", False, none, (), None)
-    for file, text in generate(law).files.items():
-        (tmp_path / file).write_text(text)
-    run(["cc", *BARE, "-O0", "-fno-stack-protector", "-c", "arm_law.c", "-o", "law.o"], tmp_path)
-    needed = undefined(tmp_path / "law.o") - {"_GLOBAL_OFFSET_TABLE_"}
-    assert needed <= MEMORY | MATH and needed >= MEMORY
-    assert writable(tmp_path / "law.o") == []
-
-
-def vectors_of_nothing(scenario):
-    """Self-test vectors of two samples at the start; the self-test is not compiled."""
-    from iblf_jax.deployment.control_law import inputs_at_start
-    from iblf_jax.deployment.write_c import Vectors
-
-    first = inputs_at_start(scenario)
-    rows = [[x, x] for x in (first.q, first.dq)]
-    return Vectors((first.q, first.dq), *rows, (), rows[0])
 
 
 def test_the_law_compiles_for_a_cortex_m4(small_law):

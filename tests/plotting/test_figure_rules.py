@@ -78,15 +78,6 @@ def test_the_bars_of_a_tuning_have_the_signs_of_the_torques():
     assert texts_of(axes) == [f"{x:.5g}".replace("-", "\N{MINUS SIGN}") for x in expected] * 2
 
 
-def test_bars_of_torques_over_decades_keep_their_signs():
-    run = made_up(chain(2))
-    run = dataclasses.replace(run, tau=run.tau * jnp.asarray([1e3, 1.0]))
-    axes = Figure().subplots()
-    _tuning._peaks(axes, curves_of({"before": run, "tuned": run}))
-    assert axes.get_yscale() == "symlog"
-    assert min(bar.get_height() for bar in axes.patches) < -4e3
-
-
 def test_a_report_lists_the_peaks_with_their_signs():
     from iblf_jax.reports import shown
 
@@ -143,13 +134,6 @@ def test_other_zooms_have_other_reasons():
     assert "the transient (failed runs aside)" in zoom_titles(both)[0]
 
 
-@pytest.mark.parametrize(("value", "text"), [(0.0385, "0.039"), (0.5, "0.5"), (0.0, "0")])
-def test_a_stated_bound_is_not_below_the_value(value, text):
-    from iblf_jax.plotting._panels import rounded_away
-
-    assert rounded_away(value) == text
-
-
 @pytest.mark.slow
 def test_a_comparison_states_the_reason_for_each_window(paper):
     found = ij.compare(paper, ["integral", "log"], duration=8.0, dt=1e-3)
@@ -199,12 +183,6 @@ def test_an_axis_shows_all_values_and_squeezes_none(x, name):
         np.testing.assert_allclose(scale.inverse(scale.forward(x)), x, rtol=1e-9)
 
 
-def test_values_that_differ_by_rounding_do_not_vary():
-    assert not _scales.varies(0.1 + 1e-17 * np.arange(9))
-    assert _scales.varies(0.1 + 1e-9 * np.arange(9))
-    assert not _scales.varies(np.array([np.nan]))
-
-
 def test_a_front_shows_every_trial():
     tried = np.array([[0.5, 40.0], [0.9, 1.0], [3.0, 0.8]])
     front = ij.ParetoFront(
@@ -236,7 +214,7 @@ def test_a_scatter_shows_every_run(study):
     far = dataclasses.replace(
         study, metrics=ij.Metrics({"margin": margins}, study.metrics.unit_pairs)
     )
-    figure = drawn(plotting.scatter(far))
+    figure = plotting.scatter(far)
     worst = margins.min(axis=1)
     for axes, x in zip(figure.axes, (v for v in _flat(study)), strict=True):
         assert axes.get_yscale() == "symlog"
@@ -276,11 +254,6 @@ def test_only_the_joint_that_left_its_bounds_is_marked():
         marks = [crosses_of(axes) for axes in make(run).axes]
         assert marks == [[], [], [0.2], [0.2], [], []], make.__name__
     assert [crosses_of(axes) for axes in run.plot().axes[:3]] == [[], [0.2], []]
-
-
-def test_each_joint_is_marked_at_its_own_time():
-    run = changed(changed(made_up(chain(2)), 1, 20, 9.0), 0, 40, -9.0)
-    assert [crosses_of(axes) for axes in plotting.positions(run).axes[::2]] == [[0.4], [0.2]]
 
 
 def test_a_velocity_that_left_its_bounds_is_not_marked_among_the_positions():

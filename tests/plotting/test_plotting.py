@@ -110,12 +110,6 @@ def test_the_zoom_is_as_long_as_the_transient():
     )
 
 
-def test_runs_are_told_apart_without_colour(runs):
-    lines = [lines_of(plotting.joint(runs).axes[0], name)[0] for name in runs]
-    assert lines[0].get_color() != lines[1].get_color()
-    assert lines[0].get_linestyle() != lines[1].get_linestyle()
-
-
 def test_shared_bounds_and_uncertain_terms_are_drawn_once_others_each():
     one, same, wider = made_up(chain(2)), made_up(chain(2), shift=0.02), made_up(chain(2))
     upper = wider.level_upper + 0.2
@@ -142,7 +136,7 @@ def test_runs_of_different_length_and_record_share_one_time_axis():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("n", [1, 7])
+@pytest.mark.parametrize("n", [1, 4])
 def test_every_figure_scales_to_n_joints(n):
     run = made_up(chain(n))
     for make in (plotting.velocity_errors, plotting.uncertain_terms, plotting.torques):
@@ -152,8 +146,6 @@ def test_every_figure_scales_to_n_joints(n):
     assert titles[:n] == [f"joint {k}" for k in range(n)]
     assert len(figure.axes) == n + (6 if n > 1 else 5)
     drawn(figure)
-    if n > 1:
-        assert set(plotting.paper_figures(run)) == set(SIX)
 
 
 def test_the_overview_names_units_and_status(runs):
@@ -330,13 +322,7 @@ def test_a_spike_is_cut_and_named():
 
 @pytest.mark.slow
 def test_no_row_has_a_panel_alone_and_no_labels_meet():
-    assert [_style.row_sizes(n, 4) for n in (1, 4, 5, 9, 13)] == [
-        [1],
-        [4],
-        [3, 2],
-        [3, 3, 3],
-        [4, 3, 3, 3],
-    ]
+    assert [_style.row_sizes(n, 4) for n in (1, 5, 13)] == [[1], [3, 2], [4, 3, 3, 3]]
     with _style.styled():
         figure = _style.new_figure(10.0, 8.0)
         rows = _style.panel_rows(figure, 13, 4)
@@ -345,7 +331,6 @@ def test_no_row_has_a_panel_alone_and_no_labels_meet():
             "plant.link[the_very_long_name_of_a_link_of_somebody].friction_width [rad/s]"
         )
         axes.set_ylabel("worst xi margin of all joints together, as a part of the bound [1]")
-    drawn(figure)
     figure.draw_without_rendering()  # at the figure's own resolution, in which extents are given
     boxes = [axes.xaxis.label.get_window_extent() for axes in itertools.chain(*rows)]
     boxes += [axes.yaxis.label.get_window_extent() for axes in itertools.chain(*rows)]
@@ -382,21 +367,15 @@ def test_thinning_keeps_every_peak_and_both_ends():
     np.testing.assert_array_equal(thin_y, y[np.searchsorted(t, thin_t)])
 
 
-def test_the_break_of_a_run_is_where_it_left_its_bounds():
-    (good,), (bad,) = curves_of(made_up(chain(2))), curves_of(runaway(chain(2), at=150))
-    assert good.exit_index("q", 0) is None
-    assert 130 <= bad.exit_index("q", 0) < bad.samples == 151
-
-
-@pytest.mark.parametrize("plant", [chain(2), chain(4), Arm3D(3)], ids=["two", "four", "space"])
+@pytest.mark.parametrize("plant", [chain(4), Arm3D(3)], ids=["plane", "space"])
 def test_an_animation_moves(plant, tmp_path):
     runs = {"a": made_up(plant, duration=1.0), "b": made_up(plant, duration=0.5, shift=0.1)}
-    path = plotting.animate(runs, tmp_path / "arm.gif", fps=10)
+    path = plotting.animate(runs, tmp_path / "arm.gif", fps=4)
     with Image.open(path) as film:
-        assert film.n_frames == 11
-        assert film.info["duration"] == 100
+        assert film.n_frames == 5
+        assert film.info["duration"] == 250
         pictures = []
-        for frame in (0, 5, 10):
+        for frame in (0, 2, 4):
             film.seek(frame)
             pictures.append(np.asarray(film.convert("RGB")).astype(int))
     assert pictures[0][0, 0].tolist() == [255, 255, 255]
@@ -410,11 +389,6 @@ def test_an_animation_as_a_page(tmp_path):
     page = path.read_text()
     assert page.count("data:image/png;base64") == 5
     assert "<input" in page
-
-
-def test_an_animation_of_a_failed_run(tmp_path):
-    with Image.open(plotting.animate(runaway(chain(2)), tmp_path / "arm.gif", fps=5)) as film:
-        assert film.n_frames == 21
 
 
 def test_joint_limits_are_drawn_where_the_robot_would_be_at_them():

@@ -14,12 +14,12 @@ from iblf_jax.presets.paper import customary_two_link
 
 @pytest.fixture(scope="module")
 def run():
-    return ij.simulate(pendulum(), duration=1.0, dt=1e-3)
+    return ij.simulate(pendulum(), duration=0.8, dt=1e-2)
 
 
 @pytest.fixture(scope="module")
 def body_run():
-    return ij.simulate(body(), duration=5.0, dt=1e-2)
+    return ij.simulate(body(), duration=0.8, dt=1e-2)
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +32,7 @@ def flexible_run():
         controller=ij.controllers.BarrierBackstepping(k=(3.0, 20.0, 60.0, 150.0)),
         initial=ij.Initial(q=[0.7, 0.3]),
     )
-    return ij.simulate(scenario, duration=0.3, dt=1e-3)
+    return ij.simulate(scenario, duration=0.08, dt=1e-3)
 
 
 def labels_of(figure) -> list[str]:
@@ -84,7 +84,7 @@ def test_regions_are_named_by_the_robot_inside_a_plant(flexible_run):
 def test_a_level_without_bounds_shows_none_and_keeps_its_virtual_control_in_view():
     law = ij.controllers.BarrierBackstepping(k=(3.0, 10.0, 30.0))
     only_third = pendulum(controller=law, bounds=(ANGLES, None, symmetric(20.0)))
-    speed = ij.simulate(only_third, duration=0.5, dt=1e-3).plot().axes[1]
+    speed = ij.simulate(only_third, duration=0.5, dt=1e-2).plot().axes[1]
     assert not [line for line in speed.get_lines() if line.get_label() == "bounds"]
     guide = line_of(speed, r"virtual control $\alpha_{i-1}$").get_ydata()
     low, high = speed.get_ylim()
@@ -121,7 +121,7 @@ def test_figures_have_the_names_and_units_of_the_plant(run, body_run):
 @pytest.mark.slow
 def test_levels_of_plants_of_different_orders_are_refused(run, body_run):
     one = pendulum(plant=ij.plants.StrictFeedback(_rows, _ones, n=1, order=2), **_ORDER_2)
-    other = ij.simulate(one, duration=0.1, dt=1e-3)
+    other = ij.simulate(one, duration=0.1, dt=1e-2)
     with pytest.raises(ValueError, match="the same number of levels"):
         plotting.levels({"third": run, "second": other})
     with pytest.raises(ValueError, match="a component, 0 to 2"):
@@ -148,7 +148,7 @@ def test_bounds_of_levels_mark_where_a_run_failed():
     law = ij.controllers.BarrierBackstepping(k=(3.0, 10.0, 30.0))
     scenario = pendulum(controller=law, bounds=(ANGLES, None, symmetric(2.0)))
     with pytest.warns(UserWarning, match="Level 3"):
-        run = ij.simulate(scenario, duration=0.3, dt=1e-3)
+        run = ij.simulate(scenario, duration=0.3, dt=5e-3)
     (curve,) = curves_of(run)
     first = int(np.argmax(np.abs(np.asarray(run.x)[:, 2, 0]) >= 2.0))
     assert curve.exit_index("level_3", 0) == curve.exit_index("tau", 0) == first
@@ -169,13 +169,13 @@ def test_a_plant_with_an_outline_is_animated_and_drawn_along_its_path(body_run, 
 def test_a_flexible_arm_is_animated_with_its_motors(flexible_run, tmp_path):
     from iblf_jax.plotting._arm import Scene, motions_of
 
-    t = np.array([0.0, 0.1])
+    t = np.array([0.0, 0.05])
     curves = curves_of(flexible_run)
     scene = Scene(curves, *motions_of(curves, t))
     scene.move_to(1)
     motors = scene.motors[0].get_xdata()
-    assert np.allclose(motors, flexible_run.x[100, 2], atol=1e-12)
-    assert not np.allclose(motors, flexible_run.q[100], atol=1e-3)
+    assert np.allclose(motors, flexible_run.x[50, 2], atol=1e-12)
+    assert not np.allclose(motors, flexible_run.q[50], atol=1e-3)
     assert plotting.animate(flexible_run, tmp_path / "arm.gif", fps=5).exists()
 
 
@@ -199,7 +199,7 @@ def test_reports_show_levels_with_their_units(run, tmp_path):
 @pytest.mark.slow
 def test_a_sweep_reduces_a_metric_of_levels_to_the_worst_one():
     points = {"controller.k[2]": [20.0, 30.0], "initial.x[2][0]": [0.0, 10.0]}
-    data = ij.sweep(pendulum(), points, duration=0.1, dt=1e-3)
+    data = ij.sweep(pendulum(), points, duration=0.1, dt=1e-2)
     figure = plotting.heat_map(data, "level_margin", x="controller.k[2]", y="initial.x[2][0]")
     axes = figure.axes[0]
     assert axes.get_ylabel() == "initial.x[2][0] [A]"

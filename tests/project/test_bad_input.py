@@ -12,6 +12,7 @@ import re
 import subprocess
 import sys
 import warnings
+from collections.abc import Callable
 from decimal import Decimal
 from fractions import Fraction
 from pathlib import Path
@@ -59,6 +60,7 @@ BAD_NUMBERS = {
     "matrix": (np.ones((2, 2)), "(n,)"),
     "object-array": (np.asarray([object()]), "numbers"),
     "decimal": (Decimal("2.0"), "numbers"),
+    "fraction": (Fraction(2), "number"),
     "huge-int": (10**400, "numbers"),
     "function": (np.sin, "number"),
     "class": (robots.TwoLink, "number"),
@@ -73,134 +75,54 @@ def test_numbers_of_a_component(case):
     refuses(lambda: observers.Momentum(kf=value), "Momentum.kf", word)
 
 
-@pytest.mark.parametrize(
-    "value",
-    [
-        2,
-        2.0,
-        np.float32(2),
-        np.float64(2),
-        np.int8(2),
-        np.asarray(2.0),
-        jnp.asarray(2),
-        Fraction(2),
-        [2, 2],
-        (2.0, 2),
-        np.full(2, 2),
-    ],
-)
+FINE = (2, np.float32(2), np.int8(2), np.asarray(2.0), jnp.asarray(2), [2, 2], (2.0, 2))
+
+
+@pytest.mark.parametrize("value", FINE)
 def test_numbers_that_are_fine(value):
-    if isinstance(value, Fraction):
-        refuses(lambda: controllers.Backstepping(k1=value, K2=20.0), "Backstepping.k1")
-        return
     k1 = controllers.Backstepping(k1=value, K2=20.0).k1
     assert jnp.issubdtype(k1.dtype, jnp.floating)
     np.testing.assert_array_equal(k1, 2.0)
 
 
+def made(make: Callable[..., Any], *fixed: Any, **more: Any) -> Callable[..., Any]:
+    """Calls that make a component with other arguments."""
+    return lambda *args, **options: lambda: make(*fixed, *args, **more | options)
+
+
+arm = made(robots.TwoLink, **ARM)
+chain = made(robots.PlanarChain, centre=0.1, inertia=0.1)
+law = made(controllers.Backstepping, 2.0, 20.0)
+spline = made(references.WaypointSpline)
 COMPONENTS = {
-    "two-link-of-three": (
-        lambda: robots.TwoLink(**(ARM | {"mass": [1.0, 1.0, 1.0]})),
-        "TwoLink.mass",
-        "(2,)",
-    ),
-    "chain-sizes": (
-        lambda: robots.PlanarChain(mass=[1.0, 1.0], length=[1.0], centre=0.1, inertia=0.1),
-        "PlanarChain.length",
-        "(2,)",
-    ),
-    "chain-of-scalars": (
-        lambda: robots.PlanarChain(mass=1.0, length=1.0, centre=0.1, inertia=0.1),
-        "PlanarChain.mass",
-        "how many",
-    ),
-    "chain-of-none": (
-        lambda: robots.PlanarChain(mass=[], length=[], centre=[], inertia=[]),
-        "PlanarChain.mass",
-        "at least one",
-    ),
-    "payload-array": (
-        lambda: robots.TwoLink(**ARM, payload=[1.0, 2.0]),
-        "TwoLink.payload",
-        "one number",
-    ),
-    "variant": (
-        lambda: controllers.Backstepping(2.0, 20.0, variant="exact"),
-        "Backstepping.variant",
-        "'printed', 'corrected'",
-    ),
-    "reading-array": (
-        lambda: controllers.Backstepping(2.0, 20.0, variant=np.asarray(["printed"])),
-        "variant",
-        "hashable",
-    ),
-    "barrier-name": (
-        lambda: controllers.Backstepping(2.0, 20.0, barrier="integral"),
-        "Backstepping.barrier",
-        "barriers.Integral()",
-    ),
-    "barrier-class": (
-        lambda: controllers.Backstepping(2.0, 20.0, barrier=barriers.Log),
-        "Backstepping.barrier",
-        "brackets",
-    ),
-    "barrier-number": (
-        lambda: controllers.Backstepping(2.0, 20.0, barrier=3),
-        "Backstepping.barrier",
-        "Integral()",
-    ),
-    "barrier-none": (
-        lambda: controllers.Backstepping(2.0, 20.0, barrier=None),
-        "Backstepping.barrier",
-        "component",
-    ),
+    "two-link-of-three": (arm(mass=[1.0] * 3), "TwoLink.mass", "(2,)"),
+    "chain-sizes": (chain(mass=[1.0, 1.0], length=[1.0]), "PlanarChain.length", "(2,)"),
+    "chain-of-scalars": (chain(mass=1.0, length=1.0), "PlanarChain.mass", "how many"),
+    "chain-of-none": (chain(mass=[], length=[]), "PlanarChain.mass", "at least one"),
+    "payload-array": (arm(payload=[1.0, 2.0]), "TwoLink.payload", "one number"),
+    "variant": (law(variant="exact"), "Backstepping.variant", "'printed', 'corrected'"),
+    "reading-array": (law(variant=np.asarray(["printed"])), "variant", "hashable"),
+    "barrier-name": (law(barrier="integral"), "Backstepping.barrier", "barriers.Integral()"),
+    "barrier-class": (law(barrier=barriers.Log), "Backstepping.barrier", "brackets"),
     "guard": (lambda: barriers.Integral(guard=1.5), "Integral.guard", "between 0 and 1"),
     "guard-zero": (lambda: barriers.Log(guard=0.0), "Log.guard", "positive"),
-    "guard-word": (lambda: barriers.Log(guard="small"), "Log.guard", "positive"),
     "p-zero": (lambda: barriers.Log(p=0), "Log.p", ">= 1"),
-    "p-half": (lambda: barriers.Log(p=1.5), "Log.p", "whole"),
-    "p-bool": (lambda: barriers.Log(p=True), "Log.p", "whole"),
     "observer-start": (
         lambda: observers.AsPublished(kf=20.0, start="cold"),
         "AsPublished.start",
         "'matched'",
     ),
     "side-number": (lambda: bounds.Bounds(0.1, 0.9), "Bounds.lower", "Constant(value)"),
-    "side-none": (lambda: bounds.Bounds(bounds.Constant(0.1), None), "Bounds.upper", "component"),
     "friction-width": (lambda: disturbances.Friction(width=0.0), "Friction.width", "> 0"),
-    "friction-negative": (lambda: disturbances.Friction(viscous=-0.1), "Friction.viscous", ">= 0"),
     "sum-of-numbers": (lambda: disturbances.Sum((1.0, 2.0)), "Sum.parts", "tuple of disturbances"),
     "sum-of-one": (lambda: disturbances.Sum(disturbances.Friction()), "Sum.parts", "brackets"),
-    "sum-of-words": (lambda: disturbances.Sum(("friction",)), "Sum.parts[0]", "Disturbance"),
-    "spline-order": (
-        lambda: references.WaypointSpline((0.0, 0.0), [[0.0], [1.0]]),
-        "WaypointSpline.times",
-        "increasing",
-    ),
-    "spline-words": (
-        lambda: references.WaypointSpline(("a", "b"), [[0.0], [1.0]]),
-        "WaypointSpline.times",
-        "increasing",
-    ),
-    "spline-rows": (
-        lambda: references.WaypointSpline((0.0, 1.0), [[0.0], [1.0], [2.0]]),
-        "WaypointSpline.waypoints",
-        "row",
-    ),
-    "spline-list": (
-        lambda: references.WaypointSpline([0.0, 1.0], [[0.0], [1.0]]),
-        "WaypointSpline.times",
-        "tuple",
-    ),
+    "spline-order": (spline((0.0, 0.0), [[0.0], [1.0]]), "WaypointSpline.times", "increasing"),
+    "spline-rows": (spline((0.0, 1.0), [[0.0], [1.0], [2.0]]), "WaypointSpline.waypoints", "row"),
+    "spline-list": (spline([0.0, 1.0], [[0.0], [1.0]]), "WaypointSpline.times", "tuple"),
     "quintic": (lambda: references.Quintic(0.0, 1.0, duration=-2.0), "Quintic.duration", "> 0"),
     "preset-law": (lambda: ij.presets.zhang_yan_2024(law="tangent"), "law", "'integral', 'log'"),
     "preset-reading": (lambda: ij.presets.zhang_yan_2024(variant=None), "variant", "'printed'"),
     "dtype-int": (lambda: ij.astype(ij.presets.zhang_yan_2024(), "int32"), "dtype", "float32"),
-    "dtype-word": (
-        lambda: ij.astype(ij.presets.zhang_yan_2024(), "double-double"),
-        "dtype",
-        "float32",
-    ),
 }
 
 
@@ -216,9 +138,15 @@ def with_part(**parts):
 
 TUBE = ij.presets.zhang_yan_2024().bounds[0]
 CHAIN3 = robots.PlanarChain(mass=[1.0, 1.0, 1.0], length=0.3, centre=0.1, inertia=0.1)
+funnel = bounds.Funnel
+
+
+def between(lower, upper):
+    return with_part(bounds=bounds.Bounds(lower, upper))
+
+
 SCENARIOS = {
     "plant-none": (with_part(plant=None), "Scenario.plant", "component"),
-    "plant-name": (with_part(plant="two_link"), "Scenario.plant", "robots"),
     "plant-class": (with_part(plant=robots.TwoLink), "Scenario.plant", "brackets"),
     "plant-is-a-bound": (
         with_part(plant=bounds.Constant(1.0)),
@@ -229,7 +157,6 @@ SCENARIOS = {
     "model-of-three": (with_part(model=CHAIN3), "Scenario.model", "3 joints", "2 joints"),
     "plant-of-three": (with_part(plant=CHAIN3, model=CHAIN3), "got", "3 (one a joint)"),
     "reference-class": (with_part(reference=references.Sinusoid), "Scenario.reference", "brackets"),
-    "reference-array": (with_part(reference=np.ones(2)), "Scenario.reference", "Reference"),
     "reference-of-three": (
         with_part(reference=references.WaypointSpline((0.0, 1.0), [[0.5] * 3, [0.6] * 3])),
         "reference.position",
@@ -238,47 +165,38 @@ SCENARIOS = {
     ),
     "bounds-one-side": (with_part(bounds=bounds.Constant(0.1)), "Scenario.bounds", "Bounds(lower="),
     "bounds-exchanged": (
-        with_part(bounds=bounds.Bounds(TUBE.upper, TUBE.lower)),
+        between(TUBE.upper, TUBE.lower),
         "bounds of joint 0",
         "lower < upper",
         "Exchange",
     ),
     "lower-funnel-of-the-upper-sign": (
-        with_part(bounds=bounds.Bounds(bounds.Funnel(0.3, 0.1, 1.0), bounds.Funnel(0.3, 0.1, 1.0))),
+        between(funnel(0.3, 0.1, 1.0), funnel(0.3, 0.1, 1.0)),
         "bounds of joint 0",
         "as a lower side it takes negative numbers",
     ),
     "lower-funnel-below-the-upper-one": (
-        with_part(bounds=bounds.Bounds(bounds.Funnel(0.2, 0.1, 1.0), bounds.Funnel(0.3, 0.1, 1.0))),
+        between(funnel(0.2, 0.1, 1.0), funnel(0.3, 0.1, 1.0)),
         "reference of joint 0",
         "as a lower side it takes negative numbers",
     ),
     "upper-funnel-of-the-lower-sign": (
-        with_part(
-            bounds=bounds.Bounds(bounds.Funnel(-0.3, -0.1, 1.0), bounds.Funnel(-0.2, -0.1, 1.0))
-        ),
+        between(funnel(-0.3, -0.1, 1.0), funnel(-0.2, -0.1, 1.0)),
         "reference of joint 0",
         "as an upper side it takes positive numbers",
     ),
     "bounds-wrong-n": (
-        with_part(bounds=bounds.Bounds(bounds.Constant([0.1] * 3), TUBE.upper)),
+        between(bounds.Constant([0.1] * 3), TUBE.upper),
         "bounds[0].lower.value",
         "2 (one a joint)",
     ),
     "controller-object": (with_part(controller=object()), "Scenario.controller", "check_law"),
     "controller-gains": (with_part(controller=[2.0, 20.0]), "Scenario.controller", "RobotLaw"),
-    "observer-number": (with_part(observer=20.0), "Scenario.observer", "NoObserver()"),
-    "disturbance-list": (
-        with_part(disturbance=[disturbances.Friction()]),
-        "Scenario.disturbance",
-        "Nothing()",
-    ),
     "tip-force-in-space": (
         with_part(disturbance=disturbances.TipForce(amplitude=[1.0, 2.0, 3.0])),
         "disturbance.torque",
         "(2,)",
     ),
-    "initial-tuple": (with_part(initial=(0.8, 0.8)), "Scenario.initial", "Initial(q="),
     "initial-of-three": (
         with_part(initial=ij.Initial(q=[0.8, 0.8, 0.8])),
         "initial.q",
@@ -291,12 +209,6 @@ SCENARIOS = {
         "(0.34, 1.04)",
         "Move the start",
     ),
-    "start-on-the-bound": (
-        with_part(initial=ij.Initial(q=[0.8, 0.9])),
-        "initial.q[1]",
-        "inside the bounds",
-    ),
-    "start-below": (with_part(initial=ij.Initial(q=[0.8, 0.1])), "initial.q[1]", "0.1"),
     "start-too-fast": (with_part(initial=ij.Initial(q=0.8, dq=1e5)), "initial.dq", "10000"),
     "reference-outside": (
         with_part(reference=references.Sinusoid(1.5, 0.1)),
@@ -315,7 +227,6 @@ SCENARIOS = {
         "float32",
     ),
     "not-a-scenario": (lambda: ij.simulate({"law": "integral"}, **SHORT), "scenario", "ij.presets"),
-    "not-a-scenario-dt": (lambda: ij.recommended_dt(None), "scenario", "ij.presets"),
 }
 
 
@@ -332,38 +243,18 @@ def test_nan_that_came_in_by_a_tree_map_is_found_with_its_path():
 
 
 ARGUMENTS = {
-    "dt-zero": ({"dt": 0.0}, "dt", "positive"),
-    "dt-negative": ({"dt": -1e-3}, "dt", "positive"),
-    "dt-nan": ({"dt": float("nan")}, "dt", "positive"),
-    "dt-infinite": ({"dt": np.inf}, "dt", "positive"),
-    "dt-word": ({"dt": "1e-3"}, "dt", "positive"),
-    "dt-none": ({"dt": None}, "dt", "positive"),
-    "dt-array": ({"dt": np.asarray([1e-3])}, "dt", "positive"),
     "dt-too-long": ({"dt": 1.0}, "duration", "whole number of steps"),
     "dt-tiny": ({"dt": 1e-300}, "duration", "at most"),
-    "duration-zero": ({"duration": 0}, "duration", "positive"),
-    "duration-bool": ({"duration": True}, "duration", "positive"),
-    "duration-complex": ({"duration": 1j}, "duration", "positive"),
-    "duration-date": ({"duration": np.datetime64("2020")}, "duration", "positive"),
-    "duration-text": ({"duration": np.str_("1")}, "duration", "positive"),
-    "duration-huge": ({"duration": 10**400}, "duration", "positive"),
     "duration-long": ({"duration": 1e300}, "duration", "at most", "Shorten"),
     "duration-broken": (
         {"duration": 0.0105},
-        "duration",
         "0.0105",
         "whole number",
         "Take duration=0.01 or dt=0.00105",
     ),
     "too-many-samples": ({"duration": 1e6}, "record_every", "Take record_every="),
-    "record-zero": ({"record_every": 0}, "record_every", ">= 1"),
-    "record-half": ({"record_every": 1.5}, "record_every", "whole"),
-    "record-none": ({"record_every": None}, "record_every", "whole"),
-    "method": ({"method": "rk45"}, "method", "'euler', 'heun', 'rk4'"),
-    "method-none": ({"method": None}, "method", "'rk4'"),
-    "method-array": ({"method": np.asarray(["rk4", "x"])}, "method", "'rk4'"),
-    "method-list": ({"method": ["rk4"]}, "method", "'rk4'"),
 }
+"""What `REFUSED` does not try at all functions."""
 
 
 @pytest.mark.parametrize("case", ARGUMENTS)
@@ -387,20 +278,12 @@ PATHS = {
     "a-part": ("controller", "path"),
     "static": ("controller.variant", "path"),
     "beyond-the-end": ("plant.mass[2]", "plant.mass"),
-    "before-the-start": ("plant.mass[-3]", "plant.mass"),
-    "far-beyond": ("plant.mass[99999999999999999999]", "path"),
     "into-a-number": ("plant.g[0]", "plant.g"),
-    "deep": ("plant.mass[0][0]", "plant.mass"),
-    "index-on-a-part": ("plant[0]", "path"),
     "empty": ("", "names joined by dots"),
     "dots": ("plant..mass", "names joined by dots"),
-    "leading-dot": (".plant.mass", "names joined by dots"),
     "slice": ("plant.mass[0:1]", "names joined by dots"),
-    "space": ("plant. mass", "names joined by dots"),
     "private": ("plant.__class__", "path"),
     "number": (3, "names joined by dots"),
-    "none": (None, "names joined by dots"),
-    "tuple": (("plant", "mass"), "names joined by dots"),
     "robot-alone": ("robot", "path"),
 }
 
@@ -534,16 +417,16 @@ GOOD = {
 """Function, and arguments that are fine besides the scenario and the duration."""
 
 
-def defaults_of(name: str) -> dict[str, Any]:
+def defaults_of(function: Callable[..., Any]) -> dict[str, Any]:
     """Argument of a function -> its default; REQUIRED if it has none."""
-    parameters = inspect.signature(GOOD[name][0]).parameters.values()
+    parameters = inspect.signature(function).parameters.values()
     return {x.name: x.default for x in parameters if x.kind != x.VAR_KEYWORD}
 
 
-def call(name: str, /, **changed: Any) -> Any:
+def call(entry: tuple[Callable[..., Any], dict[str, Any]], /, **changed: Any) -> Any:
     """Calls a function with arguments that are fine, except for what is changed."""
-    function, arguments = GOOD[name]
-    defaults = defaults_of(name)
+    function, arguments = entry
+    defaults = defaults_of(function)
     fine = {"scenario": WEAK, "duration": SHORT["duration"]}
     needed = {key: x for key, x in fine.items() if defaults.get(key, WEAK) is REQUIRED}
     return function(**(needed | arguments | changed))
@@ -551,21 +434,8 @@ def call(name: str, /, **changed: Any) -> Any:
 
 NO_WORDS = (None, [], {}, 3, b"rk4", ["rk4"], np.asarray(["rk4", "x"]), "nope", True, float("nan"))
 NO_TIMES = (
-    None,
-    "x",
-    [],
-    True,
-    0.0,
-    -1.0,
-    float("nan"),
-    np.inf,
-    5e-324,
-    3e-300,
-    1e300,
-    4e9,
-    10**30,
-    1j,
-    np.ones(2),
+    *(None, "x", [], True, 0.0, -1.0, float("nan"), np.inf, 5e-324, 3e-300, 1e300, 4e9, 10**30),
+    *(1j, np.ones(2)),
 )
 NO_SEEDS = (None, "x", [], True, -1, 1.5, float("nan"), 2**32, 10**30, np.ones(2))
 NO_COUNTS = (None, "x", [], True, 0, -3, 1.5, float("nan"), np.inf, 10**30, 7 * 10**29, np.ones(2))
@@ -600,7 +470,7 @@ REFUSED = {
             BY_NAME[name][1],
         )
         for function in GOOD
-        for name, default in defaults_of(function).items()
+        for name, default in defaults_of(GOOD[function][0]).items()
         if name in BY_NAME and (name == "scenario" or function not in LATE)
     },
     # Arguments of one function, and those of the names above that differ.
@@ -674,7 +544,7 @@ def test_arguments_of_every_function(case, tmp_path, monkeypatch):
     values, words = REFUSED[case]
     for value in values:
         with pytest.raises(ValueError, match=r"(?s)\w+.*: got .*, expected .+") as caught:
-            call(function, **{argument: value})
+            call(GOOD[function], **{argument: value})
         message = str(caught.value)
         named = message.split(": got")[0]
         assert argument in named, (value, message)
@@ -713,7 +583,6 @@ def test_misspelt_parts_and_fields_get_a_suggestion():
         "'contoller'",
         "Did you mean controller?",
     )
-    refuses(lambda: ij.with_parts(WEAK, bound=None), "Did you mean bounds?")
     refuses(lambda: ij.with_parts(WEAK, zzz=None), "'zzz'", "robot, plant")
     refuses(
         lambda: dataclasses.replace(WEAK, refrence=WEAK.reference),
@@ -881,31 +750,12 @@ def test_every_warning_of_the_package_looks_for_the_users_line():
 # --------------------------------------------------------------------------------------- grammar
 
 
-@pytest.mark.parametrize(
-    ("noun", "expected"),
-    [
-        *(
-            ("Actuator", "an Actuator"),
-            ("Encoder", "an Encoder"),
-            ("Ideal", "an Ideal"),
-            ("Observer", "an Observer"),
-        ),
-        *(
-            ("Controller", "a Controller"),
-            ("Uniform", "a Uniform"),
-            ("user", "a user"),
-            ("Universal", "a Universal"),
-        ),
-        *(
-            ("unit", "a unit"),
-            ("unimportant part", "an unimportant part"),
-            ("hinge", "a hinge"),
-            ("one-sided", "a one-sided"),
-        ),
-    ],
-)
-def test_the_article_of_a_noun(noun, expected):
-    assert checks.with_article(noun) == expected
+def test_the_article_of_a_noun():
+    for article, nouns in {
+        "a": ("Uniform", "user", "Universal", "unit", "hinge", "one-sided"),
+        "an": ("Actuator", "Ideal", "unimportant part"),
+    }.items():
+        assert [checks.with_article(noun) for noun in nouns] == [f"{article} {x}" for x in nouns]
 
 
 @pytest.mark.slow
@@ -928,11 +778,3 @@ def test_no_message_has_a_fixed_article_before_a_name_that_varies():
                 ):
                     found.append(f"{path.name}:{after.lineno}: {ast.unparse(after.value)}")
     assert not found
-
-
-def test_the_checker_of_an_actuator_speaks_of_an_actuator():
-    class Bare:
-        pass
-
-    with pytest.raises(Exception, match=r"the contract of an Actuator"):
-        ij.testing.check_actuator(Bare())

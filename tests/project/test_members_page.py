@@ -17,15 +17,10 @@ def test_the_page_is_not_stale():
     )
 
 
-@pytest.mark.parametrize(
-    "cls",
-    [
-        *barriers.MEMBERS.values(),
-        *controllers.MEMBERS.values(),
-        *decays.MEMBERS.values(),
-        *observers.MEMBERS.values(),
-    ],
-)
+FAMILIES = (barriers, controllers, decays, observers)
+
+
+@pytest.mark.parametrize("cls", [cls for family in FAMILIES for cls in family.MEMBERS.values()])
 def test_every_member_says_what_it_is_and_where_it_comes_from(cls):
     assert len(PAGE["first_line"](cls)) > 5
     assert len(PAGE["source"](cls)) > 3

@@ -8,11 +8,9 @@ import configparser
 import os
 import re
 import select
-import shutil
 import signal
 import subprocess
 import sys
-import threading
 import tomllib
 
 import pytest
@@ -60,11 +58,6 @@ def test_pre_releases_are_taken_of_jax_alone_and_above_its_limit():
     assert any(text.startswith("equinox") for text in early)
 
 
-def test_pythons_are_newer_than_the_oldest():
-    assert tool.minors() == sorted(tool.minors(), reverse=True)
-    assert min(tool.minors()) == 12
-
-
 # --- keys ----------------------------------------------------------------------------------------
 
 
@@ -94,26 +87,6 @@ def test_different_environments_have_different_keys(tmp_path, monkeypatch):
     keys = [tool.key_of(content) for content in contents]
     assert len(set(keys)) == len(keys)
     assert tool.key_of(description()) == keys[-1]
-
-
-def test_the_newest_packages_are_looked_for_again_every_week(monkeypatch):
-    class Later(tool.datetime.date):
-        @classmethod
-        def today(cls):
-            return tool.datetime.date.fromordinal(now.toordinal() + 7)
-
-    now = tool.datetime.date.today()
-    before = tool.key_of(tool.description([], "", NO_OPTIONS))
-    monkeypatch.setattr(tool.datetime, "date", Later)
-    assert tool.key_of(tool.description([], "", NO_OPTIONS)) != before
-
-
-def test_options_that_do_not_decide_what_is_installed_do_not_matter():
-    same = [
-        tool.PipConfiguration(options, [])
-        for options in ({}, {":env:.compile": "0"}, {"global.default-timeout": "60"})
-    ]
-    assert len({tool.key_of(tool.description(["jax"], "3.13", pip)) for pip in same}) == 1
 
 
 # --- the configuration of pip --------------------------------------------------------------------
@@ -162,48 +135,6 @@ def test_the_command_has_the_environment_of_the_copy(machine, tmp_path, monkeypa
     assert "PYTHONPATH" not in seen
     first = [str(x / "venv" / "bin") for x in (copy, packages)]
     assert seen["PATH"].split(os.pathsep)[:2] == first
-
-
-def end_of(monkeypatch, machine, tmp_path, *command):
-    """The exit code of a call whose environment is there."""
-
-    def prepare(options, stack):
-        stack.callback(tool.is_removed, tmp_path / "copy")
-        return machine, tmp_path / "packages", tmp_path / "copy"
-
-    (tmp_path / "copy" / "tree").mkdir(parents=True)
-    handler = signal.getsignal(signal.SIGTERM)
-    monkeypatch.setattr(tool, "prepare", prepare)
-    monkeypatch.setattr(sys, "argv", ["newest_python", *command])
-    try:
-        return tool.main()
-    finally:
-        signal.signal(signal.SIGTERM, handler)
-
-
-def test_a_command_that_is_not_there_is_no_missing_environment(
-    machine, tmp_path, monkeypatch, capfd
-):
-    assert end_of(monkeypatch, machine, tmp_path, "pyhton", "-m", "pytest") == tool.NOT_STARTED
-    assert "the command did not start: " in capfd.readouterr().err
-    assert not (tmp_path / "copy").exists()
-
-
-def test_a_copy_that_cannot_be_removed_does_not_change_the_exit_code(
-    machine, tmp_path, monkeypatch, capfd
-):
-    def stays(folder):
-        raise tool.UnavailableError(f"removing {folder} failed")
-
-    monkeypatch.setattr(tool, "_remove", stays)
-    command = [sys.executable, "-c", "raise SystemExit(3)"]
-    assert end_of(monkeypatch, machine, tmp_path, *command) == 3
-    assert f"removing {tmp_path / 'copy'} failed" in capfd.readouterr().err
-    left = tmp_path / "copies" / "left"
-    left.mkdir(parents=True)
-    tool.lock_of(left).touch()
-    tool.remove_unused(machine)
-    assert tool.lock_of(left).exists()
 
 
 # --- calls at the same time, and calls that were interrupted -------------------------------------
@@ -270,22 +201,6 @@ def test_an_environment_is_made_once_and_again_after_an_interruption(
     assert len(steps) == 6
 
 
-def test_a_lock_is_awaited(tmp_path):
-    order = []
-
-    def second():
-        with tool.locked(tmp_path / "making.lock"):
-            order.append("second")
-
-    with tool.locked(tmp_path / "making.lock"):
-        thread = threading.Thread(target=second)
-        thread.start()
-        thread.join(0.2)
-        order.append("first")
-    thread.join(10.0)
-    assert order == ["first", "second"]
-
-
 # --- where it cannot be made ---------------------------------------------------------------------
 
 
@@ -298,29 +213,7 @@ def test_a_python_that_cannot_be_used_is_named(tmp_path):
     )
 
 
-def test_a_program_that_is_no_python_and_one_of_another_version_are_told_apart(monkeypatch):
-    with pytest.raises(tool.UnavailableError, match=r"echo is no Python that starts"):
-        tool.found_python(shutil.which("echo"))
-    monkeypatch.setattr(tool.interpreters, "version_of", lambda python: (3, 11))
-    with pytest.raises(tool.UnavailableError, match=r"old is Python 3\.11; it must be Python 3"):
-        tool.found_python("/of/an/old")
-
-
 def test_without_any_python_and_root_it_says_what_to_do(tmp_path, monkeypatch):
     monkeypatch.setattr(tool.os, "geteuid", lambda: 1000)
     with pytest.raises(tool.UnavailableError, match=r"no python3\.13 .* name it by --python PATH"):
         tool.debian(tmp_path, NO_OPTIONS)
-
-
-def test_apt_without_an_archive_of_debian_is_refused(monkeypatch):
-    monkeypatch.setattr(tool, "run", lambda what, words: "http://archive.ubuntu.com/ubuntu/")
-    with pytest.raises(tool.UnavailableError, match=r"names no archive of Debian: http://arch"):
-        tool._archive()
-
-
-def test_a_step_that_fails_is_shown_with_its_output():
-    code = "print('first'); raise SystemExit('the reason')"
-    with pytest.raises(tool.UnavailableError, match=r"a step failed:\nfirst\nthe reason"):
-        tool.run("a step", [sys.executable, "-uc", code])
-    with pytest.raises(tool.UnavailableError, match="a step did not start"):
-        tool.run("a step", ["/no/such/program"])

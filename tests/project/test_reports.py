@@ -15,8 +15,7 @@ from iblf_jax.studies.statistics import probability
 from iblf_jax.tuning.report import Change, Verdict
 from iblf_jax.tuning.report import TuningReport as Report
 
-SHORT = {"duration": 0.2, "dt": 2e-3}
-
+SHORT = {"duration": 0.16, "dt": 2e-3}
 
 SCENARIO = ij.presets.zhang_yan_2024()
 DRAWN = {"plant.mass": ij.factor(ij.uniform(0.8, 1.25), shared=True)}
@@ -96,9 +95,9 @@ def test_a_title_does_not_repeat_the_name_of_the_class(results):
         assert not parts.words[0].startswith(parts.title), kind
     study = reports.shown(results["Study"])
     assert study.title == "Monte-Carlo study"
-    assert study.words[0].startswith("16 runs of 0.2 s, dt = 0.002 s, seed 0")
+    assert study.words[0].startswith("16 runs of 0.16 s, dt = 0.002 s, seed 0")
     assert reports.shown(results["Comparison"]).words == [
-        "2 laws, 0.2 s, dt = 0.002 s, rk4; worst joint"
+        "2 laws, 0.16 s, dt = 0.002 s, rk4; worst joint"
     ]
 
 

@@ -39,11 +39,7 @@ def wrong(page: str, public: set[str]) -> dict[str, set[str]]:
 
 
 def test_every_public_name_is_in_one_list():
-    assert wrong(PAGE, PUBLIC) == {
-        "missing": set(),
-        "unknown": set(),
-        "twice": set(),
-    }
+    assert wrong(PAGE, PUBLIC) == {"missing": set(), "unknown": set(), "twice": set()}
 
 
 def test_these_tests_can_fail():

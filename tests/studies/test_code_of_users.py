@@ -62,8 +62,7 @@ def sweep(part, store, backend):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("backend", ["auto", "vmap"])
-@pytest.mark.parametrize("make", [table_of, scaled])
+@pytest.mark.parametrize(("backend", "make"), [("auto", table_of), ("vmap", scaled)])
 def test_a_store_of_changed_code_is_refused(tmp_path, backend, make):
     pytest.importorskip("zarr")
     first = sweep(Table(make(1.0)), tmp_path / "store", backend)

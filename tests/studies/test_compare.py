@@ -15,6 +15,7 @@ from iblf_jax.studies.compare import factor_nearest_one
 from iblf_jax.studies.equal_effort import Trials, search
 
 RUN = {"duration": 2.0, "dt": 1e-3, "record_every": 10}
+BRIEF = {"duration": 0.08, "dt": 1e-3}
 
 
 @pytest.fixture(scope="module")
@@ -22,19 +23,12 @@ def comparison():
     return ij.compare(ij.presets.zhang_yan_2024(), ["integral", "log", "pd"], **RUN)
 
 
-def effort(run):
-    """RMS torque above gravity from a run with every step recorded."""
-    gravity = np.array([run.scenario.model.gravity(q) for q in run.q])
-    square = np.sum((np.asarray(run.tau) - gravity) ** 2, axis=1)
-    return math.sqrt(np.trapezoid(square, run.t) / float(run.t[-1]))
-
-
 @pytest.mark.slow
 def test_equal_effort_is_equal_effort(comparison):
     assert list(comparison.equal_effort) == ["integral", "log", "pd"]
     efforts = [float(run.metrics.effort_above_gravity) for run in comparison.equal_effort.values()]
     np.testing.assert_allclose(efforts, efforts[0], rtol=1e-5)
-    assert comparison.factors["integral"] == 1.0
+    assert comparison.factors["integral"] == 1.0 < comparison.factors["log"]
     for name, gains in (("log", ("k1", "K2")), ("pd", ("Kp", "Kd"))):
         for gain in gains:
             before, after = (
@@ -45,21 +39,11 @@ def test_equal_effort_is_equal_effort(comparison):
 
 
 @pytest.mark.slow
-def test_the_fold_measures_the_torque_above_gravity():
-    run = ij.simulate(
-        ij.presets.zhang_yan_2024(), duration=0.5, dt=1e-3, metrics=(ij.metrics.AboveGravity(),)
-    )
-    assert float(run.metrics.effort_above_gravity) == pytest.approx(effort(run), rel=1e-9)
-
-
-@pytest.mark.slow
 def test_laws_by_name_take_the_gains_the_observer_and_the_limit_of_the_scenario():
     scenario = ij.with_parameters(
         ij.presets.zhang_yan_2024_saturated(), {"controller.k1": [1.5, 2.5], "controller.K2": 15.0}
     )
-    comparison = ij.compare(
-        scenario, ["log", "adaptive_rbf"], duration=0.02, dt=1e-3, equal_effort=False
-    )
+    comparison = ij.compare(scenario, ["log", "adaptive_rbf"], equal_effort=False, **BRIEF)
     for name, run in comparison.rollouts.items():
         law = run.scenario.controller
         assert isinstance(law, controllers.Saturated)
@@ -119,24 +103,14 @@ def test_a_metric_replaces_the_standard_one_of_its_class(comparison):
     folds = (ij.metrics.Settling(tolerance=[0.02, 0.04]), ij.metrics.LyapunovValue())
     options = RUN | {"record_every": 1}
     found = ij.compare(comparison.scenario, ["log"], metrics=folds, equal_effort=False, **options)
+    with pytest.raises(ValueError, match=r"metrics.*Put one fold into brackets"):
+        ij.compare(comparison.scenario, ["log"], metrics=folds[0], **RUN)
     run = found.rollouts["log"]
     inside = np.abs(run.e1) < np.array([0.02, 0.04])
     settled = [np.flatnonzero(~inside[:, i])[-1] + 1 for i in range(2)]
     np.testing.assert_allclose(run.metrics.settling_time, run.t[np.array(settled)])
     assert set(ij.metrics.LyapunovValue.units) <= set(run.metrics)
     assert found.table["gains"][0].settling_time < comparison.table["gains"][1].settling_time
-
-
-def test_metrics_are_a_sequence(comparison):
-    with pytest.raises(ValueError, match=r"metrics.*Put one fold into brackets"):
-        ij.compare(comparison.scenario, ["log"], metrics=ij.metrics.Settling(), **RUN)
-
-
-def test_at_equal_gains_the_integral_form_works_harder_than_the_logarithmic_one(comparison):
-    integral, log = comparison.table["gains"][:2]
-    assert integral.settling_time < log.settling_time
-    assert integral.effort_above_gravity > log.effort_above_gravity
-    assert comparison.factors["log"] > 1.0
 
 
 @pytest.mark.slow
@@ -163,9 +137,7 @@ def test_laws_for_other_constraints_have_names_and_margins():
     wall = ij.regions.HalfSpace(normal=[-1.0, 0.0], offset=-0.245)
     preset = ij.presets.zhang_yan_2024_full_state()
     scenario = ij.with_parts(preset, bounds=(preset.bounds[0], speeds), regions=(wall,))
-    comparison = ij.compare(
-        scenario, ["integral", "full_state", "reference_governor"], duration=0.1, dt=1e-3
-    )
+    comparison = ij.compare(scenario, ["integral", "full_state", "reference_governor"], **BRIEF)
     given = {row.law: row for row in comparison.table["gains"]}
     assert given["integral"].velocity_margin < 0 < given["full_state"].velocity_margin
     for row in given.values():
@@ -189,9 +161,8 @@ def test_a_filter_by_name_is_around_the_unconstrained_law():
     found = ij.compare(
         ij.with_parts(ij.presets.zhang_yan_2024(), controller=law),
         ["pd"],
-        duration=0.02,
-        dt=1e-3,
         equal_effort=False,
+        **BRIEF,
     )
     assert isinstance(
         found.rollouts["pd"].scenario.controller, controllers.PDGravity
@@ -203,7 +174,7 @@ def test_a_law_without_a_factor_is_said_so():
     # A limit far below what the integral form does: no gain makes this one work as hard.
     capped = controllers.Saturated(law=controllers.PDGravity(Kp=60.0, Kd=20.0), limit=[8.0, 1.0])
     comparison = ij.compare(
-        ij.presets.zhang_yan_2024(), {"integral": "integral", "capped": capped}, **RUN
+        ij.presets.zhang_yan_2024(), {"integral": "integral", "capped": capped}, **BRIEF
     )
     assert math.isnan(comparison.factors["capped"])
     assert "capped" not in comparison.equal_effort
@@ -233,36 +204,16 @@ def test_laws_of_a_users_own():
         Bang(),
         Bang(size=0.2),
     ]
-    comparison = ij.compare(ij.presets.zhang_yan_2024(), laws, duration=0.1, dt=1e-3)
+    comparison = ij.compare(ij.presets.zhang_yan_2024(), laws, **BRIEF)
     assert list(comparison.rollouts) == ["Backstepping(Tan)", "Bang", "Bang 2"]
     assert "no gains to scale" in comparison.reasons["Bang"]
     assert "no gains (Bang, Bang 2)" in repr(comparison)
 
 
-@pytest.mark.parametrize(
-    "laws", [[], "integral", ["nonsense"], [3.0], {"x": None}, 7, [controllers.PDGravity]]
-)
+@pytest.mark.parametrize("laws", [["nonsense"], [3.0], {"x": None}, [controllers.PDGravity]])
 def test_wrong_laws_are_value_errors(laws):
     with pytest.raises(ValueError, match="laws"):
         ij.compare(ij.presets.zhang_yan_2024(), laws, duration=0.1)
-
-
-@pytest.mark.parametrize(
-    ("effort", "target", "expected"),
-    [
-        (lambda c: c, 3.0, 3.0),
-        (lambda c: c, 0.2, 0.2),
-        (lambda c: c, 1.0, 1.0),
-        (lambda c: (c - 0.5) * (c - 1.1) + 2.0, 2.0, 1.1),  # two roots: the one nearest 1
-        (lambda c: (c - 0.9) * (c - 1.3) + 2.0, 2.0, 0.9),
-        (lambda c: c if c < 2.0 else math.nan, 1.9, 1.9),  # failing runs beyond
-        (lambda c: c if c < 2.0 else math.nan, 3.0, math.nan),
-        (lambda c: 1.0 + 0.1 * math.tanh(c), 5.0, math.nan),
-        (lambda c: math.nan, 1.0, math.nan),
-    ],
-)
-def test_the_factor_is_the_one_nearest_one(effort, target, expected):
-    np.testing.assert_allclose(factor_nearest_one(effort, target), expected, rtol=1e-6)
 
 
 # ----------------------------------------------------------------------- figure and command line
@@ -293,41 +244,21 @@ def test_the_figure_shows_every_law_in_the_same_colour_on_both_sides(comparison)
 
 
 @pytest.mark.slow
-def test_command_line(tmp_path, capsys, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    words = [
-        "--laws",
-        "integral",
-        "log",
-        "--duration",
-        "2",
-        "--record-every",
-        "10",
-        "--out",
-        str(tmp_path / "out"),
-    ]
+def test_command_line(tmp_path, capsys):
+    words = ["--laws", "integral", "log", "--out", str(tmp_path / "out")]
+    words += ["--duration", "2", "--record-every", "10"]
     assert cli.main(["compare", *words]) == 0
     out = capsys.readouterr().out
     assert "Equal effort" in out
     assert "twice the logarithmic" in out
     names = {path.name for path in (tmp_path / "out").iterdir()}
-    assert names >= {
-        "comparison.txt",
-        "comparison.csv",
-        "comparison.json",
-        "comparison_joint_0.png",
-        "comparison_joint_1.pdf",
-        "rollouts.nc",
-    }
+    tables = {f"comparison.{ending}" for ending in ("txt", "csv", "json")}
+    figures = {"comparison_joint_0.png", "comparison_joint_1.pdf"}
+    assert names >= tables | figures | {"rollouts.nc"}
     report = json.loads((tmp_path / "out" / "comparison.json").read_text())
     assert report["factors"]["integral"] == 1.0
     assert report["factors"]["log"] == pytest.approx(1.1, abs=0.1)
     assert set(ij.load(tmp_path / "out" / "rollouts.nc")) == {"integral", "log"}
-
-
-def test_command_line_refuses_an_unknown_law(capsys):
-    assert cli.main(["compare", "zhang_yan_2024", "--laws", "nonsense", "--duration", "0.1"]) == 2
-    assert "one of 'integral'" in capsys.readouterr().err
 
 
 # ------------------------------------------------------ efforts that do not grow with the factor
@@ -357,49 +288,24 @@ class Wavy:
         return controllers.Command(tau, tube.dq_d, jnp.zeros_like(q), never, never), ()
 
 
-BRIEF = {"duration": 0.5, "dt": 1e-3, "record_every": 50}
-
-
-@pytest.fixture(scope="module")
-def wavy():
-    return ij.compare(
-        ij.presets.zhang_yan_2024(), {"at 1.28": Wavy(k=1.28), "at 1": Wavy()}, **BRIEF
-    )
-
-
 @pytest.mark.slow
-def test_the_factor_nearest_one_is_found_beyond_trials_that_fail(wavy):
+def test_the_factor_nearest_one_is_found_beyond_trials_that_fail():
     """The effort is the target's at 0.045 and at 1.28; the trials between 1.17 and 1.23 and from
     1.4 to 1.6 fail."""
+    laws = {"at 1.28": Wavy(k=1.28), "at 1": Wavy()}
+    wavy = ij.compare(ij.presets.zhang_yan_2024(), laws, **BRIEF)
     assert wavy.factors["at 1"] == pytest.approx(1.28, rel=1e-4)
     found = wavy.searches["at 1"]
-    assert len(found.crossings) == 2
-    assert found.crossings[1] == pytest.approx(0.045, abs=0.002)
-    efforts = [float(run.metrics.effort_above_gravity) for run in wavy.equal_effort.values()]
-    np.testing.assert_allclose(efforts, efforts[0], rtol=1e-4)
+    assert found.crossings == pytest.approx([1.28, 0.045], abs=0.002)
     assert all(1.17 <= factor <= 1.23 or factor >= 1.4 for factor in found.failed)
-    assert any(1.17 < factor < 1.23 for factor in found.failed)
-    assert all(
-        "time step is too large" in why for factor, why in found.failed.items() if factor < 1.23
-    )
-
-
-@pytest.mark.slow
-def test_failed_trials_are_in_the_text_and_in_the_dictionary(wavy):
-    text, found = repr(wavy), wavy.searches["at 1"]
+    assert "time step is too large" in next(why for x, why in found.failed.items() if x < 1.23)
+    text = repr(wavy)
     assert "of which 1.28 is the nearest to 1" in text
     assert f"{len(found.factors)} factors from 0.0312 to 32 were run" in text
-    assert f"{len(found.failed)} of them fail" in text
-    assert "the time step is too large" in text
-    assert (
-        f"only the time step is to blame: with dt={found.smaller_dt:g}" in text
-        and found.smaller_dt < 1e-3
-    )
+    assert f"with dt={found.smaller_dt:g}" in text and found.smaller_dt < 1e-3
     data = json.loads(json.dumps(found.to_dict(), allow_nan=False))
-    assert data["factor"] == found.factor
     assert len(data["trials"]["status"]) == len(found.factors)
     assert {entry["factor"] for entry in data["failed"]} == set(found.failed)
-    assert "the time step is too large" in wavy._repr_html_()
 
 
 def banded(low, high, flags):
@@ -455,25 +361,20 @@ def test_inaccurate_trials_count_only_where_the_given_runs_are_inaccurate_too():
 @pytest.mark.parametrize(
     ("effort", "target", "expected"),
     [
+        (lambda c: c, 1.0, 1.0),
+        (lambda c: 1.0 / c, 0.3, 1.0 / 0.3),
+        # of two factors the nearest to 1
+        (lambda c: (c - 0.5) * (c - 1.1) + 2.0, 2.0, 1.1),
         (lambda c: 2.0 + math.sin(12.0 * math.log(c)), 2.5, math.exp(math.asin(0.5) / 12.0)),
-        (
-            lambda c: 2.0 - (c - 0.71) ** 2,
-            2.0 - 1e-4,
-            0.72,
-        ),  # turns back just beyond the target, between grid points
+        # turns back just beyond the target, between grid points
+        (lambda c: 2.0 - (c - 0.71) ** 2, 2.0 - 1e-4, 0.72),
         (lambda c: math.nan if 1.1 < c < 1.3 else c, 1.35, 1.35),
         (lambda c: math.nan if 1.1 < c < 1.3 else c, 1.2, math.nan),
-        (
-            lambda c: math.nan if 1.03 < c < 1.3 else c + 3.0 * (c < 0.2),
-            1.2,
-            math.nan,
-        ),  # a jump over the target is no factor
-        (lambda c: 1.0 / c, 0.3, 1.0 / 0.3),
-        (
-            lambda c: abs(math.log(c)) + 0.1,
-            1.1,
-            math.exp(-1.0),
-        ),  # 1/e and e are equally near: the first one
+        (lambda c: 1.0 + 0.1 * math.tanh(c), 5.0, math.nan),
+        # a jump over the target is no factor
+        (lambda c: math.nan if 1.03 < c < 1.3 else c + 3.0 * (c < 0.2), 1.2, math.nan),
+        # 1/e and e are equally near: the first one
+        (lambda c: abs(math.log(c)) + 0.1, 1.1, math.exp(-1.0)),
     ],
 )
 def test_efforts_of_any_shape(effort, target, expected):

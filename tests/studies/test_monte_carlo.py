@@ -43,14 +43,14 @@ def results(study):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("chunk", [1, 256, 300, 10**6])
+@pytest.mark.parametrize("chunk", [1, 300])
 def test_chunk_changes_nothing(study, chunk):
     assert cases.same(
         results(study), results(cases.study(executor=ij.studies.LocalExecutor(chunk=chunk)))
     )
 
 
-@pytest.mark.parametrize(("chunk", "together"), [(256, 1), (512, 2), (None, sizes.MAX_IN_FLIGHT)])
+@pytest.mark.parametrize(("chunk", "together"), [(256, 1), (None, sizes.MAX_IN_FLIGHT)])
 def test_as_many_blocks_are_made_beside_each_other_as_are_in_flight(
     study, chunk, together, monkeypatch
 ):
@@ -79,7 +79,7 @@ def test_as_many_blocks_are_made_beside_each_other_as_are_in_flight(
     assert cases.same(results(study), {name: x[:600] for name, x in results(again).items()})
 
 
-@pytest.mark.parametrize("runs", [1, 255, 256, 257])
+@pytest.mark.parametrize("runs", [1, 257])
 def test_number_of_runs_changes_no_run(study, runs):
     fewer = results(cases.study(runs=runs))
     assert cases.same({name: x[:runs] for name, x in results(study).items()}, fewer)
@@ -166,12 +166,12 @@ def test_choice_has_its_weights():
 
 
 @pytest.mark.slow
-def test_a_law_and_a_distribution_from_a_notebook():
-    """Classes of the user's own, defined where the study is made."""
+def test_a_distribution_from_a_notebook():
+    """A class of the user's own, defined where the study is made."""
 
     @ij.component
     class Triangular:
-        """The sum of two dice: density 2 (1 - x) on (0, 1)."""
+        """Density 2 (1 - x) on (0, 1)."""
 
         def quantile(self, u):
             return 1 - jnp.sqrt(1 - u)
@@ -179,38 +179,9 @@ def test_a_law_and_a_distribution_from_a_notebook():
         def support(self):
             return np.zeros(()), np.ones(())
 
-    @ij.component
-    class Damping:
-        """tau = G0 - Kd q' - f_hat."""
-
-        Kd: jax.Array = ij.leaf("N m s/rad", sign="positive")
-
-        def init(self, q, dq, context):
-            return ()
-
-        def command(self, t, q, dq, f_hat, context, state):
-            never = jnp.zeros(q.shape, bool)
-            tau = context.model.gravity(q) - self.Kd * dq - f_hat
-            return (
-                ij.controllers.Command(tau, jnp.zeros_like(q), jnp.zeros_like(q), never, never),
-                state,
-            )
-
-    scenario = dataclasses.replace(
-        SCENARIO, controller=Damping(Kd=[4.0, 4.0]), observer=ij.observers.NoObserver()
-    )
-    study = ij.monte_carlo(
-        scenario,
-        {"plant.payload": ij.value(Triangular())},
-        runs=300,
-        seed=1,
-        duration=0.05,
-        progress=False,
-    )
-    assert study.backend in ("native", "vmap")
-    assert abs(study.samples["plant.payload"].mean() - 1 / 3) < 0.05
-    replayed = study.replay(7)
-    np.testing.assert_array_equal(replayed.metrics["effort"], study.metrics["effort"][7])
+    found = cases.study(300, {"plant.payload": ij.value(Triangular())})
+    assert abs(found.samples["plant.payload"].mean() - 1 / 3) < 0.05
+    np.testing.assert_array_equal(found.replay(7).metrics["margin"], found.metrics["margin"][7])
 
 
 @pytest.mark.slow
@@ -460,17 +431,9 @@ def test_bad_perturbations_are_refused(perturbation, message):
 @pytest.mark.parametrize(
     ("more", "message"),
     [
-        ({"runs": 0}, "runs"),
-        ({"runs": 2.0}, "runs"),
-        ({"seed": -1}, "seed"),
-        ({"seed": 1.5}, "seed"),
-        ({"seed": True}, "seed"),
-        ({"method": "rk5"}, "rk4"),
         ({"sampler": "halton"}, "sobol"),
         ({"runs": 100, "sampler": "sobol"}, "128"),
         ({"runs": 10, "replicates": 2}, "replicates"),
-        ({"backend": "fast"}, "backend"),
-        ({"executor": ij.studies.LocalExecutor(chunk=0.5)}, "chunk"),
         ({"duration": 0.0105}, "duration"),
     ],
 )

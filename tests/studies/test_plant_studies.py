@@ -9,18 +9,15 @@ import pytest
 
 import iblf_jax as ij
 
-SHORT = {"duration": 0.2, "dt": 1e-3}
+SHORT = {"duration": 0.08, "dt": 1e-3}
 UNKNOWN = {
     "user class": {"plant.D": ij.factor(ij.uniform(0.9, 1.1))},
-    "electric drive": {"plant.robot.mass[1]": ij.factor(ij.uniform(0.9, 1.1))},
     "flexible joint": {"plant.stiffness": ij.factor(ij.uniform(0.8, 1.2))},
 }
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "case", [x if x == "user class" else pytest.param(x, marks=pytest.mark.slow) for x in UNKNOWN]
-)
+@pytest.mark.parametrize("case", UNKNOWN)
 def test_executors_give_the_same_numbers(case):
     scenario = loops_of_plants.CASES[case]()
     runs = [
@@ -44,18 +41,6 @@ def test_a_sweep_over_a_gain_of_a_level_is_stored(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_rigid_law_is_compared_with_one_of_all_levels():
-    rigid = loops_of_plants.rigid_law()
-    scenario = loops_of_plants.flexible_joint(plant=rigid.plant)
-    laws = {"all levels": scenario.controller, "rigid": rigid.controller}
-    found = ij.compare(scenario, laws, equal_effort=False, **SHORT)
-    model = found.rollouts["rigid"].scenario.model
-    assert type(model) is ij.robots.WithMotors
-    np.testing.assert_array_equal(model.inertia, rigid.plant.motor_inertia)
-    assert found.rollouts["all levels"].scenario.model.order == 4
-
-
-@pytest.mark.slow
 def test_a_rigid_law_and_one_of_all_levels_at_equal_effort():
     """Neither has a barrier above the first level: leaving the bounds there is no obstacle."""
     preset = ij.presets.flexible_joint_two_link(stiffness=1000.0)
@@ -65,6 +50,10 @@ def test_a_rigid_law_and_one_of_all_levels_at_equal_effort():
     all_levels = ij.controllers.BarrierBackstepping(k=(2.0, 10.0, 30.0, 60.0))
     laws = {"rigid": rigid, "all levels": all_levels}
     found = ij.compare(scenario, laws, duration=1.0, dt=5e-4)
+    model = found.rollouts["rigid"].scenario.model
+    assert type(model) is ij.robots.WithMotors
+    np.testing.assert_array_equal(model.inertia, scenario.plant.motor_inertia)
+    assert found.rollouts["all levels"].scenario.model.order == 4
     assert int(found.rollouts["rigid"].status) & ij.Status.STATE_BOUND_VIOLATED
     efforts = [x.metrics.effort_above_gravity for x in found.equal_effort.values()]
     assert list(found.equal_effort) == ["rigid", "all levels"]
@@ -86,13 +75,7 @@ def errors_below(size):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("size", "tolerance", "shown"),
-    [
-        (0.005, 0.01, False),
-        (0.02, 0.01, True),
-        (0.005, 0.001, True),
-        (0.02, 0.03, False),
-        (0.01, 0.01, False),
-    ],
+    [(0.005, 0.01, False), (0.02, 0.01, True), (0.005, 0.001, True), (0.01, 0.01, False)],
 )
 def test_a_settling_time_is_shown_where_the_bounds_do_not_settle_the_run(size, tolerance, shown):
     scenario = plant_cases.pendulum(initial=ij.Initial(x=[[0.0]] * 3))

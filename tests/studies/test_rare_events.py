@@ -91,8 +91,6 @@ def series(dimension, beta):
 
 
 CASES = {
-    "1e-3 in 6": linear(6, 3.09),
-    "1e-6 in 2": linear(2, 4.75),
     "1e-6 in 50": linear(50, 4.75),
     "1e-8 in 10": linear(10, 5.6),
     "quadratic": quadratic(5, 4.2, 0.2),

@@ -21,7 +21,7 @@ import pytest
 import study_cases as cases
 
 import iblf_jax as ij
-from iblf_jax.engine import CompiledBatch, native
+from iblf_jax.engine import native
 from iblf_jax.kernels import toolchain
 from iblf_jax.studies import blocks, interrupt, store, sweep
 
@@ -85,9 +85,8 @@ def test_points_are_the_studies_of_their_scenarios(table):
         )
 
 
-@pytest.mark.parametrize("chunk", [1, 700])
-def test_chunk_changes_nothing(table, chunk):
-    assert cases.table(executor=ij.studies.LocalExecutor(chunk=chunk)).identical(table)
+def test_chunk_changes_nothing(table):
+    assert cases.table(executor=ij.studies.LocalExecutor(chunk=700)).identical(table)
 
 
 @pytest.mark.slow
@@ -188,23 +187,9 @@ def test_another_scenario_law_or_backend_is_refused(finished):
         )
     with pytest.raises(ij.StoreError, match="backend"):
         ij.sweep(SCENARIO, cases.GRID, perturbations=ways, **options, backend="vmap")
-    assert ij.load_sweep(finished).attrs["backend"] in (
-        "native",
-        "vmap",
-    ), "what it ran on, not what was asked for"
-
-
-@pytest.mark.slow
-def test_a_store_of_a_backend_that_was_removed_loads(tmp_path, monkeypatch):
-    """As it is; to continue it is to compute other digits, and is refused."""
-    with monkeypatch.context() as patch:
-        patch.setattr(CompiledBatch, "backend", "xla")
-        written = once(store=tmp_path / "old")
-    loaded = ij.load_sweep(tmp_path / "old")
-    assert loaded.attrs["backend"] == "xla"
-    assert loaded.identical(written)
-    with pytest.raises(ij.StoreError, match=r"backend: the store has .?xla"):
-        once(store=tmp_path / "old")
+    assert ij.load_sweep(finished).attrs["backend"] in ("native", "vmap"), (
+        "what it ran on, not what was asked for"
+    )
 
 
 @pytest.mark.skipif(native.unavailable() is not None, reason="no C++ compiler")
@@ -277,21 +262,11 @@ class Payload:
 def crafted(path, marker, kind):
     """A store, written by hand, in which the chunks of `margin` are unpickled."""
     attributes = {"iblf_jax_store": 1, "config": {}, "cases": 1, "unit": 1, "variables": ["margin"]}
-    array = {
-        "zarr_format": 2,
-        "shape": [1],
-        "chunks": [1],
-        "dtype": "<f8",
-        "fill_value": 0,
-        "order": "C",
-    }
-    done = array | {"dtype": "<u8", "fill_value": 1, "compressor": None, "filters": None}
-    array |= {
-        "dtype": "|O",
-        "fill_value": "",
-        "compressor": None,
-        "filters": [{"id": "vlen-utf8"}, {"id": "pickle"}],
-    }
+    array = {"zarr_format": 2, "shape": [1], "chunks": [1], "fill_value": 0, "order": "C"}
+    array |= {"compressor": None, "filters": None}
+    done = array | {"dtype": "<u8", "fill_value": 1}
+    array |= {"dtype": "|O", "fill_value": ""}
+    array |= {"filters": [{"id": "vlen-utf8"}, {"id": "pickle"}]}
     group = {"zarr_format": 3, "node_type": "group", "attributes": attributes}
     inline = {
         "kind": "inline",
@@ -420,6 +395,18 @@ def test_without_zarr_the_extra_is_named(tmp_path, monkeypatch):
         cases.table(store=tmp_path / "sweep.zarr")
 
 
+def test_a_disk_that_is_full_from_the_start_keeps_no_half_of_a_store(tmp_path, monkeypatch):
+    import zarr
+
+    def full(*words):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(zarr.Array, "__setitem__", full)
+    with pytest.raises(store.StoreWriteError, match="no space left"):
+        cases.table(store=tmp_path / "sweep.zarr")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_disk_full_keeps_what_was_written(tmp_path, table, monkeypatch):
     import zarr
 
@@ -441,30 +428,6 @@ def test_disk_full_keeps_what_was_written(tmp_path, table, monkeypatch):
     assert cases.table(store=path).identical(table)
 
 
-@pytest.mark.slow
-def test_a_limit_of_the_system_is_a_clear_error(tmp_path, compiled):
-    """RLIMIT_FSIZE: the kernel itself refuses to write more."""
-    code = (
-        "import resource, sys; sys.path.insert(0, sys.argv[1]); import study_cases as c;"
-        " c.table()\nresource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000));"
-        " c.table(store=sys.argv[2])"
-    )
-    command = [
-        sys.executable,
-        "-c",
-        code,
-        str(Path(cases.__file__).parent),
-        str(tmp_path / "sweep.zarr"),
-    ]
-    done = subprocess.run(
-        command, env=cases.environment(compiled), capture_output=True, text=True, timeout=300
-    )
-    assert done.returncode == 1
-    assert "StoreWriteError" in done.stderr
-    assert "no space left" in done.stderr
-    assert list(tmp_path.iterdir()) == [], "half a store was left behind"
-
-
 def cut_in(monkeypatch, count, deed):
     """Does something before the so-many-th write of an array."""
     import zarr
@@ -480,7 +443,7 @@ def cut_in(monkeypatch, count, deed):
     monkeypatch.setattr(zarr.Array, "__setitem__", write)
 
 
-@pytest.mark.parametrize("count", [1, 6, 9, 25])
+@pytest.mark.parametrize("count", [1, 9, 25])
 def test_a_store_that_is_deleted_meanwhile_is_begun_anew(tmp_path, table, monkeypatch, count):
     """Noticed at the unit at hand; nothing of it stays that would be in the way of the same
     call."""

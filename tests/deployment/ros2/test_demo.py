@@ -55,15 +55,6 @@ def test_noise_and_delay_are_those_of_cosimulate(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_payload_is_that_of_cosimulate(tmp_path):
-    payload = ij.robots.Payload(mass=0.2, centre=[0.31, 0.0, 0.0], inertia=[1e-4] * 3 + [0.0] * 3)
-    found = demonstrate(PAPER, tmp_path, period=2e-3, duration=0.4, dt=1e-3, payload=payload)
-    assert found.distance < 1e-9
-    bare = ij.cosimulate(PAPER, tmp_path / "robot.xml", duration=0.4, dt=1e-3)
-    assert np.max(np.abs(np.asarray(bare.q - found.rollout.q))) > 1e-4
-
-
-@pytest.mark.slow
 def test_an_arm_from_its_file_has_its_own_joints_and_limits(tmp_path):
     scenario = ij.load_scenario(ROOT / "examples" / "arm.toml")
     arm = ij.with_parameters(scenario, {"plant.payload": 0.0})

@@ -167,41 +167,20 @@ def test_joints_are_found_by_name_in_any_order(order):
         assert sample == JointSample(5, 7, (0.0, 0.1, 0.2), (0.0, 1.0, 2.0))
 
 
-def test_the_order_may_change_from_message_to_message():
-    reader = JointReader(("a", "b"), True)
-    first = reader.read(["a", "b"], (1.0, 2.0), (3.0, 4.0), 0, 0)
-    second = reader.read(["b", "a"], (2.0, 1.0), (4.0, 3.0), 1, 1)
-    assert first[2:] == second[2:] == ((1.0, 2.0), (3.0, 4.0))
-
-
+FOUR = {"q": (0.1, 0.2, 0.3, 0.4), "dq": (0.0,) * 4}
+MISSING = {"names": ("shoulder", "wrist"), "q": (0.1, 0.3), "dq": (0.0, 0.0)}
 BAD_STATES = {
     "NaN in a position": ({"q": (0.1, math.nan, 0.3)}, FaultKind.NOT_FINITE, "elbow"),
     "infinity in a velocity": ({"dq": (0.0, 0.0, math.inf)}, FaultKind.NOT_FINITE, "wrist"),
-    "a missing joint": (
-        {"names": ("shoulder", "wrist"), "q": (0.1, 0.3), "dq": (0.0, 0.0)},
-        FaultKind.JOINTS,
-        "elbow",
-    ),
-    "an unknown name in place of a joint": (
-        {"names": ("shoulder", "elbo", "wrist")},
-        FaultKind.JOINTS,
-        "elbow",
-    ),
-    "a joint that occurs twice": (
-        {"names": (*JOINTS, "elbow"), "q": (0.1, 0.2, 0.3, 0.4), "dq": (0.0,) * 4},
-        FaultKind.JOINTS,
-        "elbow",
-    ),
+    "a missing joint": (MISSING, FaultKind.JOINTS, "elbow"),
+    "an unknown name": ({"names": ("shoulder", "elbo", "wrist")}, FaultKind.JOINTS, "elbow"),
+    "a joint that occurs twice": ({"names": (*JOINTS, "elbow")} | FOUR, FaultKind.JOINTS, "elbow"),
     "too few positions": ({"q": (0.1, 0.2)}, FaultKind.JOINTS, "2 positions"),
-    "too many positions": ({"q": (0.1, 0.2, 0.3, 0.4)}, FaultKind.JOINTS, "4 positions"),
+    "too many positions": ({"q": FOUR["q"]}, FaultKind.JOINTS, "4 positions"),
     "no velocities": ({"dq": ()}, FaultKind.JOINTS, "0 velocities"),
     "too few velocities": ({"dq": (0.0,)}, FaultKind.JOINTS, "1 velocities"),
     "a stamp before the last one": ({"stamp": EPOCH}, FaultKind.CLOCK, "jumped back"),
-    "a stamp far after the last one": (
-        {"stamp": EPOCH + 100 * T},
-        FaultKind.STALE,
-        "apart",
-    ),
+    "a stamp far after the last one": ({"stamp": EPOCH + 100 * T}, FaultKind.STALE, "apart"),
 }
 
 
@@ -234,12 +213,10 @@ def test_a_bad_state_is_a_fault_that_only_start_leaves(name, mode, policy):
     assert bench.period().torque == bench.law.torque
 
 
-@pytest.mark.parametrize("name", BAD_STATES)
+@pytest.mark.parametrize("name", [*BAD_STATES][:-1])
 def test_a_bad_state_while_stopped_changes_nothing_but_the_note(name):
     bench = Bench()
     bench.period()
-    if name == "a stamp far after the last one":
-        return
     command = bench.period(**BAD_STATES[name][0])
     assert command.mode is Mode.STOPPED
     assert BAD_STATES[name][2] in bench.supervisor.note
@@ -514,15 +491,6 @@ def test_a_period_without_a_new_state_repeats_the_torques():
     assert bench.supervisor.repeated == 2
 
 
-def test_repeated_torques_keep_their_limits():
-    bench = Bench().running()
-    bench.law.torque = [11.0, -6.0, 1.0]
-    bench.period()
-    bench.now += T
-    assert bench.command().torque == [10.0, -5.0, 1.0]
-    assert bench.supervisor.repeated == 1
-
-
 def test_a_new_start_does_not_repeat_torques_of_the_earlier_run():
     bench = Bench().running()
     bench.supervisor.stop()
@@ -564,12 +532,6 @@ def test_an_automatic_start_needs_no_service_and_does_not_leave_a_fault():
     bench.now += 3 * T
     _, message = bench.supervisor.hold(bench.now, bench.clock)
     assert "in fault (the position of shoulder is nan); no valid state has arrived for" in message
-
-
-def test_an_automatic_start_that_is_refused_is_reported():
-    bench = Bench(start_automatically=True, time_origin=EPOCH + 1000 * T)
-    assert bench.period().mode is Mode.STOPPED
-    assert "time_origin" in bench.supervisor.note
 
 
 def test_a_torque_that_is_not_finite_is_a_fault():
