@@ -1,7 +1,8 @@
 """Runs of the scenarios of members, in processes that are told apart.
 
 Each line of the input names a backend, a method and a member.  The answer is a line of JSON with
-position, velocity and torque at the end of a short run.  A backend that cannot run it is an error.  With `--apart`, each line gets a process
+position, velocity and torque at the end of a short run; a backend that cannot run it is an error.
+With `--apart`, each line gets a process
 of its own; it starts with the package imported, and with nothing computed or compiled.
 """
 

@@ -302,7 +302,8 @@ def test_import_is_light_and_leaves_the_session_alone():
     code = (
         "import sys, json, jax\nbefore = set(sys.modules); x64 = jax.config.jax_enable_x64; cache"
         f" = jax.config.jax_compilation_cache_dir\nimport iblf_jax\nheavy = [m for m in {HEAVY!r}"
-        " if m in set(sys.modules) - before]\niblf_jax.monte_carlo, iblf_jax.sweep\nfrom jax._src import xla_bridge\nsame = [x64 =="
+        " if m in set(sys.modules) - before]\niblf_jax.monte_carlo, iblf_jax.sweep\nfrom"
+        " jax._src import xla_bridge\nsame = [x64 =="
         " jax.config.jax_enable_x64, cache =="
         " jax.config.jax_compilation_cache_dir]\nprint(json.dumps([heavy, *same,"
         " bool(xla_bridge._backends)]))"

@@ -168,9 +168,7 @@ def test_access_by_name_and_by_attribute(short_run):
 
 # --- integrals are of second order -----------------------------------------------
 
-SLOW = ij.with_parameters(
-    ij.presets.zhang_yan_2024(variant="corrected"), {"controller.K2": 4.0, "observer.kf": 4.0}
-)
+
 @pytest.mark.slow
 def test_the_effort_above_gravity_by_hand(rng):
     fold, samples = ij.metrics.AboveGravity(), ij.testing.metrics.samples(rng)
@@ -182,6 +180,9 @@ def test_the_effort_above_gravity_by_hand(rng):
     np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 
+SLOW = ij.with_parameters(
+    ij.presets.zhang_yan_2024(variant="corrected"), {"controller.K2": 4.0, "observer.kf": 4.0}
+)
 STEP = ij.disturbances.Step(size=[8.0, 3.0], time=0.0631)
 LOOPS = {
     "continuous": {},
