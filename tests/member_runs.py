@@ -2,8 +2,8 @@
 
 Each line of the input names a backend, a method and a member.  The answer is a line of JSON with
 position, velocity and torque at the end of a short run; a backend that cannot run it is an error.
-With `--apart`, each line gets a process
-of its own; it starts with the package imported, and with nothing computed or compiled.
+With `--apart`, each line gets a process of its own; it starts with the package imported, and with
+nothing computed or compiled.
 """
 
 from __future__ import annotations
