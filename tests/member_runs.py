@@ -1,8 +1,9 @@
 """Runs of the scenarios of members, in processes that are told apart.
 
 Each line of the input names a backend, a method and a member.  The answer is a line of JSON with
-position, velocity and torque at the end of a short run.  With `--apart`, each line gets a process
-of its own; it starts with the package imported, and with nothing computed or compiled.
+position, velocity and torque at the end of a short run; a backend that cannot run it is an error.
+With `--apart`, each line gets a process of its own; it starts with the package imported, and with
+nothing computed or compiled.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import warnings
 import jax
 
 import iblf_jax as ij
+from iblf_jax.engine.compile import BackendWarning
 
 RUN = {"duration": 0.02, "dt": 2e-3}
 
@@ -35,6 +37,7 @@ def answer(line: str) -> None:
     backend, method, name = line.strip().split(" ", 2)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
+        warnings.simplefilter("error", BackendWarning)
         scenario = scenarios()[name]()
         method = fitting(scenario, method)
         run = ij.simulate(scenario, backend=backend, method=method, **RUN)

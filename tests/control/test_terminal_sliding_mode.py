@@ -128,15 +128,26 @@ def test_the_trajectory_and_the_band():
     assert np.all(np.abs(v) <= (2.02 * LAW["beta"] * sigma) ** (1.0 / LAW["p"]))
 
 
-@pytest.mark.slow
-def test_certify_checks_the_claim_of_the_law():
-    """(T.2) is an equality."""
+@pytest.mark.parametrize(
+    ("observer", "term"),
+    [
+        pytest.param(ij.observers.Momentum(kf=20.0), "f_tilde", marks=pytest.mark.slow),
+        pytest.param(
+            ij.observers.StateObserver(bandwidth=100.0, offset=(0.0, 0.3)),
+            "tau(x_hat)",
+            marks=pytest.mark.release,
+        ),
+    ],
+    ids=["measured velocity", "estimated velocity"],
+)
+def test_certify_checks_the_claim_of_the_law(observer, term):
+    """(T.2) is an equality; with estimated velocities the error of the estimates is a part of T."""
     pushed = ij.disturbances.Sinusoids(amplitude=[0.3, 0.1], frequency=3.0)
-    scenario = loop(LAW, observer=ij.observers.Momentum(kf=20.0), disturbance=pushed)
+    scenario = loop(LAW, observer=observer, disturbance=pushed)
     certificate = ij.certify(scenario, duration=0.1, dt=2e-4)
     line = {line.name: line for line in certificate.lines}["inequality, own V"]
     assert line.verdict == "holds" and abs(line.margin) < 1e-10
-    assert "f_tilde" in line.statement
+    assert term in line.statement
 
 
 def test_an_exponent_without_a_law_is_refused():

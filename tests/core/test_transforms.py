@@ -13,8 +13,10 @@ from conftest import PAPER, SHORT
 from made_up_runs import ALWAYS
 
 import iblf_jax as ij
+from iblf_jax.core.caches import CACHE
 from iblf_jax.core.status import Status
 from iblf_jax.engine import (
+    compile,
     native,
     registry,
     request,
@@ -23,7 +25,7 @@ from iblf_jax.engine import (
     time_step,
     transformable,
 )
-from iblf_jax.kernels import UnsupportedError
+from iblf_jax.kernels import UnsupportedError, cpu
 from iblf_jax.simulation.scenario import canonical
 
 PATHS = (
@@ -389,6 +391,46 @@ def test_another_length_compiles_the_steps_alone(paper):
     assert [new - old for new, old in zip(compiled(), before, strict=True)] == [0, 1, 0]
     again = ij.simulate(paper, **SHORT, backend="native")
     np.testing.assert_array_equal(longer.q[:150], again.q[:450:3])
+
+
+@pytest.mark.slow
+@needs_compiler
+def test_a_run_alone_falls_back_where_its_kernel_cannot_be_built(paper, tmp_path, monkeypatch):
+    """With one warning, after which the process does not try again, whatever the length is; with
+    a compiler that works the kernel is built."""
+    broken = tmp_path / "g++"
+    broken.write_text(
+        '#!/bin/sh\n[ "$1" = --version ] && echo broken 1.0 && exit 0\necho "error: no"'
+        " >&2\nexit 1\n"
+    )
+    broken.chmod(0o755)
+    few = {"duration": 0.05, "dt": 1e-3, "method": "euler", "metrics": (ij.metrics.Margin(),)}
+    expected = ij.simulate(paper, **few, backend="vmap")
+    CACHE.clear(compile.WARNINGS)
+    CACHE.clear(single_run.FAILED_BUILDS)
+    cpu.kernel.cache_clear()
+    cpu.rows_function.cache_clear()
+    with monkeypatch.context() as patch:
+        patch.setenv("CXX", str(broken))
+        with pytest.warns(compile.BackendWarning, match="native backend is not available .*failed"):
+            found = ij.simulate(paper, **few, backend="native")
+        np.testing.assert_array_equal(found.q, expected.q)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            ij.simulate(paper, **few | {"duration": 0.06}, backend="native")
+            np.testing.assert_array_equal(ij.simulate(paper, **few).q, expected.q)
+    CACHE.clear(single_run.FAILED_BUILDS)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        built = ij.simulate(paper, **few, backend="native")
+    np.testing.assert_allclose(built.q, expected.q, rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_the_same_run_twice_is_bit_identical(paper, short_run):
+    again = ij.simulate(paper, **SHORT)
+    for name in ("q", "tau", "V"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(short_run, name))
 
 
 def test_no_warning_on_a_good_run(paper):

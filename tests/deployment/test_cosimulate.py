@@ -11,6 +11,7 @@ from arm_cases import ARMS
 import iblf_jax as ij
 
 mujoco = pytest.importorskip("mujoco")
+from iblf_jax.deployment.film import has_shapes
 from iblf_jax.deployment.mujoco_plant import MujocoPlant
 
 TIMING = {"duration": 0.4, "dt": 5e-4}
@@ -261,6 +262,17 @@ def test_records(tmp_path):
     np.testing.assert_array_equal(some.metrics.rmse, every.metrics.rmse)
     some.to_xarray()
     ij.save_rollouts(some, tmp_path / "run.nc")
+
+
+def test_an_arm_without_shapes_is_drawn_as_its_skeleton():
+    shapes = spec_of(PAPER.plant)
+    bare = mujoco.MjModel.from_xml_path(str(ARMS / "iiwa14.urdf"))
+    assert has_shapes(shapes.compile())
+    assert not has_shapes(bare)
+    shapes.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.1, 0.1, 0.1])
+    for geom in shapes.geoms:
+        geom.group = 0 if geom.parent == shapes.worldbody else 3
+    assert not has_shapes(shapes.compile()), "a table does not move, and other groups are not drawn"
 
 
 @pytest.mark.slow

@@ -16,7 +16,7 @@ import pytest
 import iblf_jax as ij
 from iblf_jax.core import programs
 from iblf_jax.core.status import Status
-from iblf_jax.engine import native, plan, registry, thresholds
+from iblf_jax.engine import compile, native, plan, registry, thresholds
 from iblf_jax.engine.batch import Batch, run_all
 from iblf_jax.engine.carry import Inputs
 from iblf_jax.engine.loops import checkpointed, kernel_stepper, scan
@@ -132,6 +132,28 @@ def test_a_failed_run_is_not_reported_inside_a_transformation(short_loop):
     assert np.all(np.isfinite(slope)) and slope.shape == (2, 2)
     with pytest.raises(ij.SimulationError, match="left its bounds"):
         ij.simulate(fast, **failing)
+
+
+@pytest.mark.slow
+def test_a_long_loop_whose_stages_are_rolled_has_the_same_gradient(paper, monkeypatch):
+    """In reverse mode of the scan, too."""
+
+    def ise(K2):
+        changed = ij.with_parameters(paper, {"controller.K2": K2})
+        run = ij.simulate(changed, duration=0.011, dt=1e-3, method="heun", backend="vmap")
+        return run.metrics.ise.sum()
+
+    K2 = jnp.array([20.0, 30.0])
+    found = []
+    for limit in (thresholds.LONG_EVALUATION, 0):
+        monkeypatch.setattr(thresholds, "LONG_EVALUATION", limit)
+        compile.plan_of_single_run.cache_clear()
+        assert thresholds.rolls_stages(1) == (limit == 0)
+        found.append(jax.value_and_grad(ise)(K2))
+    compile.plan_of_single_run.cache_clear()
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9)
+    assert np.all(found[0][1] != 0.0)
 
 
 @pytest.mark.parametrize("steps", [1, 2, 7, 100, 501, 4001, 20_001])

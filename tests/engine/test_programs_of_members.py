@@ -45,16 +45,16 @@ def answers(lines: list[str], folder: Path, *options: str) -> dict[tuple[str, st
 
 def check(names: list[str], method: str, folder: Path) -> None:
     """Compares the compiled run with plain JAX, in one process and in one process a member."""
-    order = [f"{backend} {method} {name}" for name in names for backend in ("auto", "vmap")]
+    order = [f"{backend} {method} {name}" for name in names for backend in ("native", "vmap")]
     random.Random(0 if os.environ.get("CI") else None).shuffle(order)
     together = answers(order, folder)
     assert len(together) == len(order)
     for name in names:
-        one, other = (np.concatenate(together[name, x], axis=None) for x in ("auto", "vmap"))
+        one, other = (np.concatenate(together[name, x], axis=None) for x in ("native", "vmap"))
         scale = max(1.0, np.abs(other).max())
         np.testing.assert_allclose(one, other, rtol=0, atol=1e-9 * scale, err_msg=name)
-    apart = answers([f"auto {method} {name}" for name in names], folder, "--apart")
-    assert apart == {key: end for key, end in together.items() if key[1] == "auto"}
+    apart = answers([f"native {method} {name}" for name in names], folder, "--apart")
+    assert apart == {key: end for key, end in together.items() if key[1] == "native"}
 
 
 def test_laws_that_are_alike_have_their_own_programs(tmp_path):

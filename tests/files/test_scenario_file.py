@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import members
 import numpy as np
 import pytest
+import scenarios_of_members
 import tomli_w
 
 import iblf_jax as ij
@@ -98,6 +99,25 @@ def test_a_saved_scenario_comes_back_equal(scenario):
     assert tomllib.loads(text) == scenario_file.scenario_to_dict(scenario) | {
         "run": {"duration": 1.0}
     }
+
+
+OTHER_FAMILIES = ("plant ", "sensor ", "actuator ", "process_noise ")
+OF_FUNCTIONS = ("strict_feedback", "strict_feedback_diagonal", "diffusion", "diffusion_additive")
+"""Members with fields that are functions, which no file holds."""
+
+
+@pytest.mark.slow
+def test_members_of_the_other_families_come_back_equal():
+    """With the sampling of the loop, whose queue follows from its delay."""
+    for name, make in scenarios_of_members.scenarios().items():
+        if not name.startswith(OTHER_FAMILIES) or name.endswith(OF_FUNCTIONS):
+            continue
+        scenario = make()
+        if scenario.sampling is not None:
+            sampling = ij.Sampling(period=2e-3, delay=5e-3)
+            scenario = ij.with_parts(scenario, sampling=sampling)
+        text = scenario_file.scenario_to_toml(scenario)
+        assert_equal(scenario, scenario_file.from_dict(tomllib.loads(text)).scenario)
 
 
 @pytest.mark.parametrize("robot", ["chain_1", "chain_3"])

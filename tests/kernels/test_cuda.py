@@ -94,6 +94,29 @@ def runs_here(monkeypatch):
         gpu_for_this_platform(monkeypatch, run=gpu_on_cpu.run, unavailable=lambda: None)
 
 
+TOLERANCE = {"float64": 1e-10, "float32": 1e-4}
+
+
+def runs_of(dtype, backend, steps):
+    """Values -> the outcome of so many steps of runs of the paper's scenario."""
+    scenario = canonical(ij.astype(ij.presets.zhang_yan_2024(), dtype))
+    folds = jax.tree.map(lambda x: jnp.asarray(x, dtype), standard())
+    dt, request = jnp.asarray(DT, dtype), RunRequest(steps, "heun", 7, backend=backend)
+    compiled = jax.jit(lambda v: execute.run_batch(scenario, v, folds, dt, request))
+    return lambda values: jax.tree.map(
+        np.asarray, compiled({k: jnp.asarray(v, dtype) for k, v in values.items()})
+    )
+
+
+def spoiled(runs):
+    """Draws, of which three fail."""
+    values = draws(runs)
+    values["plant.mass[1]"][1] = np.nan
+    values["initial.q"][3] = 40.0
+    values["plant.mass[1]"][4] = 0.02
+    return values
+
+
 @needs_compiler
 @pytest.mark.slow
 @pytest.mark.parametrize(
@@ -103,30 +126,27 @@ def runs_here(monkeypatch):
 def test_a_batch_agrees_with_the_reference(dtype, runs_here):
     """37 runs are two blocks, the second not full; 200 steps are four launches, the last not
     full.  Runs that fail have the reference's status and touch no other."""
-    scenario = canonical(ij.astype(ij.presets.zhang_yan_2024(), dtype))
-    folds = jax.tree.map(lambda x: jnp.asarray(x, dtype), standard())
-    dt = jnp.asarray(DT, dtype)
-
-    def outcome(backend):
-        request = RunRequest(200, "heun", 7, backend=backend)
-        compiled = jax.jit(lambda v: execute.run_batch(scenario, v, folds, dt, request))
-        return lambda values: jax.tree.map(
-            np.asarray, compiled({k: jnp.asarray(v, dtype) for k, v in values.items()})
-        )
-
-    values = draws(37)
-    values["plant.mass[1]"][1] = np.nan
-    values["initial.q"][3] = 40.0
-    values["plant.mass[1]"][4] = 0.02
-    by_kernel = outcome("gpu")
-    found, good, expected = by_kernel(values), by_kernel(draws(37)), outcome("vmap")(values)
+    values, by_kernel = spoiled(37), runs_of(dtype, "gpu", 200)
+    found, good = by_kernel(values), by_kernel(draws(37))
+    expected = runs_of(dtype, "vmap", 200)(values)
     np.testing.assert_array_equal(found.status, expected.status)
     assert len(set(found.status[[0, 1, 3]].tolist())) == 3
     others = np.setdiff1d(np.arange(37), [1, 3, 4])
     for x, y in zip(jax.tree.leaves(found), jax.tree.leaves(good), strict=True):
         np.testing.assert_array_equal(x[others], y[others])
     sound = [jax.tree.map(lambda x: x[others], x) for x in (found, expected)]
-    assert_same(*sound, {"float64": 1e-10, "float32": 1e-4}[dtype])
+    assert_same(*sound, TOLERANCE[dtype])
+
+
+@pytest.mark.skipif(not ON_A_GPU, reason="no GPU")
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_on_a_gpu_many_runs_agree_with_the_reference(dtype):
+    """Many blocks, of as many threads as the plan takes, in launches of their usual length."""
+    values = spoiled(1000)
+    found, expected = (runs_of(dtype, backend, 1000)(values) for backend in ("gpu", "vmap"))
+    np.testing.assert_array_equal(found.status, expected.status)
+    sound = [jax.tree.map(lambda x: x[expected.status == 0], x) for x in (found, expected)]
+    assert_same(*sound, TOLERANCE[dtype])
 
 
 @needs_compiler

@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 
 import iblf_jax as ij
 from iblf_jax import Status, plotting
-from iblf_jax.plotting import _proofs, _scales, _studies, _style, _tuning, certificates
+from iblf_jax.plotting import _panels, _proofs, _scales, _studies, _style, _tuning, certificates
 from iblf_jax.plotting._curves import curves_of, rounding_error
 from iblf_jax.studies.summaries import LEVELS, initial_margins
 
@@ -132,6 +132,11 @@ def test_other_zooms_have_other_reasons():
     assert "every run failed" in zoom_titles(plotting.positions(bad))[0]
     both = plotting.positions({"good": run, "bad": bad})
     assert "the transient (failed runs aside)" in zoom_titles(both)[0]
+
+
+def test_a_stated_bound_is_not_below_the_value():
+    rounded = [_panels.rounded_away(value) for value in (0.0385, 0.5, 0.0)]
+    assert rounded == ["0.039", "0.5", "0"]
 
 
 @pytest.mark.slow

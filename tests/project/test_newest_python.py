@@ -87,6 +87,11 @@ def test_different_environments_have_different_keys(tmp_path, monkeypatch):
     keys = [tool.key_of(content) for content in contents]
     assert len(set(keys)) == len(keys)
     assert tool.key_of(description()) == keys[-1]
+    # The newest packages are looked for again every week.
+    next_week = tool.datetime.date.today() + tool.datetime.timedelta(weeks=1)
+    later = type("Later", (tool.datetime.date,), {"today": classmethod(lambda cls: next_week)})
+    monkeypatch.setattr(tool.datetime, "date", later)
+    assert tool.key_of(description()) != keys[-1]
 
 
 # --- the configuration of pip --------------------------------------------------------------------

@@ -124,6 +124,7 @@ def test_every_import_is_declared():
 
 
 def test_every_dependency_is_pinned_at_a_version_that_is_allowed():
+    assert {"jax", "numpy", "scipy"} <= names_of(REQUIRED), "every part imports these: no extras"
     for requirement in REQUIRED:
         pin = PINS.get(canonicalize_name(requirement.name))
         assert pin is not None, f"constraints.txt has no {requirement.name}"

@@ -22,7 +22,7 @@ import iblf_jax as ij
 
 HEAVY = (
     *("matplotlib", "optax", "xarray", "pandas", "scipy", "zarr", "tqdm", "mujoco", "IPython"),
-    "hypothesis",
+    *("tomli_w", "hypothesis"),
     *("iblf_jax.certificates", "iblf_jax.identification", "iblf_jax.proofs", "iblf_jax.tuning"),
     *("iblf_jax.cli", "iblf_jax.deployment", "iblf_jax.plotting", "iblf_jax.studies.study"),
 )
@@ -297,11 +297,13 @@ def test_an_unknown_name_is_an_attribute_error():
 @pytest.mark.slow
 def test_import_is_light_and_leaves_the_session_alone():
     """In a process of its own: nothing heavy beyond what jax loads, no array made, x64 and the
-    cache as they were."""
+    cache as they were.  No device is started, else neither `jax.distributed.initialize` nor the
+    number of CPU devices could come after the import of the studies."""
     code = (
         "import sys, json, jax\nbefore = set(sys.modules); x64 = jax.config.jax_enable_x64; cache"
         f" = jax.config.jax_compilation_cache_dir\nimport iblf_jax\nheavy = [m for m in {HEAVY!r}"
-        " if m in set(sys.modules) - before]\nfrom jax._src import xla_bridge\nsame = [x64 =="
+        " if m in set(sys.modules) - before]\niblf_jax.monte_carlo, iblf_jax.sweep\nfrom"
+        " jax._src import xla_bridge\nsame = [x64 =="
         " jax.config.jax_enable_x64, cache =="
         " jax.config.jax_compilation_cache_dir]\nprint(json.dumps([heavy, *same,"
         " bool(xla_bridge._backends)]))"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
 
 import chain_cases
 import independent_chains as chains
@@ -14,6 +15,7 @@ import pytest
 
 import iblf_jax as ij
 from iblf_jax import controllers
+from iblf_jax.certificates import _certify
 from iblf_jax.control.controllers.event_compensated import TANH_GAP, excess
 from iblf_jax.simulation.closed_loop import initial_state, run_sampled_law
 from iblf_jax.simulation.metrics import Events
@@ -218,6 +220,23 @@ def test_a_law_without_a_lyapunov_function_has_no_compensation():
     )
     with pytest.raises(ValueError, match="input_slope"):
         ij.simulate(ij.with_parts(PAPER, controller=law), duration=0.1, dt=1e-3)
+
+
+@pytest.mark.slow
+def test_a_certificate_says_that_the_compensation_changes_the_input():
+    law = controllers.EventCompensated(
+        TRIGGERED.controller, relative=0.1, absolute=0.4, epsilon=0.5
+    )
+    scenario = ij.with_parts(TRIGGERED, controller=law, sampling=None)
+    line = ij.certify(scenario, duration=0.05, dt=1e-3)["inequality, case 2"]
+    assert line.verdict == "not applicable"
+    assert "or EventCompensated changed the input of Backstepping all the time" in line.note
+
+
+def test_a_certificate_says_nothing_of_held_commands_behind_a_lag():
+    motor = ij.actuators.Motor(bandwidth=500.0)
+    run = SimpleNamespace(scenario=ij.with_parts(TRIGGERED, actuator=motor))
+    assert _certify._trigger_lines(run) == ()
 
 
 @pytest.mark.release

@@ -168,6 +168,18 @@ def test_access_by_name_and_by_attribute(short_run):
 
 # --- integrals are of second order -----------------------------------------------
 
+
+@pytest.mark.slow
+def test_the_effort_above_gravity_by_hand(rng):
+    fold, samples = ij.metrics.AboveGravity(), ij.testing.metrics.samples(rng)
+    start = fold.init(jax.tree.map(lambda x: x[0], samples))
+    total, _ = jax.lax.scan(lambda acc, x: (fold.update(acc, x), None), start, samples)
+    square = np.sum((np.asarray(samples.tau) - np.asarray(samples.gravity)) ** 2, axis=1)
+    expected = np.sqrt(np.sum(samples.dt * square) / np.sum(samples.dt))
+    found = fold.finish(total)["effort_above_gravity"]
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
 SLOW = ij.with_parameters(
     ij.presets.zhang_yan_2024(variant="corrected"), {"controller.K2": 4.0, "observer.kf": 4.0}
 )

@@ -15,6 +15,7 @@ from iblf_jax.controllers import Command
 import iblf_jax as ij
 from iblf_jax.testing import ContractError
 from iblf_jax.testing._contract import Findings, in_dtype
+from iblf_jax.testing.joints import joints_of
 from iblf_jax.testing.own_claims import check_claims
 
 TWO_LINK = ij.robots.TwoLink
@@ -602,6 +603,10 @@ QUICK = ("sensor", "disturbance", "side")
 def test_members_of_any_number_of_joints(family):
     n, check, member_of = MEMBERS_OF_JOINTS[family]
     check(member_of(per_joint(n)))
+
+
+def test_coordinates_of_the_tip_are_no_numbers_of_joints():
+    assert joints_of(ij.disturbances.TipForce(amplitude=[1.0, 2.0, 3.0])) == 2
 
 
 def test_leaves_of_different_numbers_of_joints_are_a_finding():

@@ -534,6 +534,12 @@ def test_an_automatic_start_needs_no_service_and_does_not_leave_a_fault():
     assert "in fault (the position of shoulder is nan); no valid state has arrived for" in message
 
 
+def test_an_automatic_start_that_is_refused_is_reported():
+    bench = Bench(start_automatically=True, time_origin=EPOCH + 1000 * T)
+    assert bench.period().mode is Mode.STOPPED
+    assert "time_origin" in bench.supervisor.note
+
+
 def test_a_torque_that_is_not_finite_is_a_fault():
     bench = Bench(on_fault="zero").running()
     bench.law.status = NOT_FINITE
