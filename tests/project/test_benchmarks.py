@@ -17,7 +17,7 @@ FOLDER = Path(__file__).parents[2] / "benchmarks"
 OF_THEIR_OWN = ("gpu.py", "monte_carlo.py", "throughput.py")
 """They choose JAX's type and devices, of which a process has one; the others spare themselves
 another start."""
-BEFORE_A_RELEASE = {"armour.py", "constraints.py", "tuning.py"}
+BEFORE_A_RELEASE = {"armour.py", "constraints.py", "starts.py", "tuning.py"}
 """Their quick sizes compile for a quarter of a minute."""
 
 NO_BENCHMARK = {"comparison.py", "losses.py", "withdrawn.py"}
