@@ -8,9 +8,9 @@ followed by Newton's method, first towards y s = 0 (predictor), then towards a c
 depends on how far the predictor came (corrector).
 
 Several programmes are solved together, as arrays with the programmes first, because the calls of
-NumPy for an iteration of a small programme take much longer than its arithmetic: 32 programmes of
-11 unknowns and 40 rows take four times as long as one of them.  `together` runs algorithms that
-need one programme after another side by side.
+NumPy for an iteration of a small programme take much longer than its arithmetic: 32 random
+programmes of 11 unknowns and about 50 rows take four times as long as one of them.  `together` runs
+algorithms that need one programme after another side by side.
 
 Source: S. Mehrotra, SIAM J. Optim. 2 (1992) 575-601; J. Nocedal, S. J. Wright, Numerical
 Optimization, 2nd ed., algorithm 16.4.
