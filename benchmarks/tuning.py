@@ -1,7 +1,7 @@
 """Gain tuning against black-box search, on the same compiled rollout.
 
     python benchmarks/tuning.py [--quick] [--problem NAME] [--starts 8] [--seeds 3] [--json FILE]
-    [--picture FILE] [--solvers all] [--shares 10]
+    [--picture FILE] [--solvers all]
 
 The loss, without smoothing, is
 
@@ -66,8 +66,7 @@ from iblf_jax.engine.execute import run_batch
 from iblf_jax.engine.structural_constants import robot_constants
 from iblf_jax.simulation.scenario import canonical
 from iblf_jax.studies.perturbation_cube import unit_cube
-from iblf_jax.tuning import TuningProblem, _falsify, _tune, evaluation
-from iblf_jax.tuning.options import EFFORTS
+from iblf_jax.tuning import TuningProblem, _falsify, evaluation
 from iblf_jax.tuning.quantities import Peak, Quantities
 
 WITHIN = 1.005
@@ -850,35 +849,6 @@ def report_solvers(args: argparse.Namespace) -> None:
     report("Solvers of the same problem", columns, rows, args.json)
 
 
-def compare_starts(name: str, quick: bool, count: int) -> list[Any]:
-    """How many tunings from random starts, a factor e at most from the scenario's gains, end within
-    0.5 % of the best of them; objective and limits are the same for all.
-    """
-    scenario, tunables, goal, timing, study = limited_problem(name, quick)
-    problem = TuningProblem.build(scenario, tunables, goal, **timing, **study)
-    box = problem.box
-    found, evaluations = [], []
-    for seed in range(count):
-        z = box.z + np.random.default_rng(100 + seed).uniform(-1, 1, problem.size)
-        moved = dataclasses.replace(
-            problem,
-            box=dataclasses.replace(box, z=np.clip(z, box.low, box.high)),
-            options=dataclasses.replace(problem.options, seed=seed),
-        )
-        search = _tune.search_of(moved, ij.tuning.SQP(), "forward", EFFORTS["normal"])
-        search.run(EFFORTS["normal"].iterations)
-        violation, objective = search.state.incumbent_key
-        found.append(np.inf if violation > 0 else float(objective))
-        evaluations.append(search.state.evaluations)
-    best = min(found)
-    if not np.isfinite(best):
-        return [name, best, f"0 of {count}", np.nan, np.nan, float(np.mean(evaluations)), 0]
-    gaps = 100 * (np.sort(found) / best - 1)
-    within = f"{sum(x <= WITHIN * best for x in found)} of {count}"
-    median, worst = float(np.median(gaps)), float(gaps[-1])
-    return [name, best, within, median, worst, float(np.mean(evaluations)), max(evaluations)]
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -910,23 +880,9 @@ def main() -> None:
         help='names of solvers with commas between them, or "all": only compare these on the'
         " limited problems",
     )
-    parser.add_argument(
-        "--shares",
-        type=int,
-        metavar="N",
-        help="only count how many of N tunings of the limited problems, from random starts, end"
-        " within 0.5 %% of the best of them",
-    )
     args = parser.parse_args()
     if args.solvers:
         report_solvers(args)
-        return
-    if args.shares:
-        names = [args.problem] if args.problem else list(LIMITED)
-        columns = ["problem", "best", "within 0.5 %", "median gap %", "largest gap %"]
-        columns += ["values with derivatives, mean", "largest"]
-        rows = [compare_starts(name, args.quick, args.shares) for name in names]
-        report("Random starts", columns, rows, args.json)
         return
     names = (
         [args.problem]

@@ -24,6 +24,7 @@ from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.units import unit_text
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.tuning.checkpoints import fingerprint, load_checkpoint, save_checkpoint
+from iblf_jax.tuning.conflicts import conflicts_in_words
 from iblf_jax.tuning.evaluation import Evaluator, values
 from iblf_jax.tuning.objectives import Objective
 from iblf_jax.tuning.options import Effort, Report, SearchOptions, chosen_solver, options_of
@@ -45,14 +46,19 @@ from iblf_jax.tuning.solvers import Solver
 from iblf_jax.tuning.solvers.sqp import SQP
 from iblf_jax.tuning.starts import (
     MAX_SCREENED_RUNS,
+    WEIGHTS,
     Screening,
     distinct,
+    number_of_starts,
     screen,
     starting_points,
     usable_starts,
 )
 from iblf_jax.tuning.step_check import excess_at_half_step
 
+STARTS_TOGETHER = 8
+"""Largest number of starts that are evaluated with derivatives in one batch.  In larger ones more
+rows are those of starts that take no step."""
 POLISH_STEPS = 15
 """Largest number of steps of the short search at half the time step."""
 
@@ -85,11 +91,10 @@ def tune(
         minimise    risk_b [ sum_k w_k term_k ]
         subject to  the requirements and the ranges of the parameters
 
-    With the default solver and effort, the tuning evaluates 384 points besides the scenario's gains
-    without derivatives.  It begins a search at six of these points and continues from the best one.
-    This takes about 60 evaluations with derivatives.  It takes more if the search finds no gains
-    that keep the requirements, or if it does not converge.  For a planar arm with nine gains and
-    1,000 steps the evaluations take one to three seconds on two cores, besides the compilation.
+    With the default solver and effort, the tuning evaluates 1,024 points besides the scenario's
+    gains without derivatives.  It begins searches at up to 32 of these points; after every five
+    steps the better third of them continues.  This takes about 260 evaluations with derivatives,
+    and more if the search finds no gains that keep the requirements, or if it does not converge.
 
     The requirements of the result are evaluated again at half the time step.  If one of them is
     then broken by more than `step_check.STEP_TOLERANCE`, a short search at dt / 2 follows, and its
@@ -115,8 +120,8 @@ def tune(
         `ij.tuning.LBFGS()`, `ij.tuning.Adam()` or `ij.tuning.Optax()` (requirements are penalties),
         with their options, or the name of one in `ij.tuning.SOLVERS`.  If not given, SQP for up to
         32 numbers, and L-BFGS with reverse mode for more.
-      effort: "quick" (a search from the scenario's gains only), "normal", "thorough" (4,096 points
-        without derivatives and twelve starts, about 400 evaluations with derivatives), or
+      effort: "quick" (a search from the scenario's gains only), "normal", "thorough" (8,192 points
+        without derivatives and 96 starts, about 1,300 evaluations with derivatives), or
         `ij.tuning.Effort(values=..., starts=..., iterations=...)`.
       report: options of the report on fresh runs, `ij.tuning.Report(runs=..., seed=...,
         confidence=...)`.
@@ -172,7 +177,7 @@ def search_of(problem: TuningProblem, solver: Solver, mode: str, effort: Effort)
     Values are evaluated before the derivatives are compiled, so that an error is raised early.
     With a checkpoint the starting points are determined again; they are the same as before.
     """
-    starts = solver.starts or effort.starts
+    starts = solver.starts or number_of_starts(effort.starts, problem.runs, solver)
     checks.fits_memory("starts", starts, 8.0 * problem.size * NUMBERS_A_RUN)
     seed = int(problem.options.seed)
     strategy = None
@@ -191,25 +196,25 @@ def search_of(problem: TuningProblem, solver: Solver, mode: str, effort: Effort)
     if strategy is not None and problem.allowed:
         rows = max(rows, REPAIR_STARTS)  # a later phase may begin at more points
     z = z[np.minimum(np.arange(rows), starts_used - 1)]  # the last start fills the further rows
-    evaluate = Evaluator(problem, problem.candidates(z), mode, space)
+    evaluate = Evaluator(problem, problem.candidates(z), mode, space, most=STARTS_TOGETHER)
     search = Search(evaluate, solver, z, strategy)
     search.retire(slice(starts_used, None))
     return search
 
 
 def _chosen_starts(problem: TuningProblem, screening: Screening, starts: int) -> np.ndarray:
-    """The points that the search begins from, (k, p): the best screened points that differ from one
-    another.
+    """The points that the search begins from, (k, p): the best screened points of each ranking that
+    differ from one another.
 
     If all of them are refused, or the scenario's gains are the only point and leave their bounds,
     the start is found by `usable_starts`.
     """
     seed = int(problem.options.seed)
-    order = np.argsort(screening.merit, kind="stable")
+    orders = [screening.order(weight) for weight in WEIGHTS]
     is_refused = problem.sampled_too_slowly
-    z = distinct(screening, order, starts, problem.box, is_refused)
+    z = distinct(screening, orders, starts, problem.box, is_refused)
     if len(z):
-        best = jax.tree.map(lambda x: x[order[:1]], screening.found)
+        best = jax.tree.map(lambda x: x[orders[0][:1]], screening.found)
         if len(screening.points) > 1 or best.margin[0] > 0:
             return z
     first = jax.tree.map(lambda x: x[:1], screening.found)
@@ -293,8 +298,11 @@ def _outcome(search: Search, stopped: str) -> Outcome:
             stopped = AT_KINK
         else:
             stopped = "converged" if found.hold else STUCK
+    tried = _tried(search)
+    if search.is_violated:
+        tried += conflicts_in_words(search.evaluate.problem, search.state.least_excess)
     z = search.state.incumbent_z
-    return Outcome(search, z, stopped, found.multipliers, found.residuals, _tried(search))
+    return Outcome(search, z, stopped, found.multipliers, found.residuals, tried)
 
 
 def _tried(search: Search) -> tuple[str, ...]:

@@ -287,10 +287,17 @@ class Evaluator:
       candidates: of S starts; their z is replaced at each call.
       mode: of differentiation.
       space: what the solver knows of the problem.
+      most: largest number of starts in a group; as many as the vectors of a processor hold if not
+        given.
     """
 
     def __init__(
-        self, problem: TuningProblem, candidates: Candidate, mode: str, space: SearchSpace
+        self,
+        problem: TuningProblem,
+        candidates: Candidate,
+        mode: str,
+        space: SearchSpace,
+        most: int | None = None,
     ):
         self.problem = problem
         self.candidates = candidates
@@ -303,7 +310,7 @@ class Evaluator:
         self.on_values: Callable[[np.ndarray, Value], None] = lambda z, found: None
         """Called with points and their values after each evaluation without derivatives."""
         starts, runs = candidates.index.shape
-        self.group = starts_per_batch(starts, runs)
+        self.group = starts_per_batch(starts if most is None else min(starts, most), runs)
         self.active = np.ones(starts, bool)
         """Which starts are evaluated; the others are returned as invalid."""
 

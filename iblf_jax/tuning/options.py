@@ -89,22 +89,23 @@ class Report:
 class Effort:
     """How much a tuning evaluates at most.
 
-    All K starts take `selection` steps, the better half of them takes as many again, and the best
-    one continues.  Until then a search takes 3 K selection / 2 evaluations with derivatives, which
-    are 45 with the defaults.
+    All starts take `selection` steps, the better third of them takes as many again, and so on
+    until the best one is left.  Until then a search takes at most 245 evaluations with derivatives
+    with the defaults: five steps each of 32, 11, 4 and 2 starts.
 
     Args:
       values: number of points that are evaluated without derivatives to find the starts.  With many
         runs there are fewer points, so that they need at most 50,000 runs.
-      starts: number of points that the search begins from, all in one batch.
+      starts: number of points that the search begins from.  With more than 128 runs for all of them
+        together, and with other solvers than SQP, there are fewer: a fifth or more, and at least
+        six.
       iterations: largest number of steps of the solver in each phase of the search.  A step
         evaluates every start that is still active.
-      selection: number of steps after which the better half of the starts continues; after twice as
-        many only the best one does.
+      selection: number of steps after which the better third of the starts continues.
     """
 
-    values: int = 384
-    starts: int = 6
+    values: int = 1024
+    starts: int = 32
     iterations: int = 60
     selection: int = 5
 
@@ -121,7 +122,7 @@ class Effort:
 EFFORTS = {
     "quick": Effort(values=0, starts=1),
     "normal": Effort(),
-    "thorough": Effort(values=4096, starts=12, iterations=120, selection=20),
+    "thorough": Effort(values=8192, starts=96, iterations=120, selection=8),
 }
 """Name -> effort."""
 

@@ -146,7 +146,8 @@ class TuneResult(Result):
     """Number of evaluations without derivatives, each of `setup.runs` rollouts."""
     tried: tuple[str, ...] = ()
     """What the search did, in words: number of starts, number of valleys (regions around one local
-    minimum) and further phases."""
+    minimum) and further phases; if no evaluated gains keep the requirements, also which of them are
+    never kept (see `conflicts`)."""
 
     @property
     def is_violated(self) -> bool:

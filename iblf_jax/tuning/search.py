@@ -37,10 +37,10 @@ has phase 1 only.
 
 Retired starts.  A start that is `finished` takes no steps until the smoothing changes or a phase
 begins; a start that is `retired` is finished and takes no steps in the rest of its phase.  Starts
-are retired in three places: `_select` keeps the better half after `selection` steps and the best
-start after twice as many (successive halving), `_next_stage` keeps the better half at each stage,
-and `_begin_phase` retires all starts of the previous phase.  Rows that only fill up a batch are
-retired before the first step.
+are retired in three places: `_select` keeps the better third after every `selection` steps of a
+phase, `_next_stage` keeps the better half at each stage, and `_begin_phase` retires all starts of
+the previous phase.  Rows that only fill up a batch are retired before the first step.  A start that
+takes no step costs nothing, as the others are evaluated in groups of a few rows (`Evaluator`).
 """
 
 from __future__ import annotations
@@ -89,6 +89,8 @@ COARSE_TOLERANCE = 1e-3
 COARSE_STEPS = 6
 """Largest number of steps of a stage of several starts without requirements.  So many steps are
 enough to compare the starts."""
+KEPT = 3
+"""One of so many starts continues after a selection."""
 OPTIMISE, REPAIR, SECOND_SEARCH = range(3)
 """The phases of a search, in order."""
 REPAIR_STEPS = 30
@@ -111,7 +113,7 @@ class Strategy(NamedTuple):
     screening: Screening
     """The points that were evaluated without derivatives."""
     selection: int
-    """Number of steps after which the worse half of the starts is retired."""
+    """Number of steps after which the better third of the starts continues, again and again."""
     starts: int
     """Number of starts in the first phase.  A search has more rows than that where a later phase
     may begin at more points."""
@@ -165,6 +167,10 @@ class SearchState:
     """Points that were evaluated without derivatives."""
     repair_ended: bool = False
     """Whether REPAIR ended at a stationary point of the largest excess."""
+    least_excess: np.ndarray = dataclasses.field(default_factory=lambda: np.full((1, 1), np.inf))
+    """The smallest value, over all points that were evaluated, of the larger excess of every two
+    requirements, (R + 1, R + 1); on the diagonal that of one requirement alone.  The bounds are the
+    last one."""
 
     @staticmethod
     def first(solver: Any, z: np.ndarray, requirements: int) -> SearchState:
@@ -188,7 +194,15 @@ class SearchState:
             updates=np.zeros(starts, int),
             finished=np.zeros(starts, bool),
             retired=np.zeros(starts, bool),
+            least_excess=np.full((requirements + 1, requirements + 1), np.inf),
         )
+
+    def note_excess(self, found: Value) -> None:
+        """Updates `least_excess` by the values at further points."""
+        excess = np.column_stack([found.exact_excess, -found.margin])
+        excess = excess[found.valid & np.all(np.isfinite(excess), axis=1)]
+        larger = np.maximum(excess[:, :, None], excess[:, None, :])
+        self.least_excess = np.minimum(self.least_excess, np.min(larger, axis=0, initial=np.inf))
 
 
 class Search:
@@ -247,6 +261,7 @@ class Search:
         incumbent where one of them is better.
         """
         self.state.plain_values += len(z)
+        self.state.note_excess(found)
         keys = _keys(found)
         for i in np.flatnonzero(found.valid).tolist():
             self._consider(z[i], keys[i])
@@ -324,7 +339,7 @@ class Search:
         # all earlier starts.
         best = state.incumbent_z[None]
         explored = np.concatenate([best, self.history["z"][0], state.best_z])
-        order = np.argsort(self.strategy.screening.merit, kind="stable")
+        order = self.strategy.screening.order()
         count = min(2, len(state.finished)) - 1
         further = self._distinct(self.strategy.screening, order, count, explored)
         self._begin_phase(SECOND_SEARCH, np.concatenate([best, further]))
@@ -451,7 +466,7 @@ class Search:
         problem = self.evaluate.problem
         if count == 0:
             return np.zeros((0, problem.size))
-        return distinct(screening, order, count, problem.box, problem.sampled_too_slowly, others)
+        return distinct(screening, [order], count, problem.box, problem.sampled_too_slowly, others)
 
     def _valleys(self) -> np.ndarray:
         """Number of valleys in which the starts ended or were retired, and number of starts in the
@@ -469,18 +484,16 @@ class Search:
         return np.asarray([count, of_best])
 
     def _select(self) -> None:
-        """Retires the worse half of the starts after `selection` steps of the phase, and all but
-        the best one after twice as many.
+        """Retires all but the better third of the starts, after every `selection` steps of the
+        phase.
         """
         if self.strategy is None or self.state.phase == REPAIR:
             return
-        steps = self.state.phase_steps
+        if self.state.phase_steps % self.strategy.selection:
+            return
         remaining = np.flatnonzero(~self.state.retired).tolist()
         order = sorted(remaining, key=self._rank)
-        if steps == self.strategy.selection:
-            self.retire(order[checks.ceil_div(len(order), 2) :])
-        elif steps == 2 * self.strategy.selection:
-            self.retire(order[1:])
+        self.retire(order[checks.ceil_div(len(order), KEPT) :])
 
     def _rank(self, start: int) -> float:
         """The merit of a start, the smaller the better: its objective relative to that of the
@@ -564,6 +577,7 @@ class Search:
         state = self.state
         tolerance = self.solver.tolerance
         improved = False
+        state.note_excess(found.value)
         keys = _keys(found.value)
         for s in np.flatnonzero(found.value.valid).tolist():
             key = keys[s]

@@ -3,19 +3,16 @@
 A problem whose requirements are active at the optimum has several local minima: at each of them
 other peaks are at their limits.  These minima are far apart, as other gains are large at each of
 them, and the better ones are not always near the scenario's gains z0.  `screen` therefore evaluates
-points of a Sobol sequence, a third of them within |z_i - z0_i| <= NEAR and two thirds within
-|z_i - z0_i| <= FAR, and ranks them by the merit
+points of a Sobol sequence, a third of them within |z_i - z0_i| <= NEAR, a third within
+|z_i - z0_i| <= FAR and a third in the whole ranges.  They are ranked by
 
-    f / |f0| + EXCESS_WEIGHT max(0, max_r G_r, -margin),
+    f / |f0| + w max(0, max_r G_r, -margin)
 
-where f0 is the objective at the first valid point.  The weight is so large that feasible points
-come before all that are not almost feasible.  `distinct` then takes the best points that differ
-from one another, and excludes those whose gains are too high for the sampling period.
-
-The shares of near and far points come from a comparison on two problems of nine gains (three links,
-limited torque and margin), with six searches from each of twenty random scenarios.  45 % of the
-searches ended within 0.5 % of the best known objective.  With two thirds of the points near z0,
-only 30 % did.
+with each w of WEIGHTS, where f0 is the objective at the first valid point.  With the largest weight
+feasible points come before all that are not almost feasible.  With the smallest one points of a low
+objective come first that break a requirement: on some problems only they lead to the best minimum.
+`distinct` takes the best points that differ from one another, from each ranking in turn, and
+excludes those whose gains are too high for the sampling period.
 
 `usable_starts` serves searches without screening, whose starts are near the scenario's gains, and
 searches for which `distinct` finds no point.
@@ -25,7 +22,7 @@ from __future__ import annotations
 
 import itertools
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -33,17 +30,27 @@ import numpy as np
 from iblf_jax.tuning.evaluation import Value, values
 from iblf_jax.tuning.parameters import Box
 from iblf_jax.tuning.problem import TuningProblem
+from iblf_jax.tuning.solvers import SQP, Solver
 from iblf_jax.tuning.solvers._base import EXCESS_WEIGHT, violations
 
 NEAR = 1.0
 """Half-width of the box of the near points, in the coordinates z: a factor e for gains."""
 FAR = 3.0
 """Half-width of the box of the far points: a factor 20."""
+UNLIMITED = 4.6
+"""Distance from the scenario's gains that takes the place of an infinite end of a range: a factor
+100, as of most ranges that are not given."""
+WEIGHTS = (EXCESS_WEIGHT, 20.0, 5.0, 1.0)
+"""Weights of the excess in the rankings from which the starts are taken."""
 MIN_DISTANCE = 1.0
 """Smallest distance of two starts in the coordinate z in which they differ most; smaller where a
 range is narrow."""
 MAX_SCREENED_RUNS = 50_000
 """Largest number of runs in a screening; with many runs for each point there are fewer points."""
+MAX_RUNS_OF_STARTS = 128
+"""Largest number of runs of all starts together, unless there are few starts."""
+FEW_STARTS = 6
+"""Number of starts that are never too many."""
 FEW_POINTS = 32
 """Number of points that are evaluated where a search without screening needs another start."""
 
@@ -55,10 +62,14 @@ class Screening(NamedTuple):
     """Coordinates z, (N, p)."""
     found: Value
     """Their values."""
-    merit: np.ndarray
-    """What they are ranked by, (N,), the smaller the better; infinite where a run is invalid."""
+    objective: np.ndarray
+    """f / |f0|, (N,); infinite where a run is invalid."""
     excess: np.ndarray
     """The largest excess of a requirement or bound, (N,); infinite where a run is invalid."""
+
+    def order(self, weight: float = EXCESS_WEIGHT) -> np.ndarray:
+        """Indices of the points, (N,), the best first, with a weight of the excess."""
+        return np.argsort(self.objective + weight * self.excess, kind="stable")
 
 
 def screen(problem: TuningProblem, count: int, seed: int) -> Screening:
@@ -70,19 +81,20 @@ def screen(problem: TuningProblem, count: int, seed: int) -> Screening:
 
 
 def ranked(points: np.ndarray, found: Value) -> Screening:
-    """Points with their merit, which is relative to the objective of the first valid point."""
+    """Points with their objective relative to that of the first valid point, and their excess."""
     excess = violations(found)
     usable = found.valid & np.isfinite(found.objective) & np.isfinite(excess)
     size = 1.0
     if np.any(usable):
         size = max(abs(float(found.objective[usable][0])), 1e-12)
-    with np.errstate(invalid="ignore"):
-        merit = np.where(usable, found.objective / size + EXCESS_WEIGHT * excess, np.inf)
-    return Screening(points, found, merit, np.where(usable, excess, np.inf))
+    objective = np.where(usable, found.objective / size, np.inf)
+    return Screening(points, found, objective, np.where(usable, excess, np.inf))
 
 
 def spread_points(box: Box, count: int, seed: int) -> np.ndarray:
-    """Points of a scrambled Sobol sequence around the start, (count, p): a third near it."""
+    """Points of a scrambled Sobol sequence, (count, p): a third each within NEAR of the start,
+    within FAR of it, and in the whole ranges.
+    """
     from scipy.stats import qmc  # imported here because the import takes a second
 
     with warnings.catch_warnings():
@@ -90,27 +102,28 @@ def spread_points(box: Box, count: int, seed: int) -> np.ndarray:
         # which the search does not need.
         warnings.simplefilter("ignore", UserWarning)
         unit = qmc.Sobol(len(box.z), seed=np.random.default_rng([seed, 4])).random(count)
-    near = np.arange(count) % 3 == 0
-    reach = np.where(near, NEAR, FAR)[:, None]
-    low = np.maximum(box.low, box.z - reach)
-    high = np.minimum(box.high, box.z + reach)
+    reach = np.resize([NEAR, FAR, np.inf], count)[:, None]
+    lowest = np.where(np.isfinite(box.low), box.low, box.z - UNLIMITED)
+    highest = np.where(np.isfinite(box.high), box.high, box.z + UNLIMITED)
+    low = np.maximum(lowest, box.z - reach)
+    high = np.minimum(highest, box.z + reach)
     return low + unit * (high - low)
 
 
 def distinct(
     screening: Screening,
-    order: np.ndarray,
+    orders: Sequence[np.ndarray],
     count: int,
     box: Box,
     is_refused: Callable[[np.ndarray], bool],
     others: np.ndarray | None = None,
 ) -> np.ndarray:
-    """The first points of an order that differ from one another and are not refused, (m, p) with m
-    at most `count`.
+    """The first points of some orders that differ from one another and are not refused, (m, p)
+    with m at most `count`: one of each order in turn.
 
     Args:
       screening: the points.
-      order: their indices, the best first.
+      orders: their indices, the best first.
       count: largest number of points.
       box: the ranges.
       is_refused: function of z, (p,), that returns whether no search can begin there.  It takes
@@ -118,18 +131,41 @@ def distinct(
       others: further points that the result must differ from, (k, p).
     """
     distance = np.minimum(MIN_DISTANCE, 0.25 * (box.high - box.low))
+    points = screening.points
+    remaining = np.isfinite(screening.excess)
+
+    def leave_out_near(z: np.ndarray) -> None:
+        remaining[np.all(np.abs(points - z) < distance, axis=1)] = False
+
+    for other in [] if others is None else others:
+        leave_out_near(other)
     chosen: list[np.ndarray] = []
-    excluded: list[np.ndarray] = []
-    if others is not None:
-        excluded = list(others)
-    for i in order[np.isfinite(screening.merit[order])].tolist():
-        z = screening.points[i]
-        is_apart = all(np.any(np.abs(z - other) >= distance) for other in [*excluded, *chosen])
-        if is_apart and not is_refused(z):
-            chosen.append(z)
-        if len(chosen) == count:
-            break
+    turns = itertools.cycle(orders)
+    while len(chosen) < count and np.any(remaining):
+        order = next(turns)
+        i = order[np.argmax(remaining[order])]  # the first one that remains
+        remaining[i] = False
+        if not is_refused(points[i]):
+            chosen.append(points[i])
+            leave_out_near(points[i])
     return np.array(chosen).reshape(-1, len(box.z))
+
+
+def number_of_starts(starts: int, runs: int, solver: Solver) -> int:
+    """The number of starts of a search, at most that of its effort.
+
+    With many runs for each start, and with other solvers than `SQP`, which need more evaluations,
+    there are fewer: a fifth, but at least FEW_STARTS.
+
+    Args:
+      starts: number of starts of the effort.
+      runs: number of runs of each start.
+      solver: the solver.
+    """
+    few = max(FEW_STARTS, starts // 5)
+    if isinstance(solver, SQP):
+        few = max(few, MAX_RUNS_OF_STARTS // runs)
+    return min(starts, few)
 
 
 def starting_points(box: Box, starts: int, seed: int) -> np.ndarray:

@@ -19,7 +19,7 @@ OF_THEIR_OWN = ("gpu.py", "monte_carlo.py", "throughput.py")
 another start."""
 BEFORE_A_RELEASE = {
     *("armour.py", "constraints.py", "laws.py", "monte_carlo.py", "proofs.py"),
-    *("robust_tuning.py", "throughput.py", "tuning.py"),
+    *("robust_tuning.py", "starts.py", "throughput.py", "tuning.py"),
 }
 """Their quick sizes take more than a quarter of a minute."""
 

@@ -29,6 +29,7 @@ from iblf_jax.simulation.metrics import standard
 from iblf_jax.simulation.scenario import canonical
 from iblf_jax.tuning import LBFGS, SQP, Adam, Report, evaluation, starts
 from iblf_jax.tuning.checkpoints import load_checkpoint, save_checkpoint
+from iblf_jax.tuning.conflicts import conflicts_in_words
 from iblf_jax.tuning.evaluation import Derivatives, Evaluator, Value
 from iblf_jax.tuning.options import TuningRunOptions
 from iblf_jax.tuning.parameters import Box, layout, squash, unsquash
@@ -38,10 +39,19 @@ from iblf_jax.tuning.ranges import BY_STEP, BY_THEOREM, STABILITY_FRACTION, TIME
 from iblf_jax.tuning.result import STUCK
 from iblf_jax.tuning.robust import Risk, combine
 from iblf_jax.tuning.rollouts import fold_of
-from iblf_jax.tuning.search import REPAIR, Search, Strategy
+from iblf_jax.tuning.search import REPAIR, Search, SearchState, Strategy
 from iblf_jax.tuning.solvers import Constraints, SearchSpace, quadratic, sqp
-from iblf_jax.tuning.solvers.sqp import solve_subproblem
-from iblf_jax.tuning.starts import FAR, NEAR, distinct, ranked, screened, spread_points
+from iblf_jax.tuning.solvers.sqp import subproblem
+from iblf_jax.tuning.starts import (
+    FAR,
+    NEAR,
+    Screening,
+    distinct,
+    number_of_starts,
+    ranked,
+    screened,
+    spread_points,
+)
 
 jax.config.update("jax_enable_x64", True)
 
@@ -265,14 +275,16 @@ def test_default_limits_keep_the_conditions_and_the_step(paper):
 
 def test_a_quadratic_programme_is_solved_with_its_multipliers():
     rng = np.random.default_rng(0)
-    for _ in range(20):
-        root, c, A = rng.normal(size=(3, 5)), rng.normal(size=5), rng.normal(size=(8, 5))
+    programmes = []
+    for rows in range(20):  # of several shapes
+        root, c, A = rng.normal(size=(3, 5)), rng.normal(size=5), rng.normal(size=(rows, 5))
         H, A, b = (
             root.T @ root,
             np.concatenate([A, np.eye(5), -np.eye(5)]),
-            np.concatenate([rng.uniform(0.1, 1, 8), np.full(10, 0.5)]),
+            np.concatenate([rng.uniform(0.1, 1, rows), np.full(10, 0.5)]),
         )
-        x, y = quadratic.solve(H, c, A, b)
+        programmes.append(quadratic.Programme(H, c, A, b))
+    for (H, c, A, b), (x, y) in zip(programmes, quadratic.solve(programmes), strict=True):
         slack = b - A @ x
         np.testing.assert_allclose(H @ x + c + A.T @ y, 0.0, atol=1e-8)
         assert np.all(slack > -1e-9) and np.all(y >= 0) and np.max(y * slack) < 1e-8
@@ -450,11 +462,12 @@ def test_points_are_spread_near_and_far_and_the_starts_differ():
     box = Box(np.full(7, -0.6), np.full(7, -4.0), np.full(7, 1.0))
     points = spread_points(box, 120, seed=0)
     distance = np.max(np.abs(points - box.z), axis=1)
-    assert np.sum(distance <= NEAR) >= 40 and NEAR < np.max(distance) <= FAR
+    assert np.sum(distance <= NEAR) >= 40 and np.sum(distance <= FAR) >= 80
+    assert np.max(points[distance > FAR]) <= 1.0 and np.min(points) < -3.9
     assert np.all(points <= 1.0)
     screening = ranked(points, Valleys()(points).value)
-    order = np.argsort(screening.merit)
-    z = distinct(screening, order, 5, box, lambda z: np.array_equal(z, points[order[0]]))
+    order = screening.order()
+    z = distinct(screening, [order], 5, box, lambda z: np.array_equal(z, points[order[0]]))
     assert not np.any(np.all(z == points[order[0]], axis=1))  # the best one is refused
     for i in range(5):
         for j in range(i):
@@ -473,6 +486,79 @@ def test_a_search_from_several_starts_goes_on_in_the_deeper_valley():
     assert search.state.retired.sum() >= 2 and search.state.phase == 0
     found = search.conditions()
     assert found.hold and np.max(np.abs(found.residuals)) < 1e-3
+
+
+def test_the_better_third_of_the_starts_continues_after_every_selection():
+    box = Box(np.full(7, -0.6), np.full(7, -4.0), np.full(7, 4.0))
+    starts = np.random.default_rng(0).uniform(-4.0, 4.0, (12, 7))
+    evaluate = Counted(SearchSpace(box, Constraints.of((1,), (0.0,), 1)), 12)
+    strategy = Strategy(ranked(starts, Valleys()(starts).value), selection=2, starts=12)
+    search = Search(evaluate, SQP(), starts, strategy)
+    remaining, evaluations = [], []
+
+    def note(search):
+        remaining.append(int(np.sum(~search.state.retired)))
+        evaluations.append(search.state.evaluations)
+
+    search.run(60, note)
+    assert remaining[:4] == [12, 4, 4, 2]
+    assert evaluations[3] <= 2 * 12 + 2 * 4  # a start that is retired costs nothing
+
+
+@pytest.mark.parametrize(
+    ("starts", "runs", "solver", "expected"),
+    [
+        (32, 1, SQP(), 32),
+        (32, 16, SQP(), 8),
+        (32, 64, SQP(), 6),
+        (96, 64, SQP(), 19),
+        (4, 64, SQP(), 4),
+        (32, 1, LBFGS(), 6),
+    ],
+)
+def test_there_are_fewer_starts_where_each_takes_long(starts, runs, solver, expected):
+    assert number_of_starts(starts, runs, solver) == expected
+
+
+def test_starts_are_taken_from_rankings_with_several_weights_in_turn():
+    """The point with the lowest objective breaks the requirement and is far down with weight
+    200."""
+    points = np.array([[0.0], [2.0], [4.0], [6.0]])
+    excess = np.array([0.0, 0.0, 0.0, 0.05])
+    objective = np.array([1.0, 1.1, 1.2, 0.5])
+    screening = Screening(points, None, objective, excess)
+    box = Box(np.zeros(1), np.full(1, -8.0), np.full(1, 8.0))
+    orders = [screening.order(weight) for weight in (200.0, 1.0)]
+    assert orders[0].tolist() == [0, 1, 2, 3] and orders[1].tolist() == [3, 0, 1, 2]
+    z = distinct(screening, orders, 3, box, lambda z: False)
+    assert z.ravel().tolist() == [0.0, 6.0, 2.0]
+    z = distinct(screening, orders, 3, box, lambda z: z[0] == 6.0, others=np.array([[0.5]]))
+    assert z.ravel().tolist() == [2.0, 4.0]
+
+
+def test_requirements_that_no_gains_keep_are_named_alone_and_in_pairs(paper):
+    names = ("torque", "margin", "rate")
+    requirements = [SimpleNamespace(name=x, scale=10.0, measure=(1.0, "N m")) for x in names]
+    goal = SimpleNamespace(requirements=requirements)
+    problem = SimpleNamespace(objective=goal, scenario=paper)
+
+    def words(excess, margin):
+        count = len(excess)
+        value = Value(np.zeros(count), exact_excess=np.array(excess), margin=np.array(margin))
+        state = SearchState.first(None, np.zeros((1, 2)), 3)
+        state.note_excess(value._replace(valid=np.arange(count) < 3))
+        return conflicts_in_words(problem, state.least_excess)
+
+    invalid = [-1.0, -1.0, -1.0]
+    rows = [[-0.1, 0.3, 0.5], [0.2, -0.1, 0.4], [np.nan, -1.0, -1.0], invalid]
+    alone, pair = words(rows, [0.01, 0.01, 0.01, 0.01])
+    assert "keep rate, whatever" in alone and "by 4 N m or more" in alone
+    assert "keep torque and margin together" in pair and "by 2 N m" in pair
+    rows = [[0.1, -1.0, -1.0], [-1.0, 0.1, -1.0], [-1.0, -1.0, 0.1], invalid]
+    (neither,) = words(rows, [0.01, 0.01, 0.01, 0.01])
+    assert "every two requirements" in neither
+    bounds = words(rows, [-0.02, -0.03, -0.04, 0.01])
+    assert "keep the bounds, whatever" in bounds[0] and "by 0.02 rad or more" in bounds[0]
 
 
 class Ring(Counted):
@@ -846,9 +932,10 @@ def test_a_checkpoint_that_cannot_be_written_leaves_the_one_before(tmp_path, mon
 
 
 @pytest.mark.slow
-def test_only_active_starts_are_evaluated_in_groups_of_one_shape(nominal):
+@pytest.mark.parametrize(("most", "group"), [(None, 16), (8, 8)])
+def test_only_active_starts_are_evaluated_in_groups_of_one_shape(nominal, most, group):
     candidates = nominal.candidates(np.arange(20.0)[:, None] * np.ones(6))
-    evaluator = Evaluator(nominal, candidates, "forward", nominal.search_space(60))
+    evaluator = Evaluator(nominal, candidates, "forward", nominal.search_space(60), most)
     shapes = set()
 
     def derivatives(problem, candidates):
@@ -859,7 +946,7 @@ def test_only_active_starts_are_evaluated_in_groups_of_one_shape(nominal):
     evaluator.derivatives = derivatives
     evaluator.active[[3, 7]] = False
     found = evaluator(candidates.z)
-    assert shapes == {(16, 6)} and evaluator.evaluations == 18
+    assert shapes == {(group, 6)} and evaluator.evaluations == 18
     np.testing.assert_array_equal(
         found.value.loss, np.where(evaluator.active, np.arange(20.0), np.inf)
     )
@@ -1183,7 +1270,7 @@ def test_more_peaks_than_the_memory_holds_are_refused(paper, monkeypatch):
 def test_a_share_of_many_runs_is_in_the_programme(runs, share):
     """All runs break g = z + 0.2 < 0, and the objective pulls z up: the step has to go down,
     whatever the number of the worst."""
-    found = solve_subproblem(
+    task = subproblem(
         np.array([-1.0]),
         np.eye(1),
         np.array([-1.0]),
@@ -1193,6 +1280,7 @@ def test_a_share_of_many_runs_is_in_the_programme(runs, share):
         piece_gradients=np.ones((runs, 1, 1)),
         penalty=10.0,
     )
+    (found,) = quadratic.together([task])
     np.testing.assert_allclose(found.step, -0.2, atol=1e-4)
     np.testing.assert_allclose(
         found.multipliers, 1.2, rtol=1e-3

@@ -200,8 +200,8 @@ class Solver(abc.ABC):
 
 EXCESS_WEIGHT = 200.0
 """Weight of the violation where points are ranked by one number, relative to the objective.  With a
-weight of 5, six of eight searches of a problem of nine gains began, and ended, in regions where the
-requirements cannot be kept."""
+weight of 5 alone, six of eight searches of a problem of nine gains began, and ended, in regions
+where the requirements cannot be kept; for the starts see `starts.WEIGHTS`."""
 
 
 def violations(value: Value) -> np.ndarray:

@@ -11,9 +11,10 @@ Subproblem.  The step s solves, within |s_i| <= delta and the ranges of the gain
     minimise  g.s + s.(B + sum_j y_j C_j).s/2 + rho sum_r v_r
     subject to     c_j + a_j.s <= v_r,  v_r >= 0      for the pieces j of r,
 
-where y are the multipliers of the previous subproblem.  It is solved first with c_j = e_j, and then
-CURVATURE_SOLVES times with c_j = e_j + s.C_j.s/2 at the last solution.  The trial is z + s with the
-solution of which the quadratic models predict the largest decrease.
+where y are the multipliers of the previous subproblem.  It is solved first with c_j = e_j, and
+then, once curvatures are known, CURVATURE_SOLVES times with c_j = e_j + s.C_j.s/2 at the last
+solution.  The trial is z + s with the solution of which the quadratic models predict the largest
+decrease.  The subproblems of all starts are solved side by side (`quadratic.together`).
 
 Requirements on a share of the runs.  If k > 1 of the B runs may violate a requirement, its G_r is
 the mean of its k worst runs, which equals
@@ -170,7 +171,7 @@ class Selected(NamedTuple):
     """Index among all pieces of a run, (m,)."""
 
 
-def solve_subproblem(
+def subproblem(
     gradient: np.ndarray,
     matrix: np.ndarray,
     low: np.ndarray,
@@ -179,8 +180,8 @@ def solve_subproblem(
     pieces: np.ndarray,
     piece_gradients: np.ndarray,
     penalty: float,
-) -> Step:
-    """Solves the subproblem of this module as a quadratic programme.
+) -> quadratic.Task[Step]:
+    """Solves the subproblem of this module as a quadratic programme; see `quadratic.together`.
 
     The columns of the programme are the step and the unknowns of each requirement.  Its rows are
     both bounds of the step, the pieces of each requirement and the conditions of `_own_columns`.
@@ -219,7 +220,7 @@ def solve_subproblem(
     c = np.zeros(A.shape[1])
     c[:size] = gradient
     c[violation_columns] = penalty
-    x, y = quadratic.solve(H, c, A, np.concatenate([high, -low, *limits]))
+    x, y = yield quadratic.Programme(H, c, A, np.concatenate([high, -low, *limits]))
 
     step = np.clip(x[:size], low, high)
     piece_multipliers = np.zeros_like(pieces)
@@ -541,12 +542,18 @@ class SQP(Solver):
         space: SearchSpace = evaluate.space
         trials = np.stack([start.trial for start in state])
         found = evaluate(trials)
-        for s in np.flatnonzero(evaluate.active).tolist():
-            _advance(space, state[s], Point.of(space, found, s), tolerance)
+        quadratic.together(
+            [
+                _advance(space, state[s], Point.of(space, found, s), tolerance)
+                for s in np.flatnonzero(evaluate.active).tolist()
+            ]
+        )
         return trials, found
 
 
-def _advance(space: SearchSpace, state: SQPState, found: Point, tolerance: float) -> None:
+def _advance(
+    space: SearchSpace, state: SQPState, found: Point, tolerance: float
+) -> quadratic.Task[None]:
     """Accepts or rejects the trial of one start, and determines the next one.
 
     The first evaluation of a start, or the first one after the loss has changed, is accepted
@@ -559,7 +566,7 @@ def _advance(space: SearchSpace, state: SQPState, found: Point, tolerance: float
         state.done = not valid
         if valid:
             _accept(space, state, found)
-            _plan(space, state, tolerance)
+            yield from _plan(space, state, tolerance)
         return
     step = state.trial - state.z
     length = float(np.max(np.abs(step)))
@@ -590,13 +597,13 @@ def _advance(space: SearchSpace, state: SQPState, found: Point, tolerance: float
         for stored, x in zip(kept, new, strict=True):
             stored[1:] = stored[:-1].copy()
             stored[0] = x
-        if not state.corrected and _correct(space, state, step, found.pieces):
+        if not state.corrected and (yield from _correct(space, state, step, found.pieces)):
             return
     if ratio < RATIO_TO_SHRINK:
         state.radius = SHRINK_FACTOR * length
     elif ratio > RATIO_TO_GROW and length > 0.9 * state.radius:
         state.radius = min(GROWTH_FACTOR * state.radius, LARGEST_RADIUS)
-    _plan(space, state, tolerance)
+    yield from _plan(space, state, tolerance)
 
 
 def _is_comparable(state: SQPState, found: Point) -> bool:
@@ -644,7 +651,9 @@ def _curvatures_kept(constraints: Constraints) -> list[int]:
     return [min(constraints.runs * count, MAX_CURVATURES) for count in counts]
 
 
-def _solve(space: SearchSpace, state: SQPState, pieces: np.ndarray, penalty: float) -> Step:
+def _solve(
+    space: SearchSpace, state: SQPState, pieces: np.ndarray, penalty: float
+) -> quadratic.Task[Step]:
     """The subproblem at the accepted point, with `pieces` as c."""
     multipliers = state.piece_multipliers.ravel()[state.curved]
     curvature_of_pieces = np.einsum("k,kpq->pq", multipliers, state.curvatures)
@@ -654,7 +663,7 @@ def _solve(space: SearchSpace, state: SQPState, pieces: np.ndarray, penalty: flo
     high = np.minimum(space.box.high - state.z, state.radius)
     cuts = _near_cuts(state)
     owner = np.tile(space.constraints.owner, 1 + len(cuts))
-    found = solve_subproblem(
+    found = yield from subproblem(
         state.here.gradient,
         matrix,
         low,
@@ -696,7 +705,7 @@ def _predicted_decrease(space: SearchSpace, state: SQPState, step: np.ndarray) -
     return _merit(space, state, 0.0, state.here.pieces) - _merit(space, state, change, pieces)
 
 
-def _with_penalty(space: SearchSpace, state: SQPState) -> tuple[Step, float]:
+def _with_penalty(space: SearchSpace, state: SQPState) -> quadratic.Task[tuple[Step, float]]:
     """The step of the subproblem and rho, which is increased as long as that reduces the predicted
     violation.
     """
@@ -705,9 +714,9 @@ def _with_penalty(space: SearchSpace, state: SQPState) -> tuple[Step, float]:
     smallest = max(2.0 * float(np.max(state.multipliers, initial=0.0)), MIN_PENALTY * size)
     penalty = min(smallest, largest)
     total = space.constraints.violation
-    found = _solve(space, state, state.here.pieces, penalty)
+    found = yield from _solve(space, state, state.here.pieces, penalty)
     while total(found.violation) > TARGET_EXCESS and penalty < largest:
-        other = _solve(space, state, state.here.pieces, PENALTY_FACTOR * penalty)
+        other = yield from _solve(space, state, state.here.pieces, PENALTY_FACTOR * penalty)
         if total(other.violation) > 0.99 * total(found.violation):
             break
         found = other
@@ -715,9 +724,9 @@ def _with_penalty(space: SearchSpace, state: SQPState) -> tuple[Step, float]:
     return found, penalty
 
 
-def _plan(space: SearchSpace, state: SQPState, tolerance: float) -> None:
+def _plan(space: SearchSpace, state: SQPState, tolerance: float) -> quadratic.Task[None]:
     """Determines the next trial of one start, or ends the start."""
-    found, penalty = _with_penalty(space, state)
+    found, penalty = yield from _with_penalty(space, state)
     state.penalty = penalty
     predicted_violation = space.constraints.violation(found.violation)
     if predicted_violation <= TARGET_EXCESS:
@@ -731,13 +740,13 @@ def _plan(space: SearchSpace, state: SQPState, tolerance: float) -> None:
     linear_decrease = -found.change + state.penalty * reduction
     step = found.step
     decrease = _predicted_decrease(space, state, step)
-    if state.here.pieces.size:
+    if np.any(state.curvatures):
         # The step with the largest predicted decrease, among the one found and those of
         # subproblems with the curvature of the pieces, becomes the trial.
         last = found
         for _ in range(CURVATURE_SOLVES):
             curved = state.here.pieces + state.curvature_along(last.step)
-            last = _solve(space, state, curved, penalty)
+            last = yield from _solve(space, state, curved, penalty)
             other = _predicted_decrease(space, state, last.step)
             if other > decrease:
                 step = last.step
@@ -807,7 +816,7 @@ def conditions_at(space: SearchSpace, z: np.ndarray, found: Point) -> tuple[np.n
     if space.constraints.largest_only:
         size = penalty = 1.0
         found = found._replace(gradient=np.zeros_like(found.gradient))
-    solved = solve_subproblem(
+    task = subproblem(
         found.gradient,
         BETA * size * np.eye(len(z)),
         np.maximum(space.box.low - z, -1.0),
@@ -817,6 +826,7 @@ def conditions_at(space: SearchSpace, z: np.ndarray, found: Point) -> tuple[np.n
         found.piece_gradients,
         penalty,
     )
+    (solved,) = quadratic.together([task])
     excess = space.constraints.excess(found.pieces)
     over_limit = found.pieces
     if space.constraints.largest_only:
@@ -839,13 +849,15 @@ def _residuals(
     return np.array([stationarity, max(worst, 0.0), complementarity])
 
 
-def _correct(space: SearchSpace, state: SQPState, step: np.ndarray, pieces: np.ndarray) -> bool:
+def _correct(
+    space: SearchSpace, state: SQPState, step: np.ndarray, pieces: np.ndarray
+) -> quadratic.Task[bool]:
     """Makes the second-order correction of a rejected step the next trial; returns whether it
     differs from the rejected one.
     """
     if not len(space.constraints.owner):
         return False
-    found = _solve(space, state, pieces - state.here.linear_change(step), state.penalty)
+    found = yield from _solve(space, state, pieces - state.here.linear_change(step), state.penalty)
     state.trial = np.clip(state.z + found.step, space.box.low, space.box.high)
     state.corrected = True
     difference = np.max(np.abs(state.trial - state.z - step))
