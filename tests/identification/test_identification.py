@@ -412,7 +412,8 @@ def test_a_fit_that_lacks_nothing_has_no_finding(known, scenario, other_logs):
     [
         (VISCOUS, 0.0, PATHS[:2], "sign", COULOMB),
         (0.0, COULOMB, PATHS[:1], "velocity", VISCOUS),
-        (VISCOUS, [0.4, 0.1], PATHS[:2], "sign", [-0.2, None]),
+        (VISCOUS, [0.2, 0.0], PATHS[:2], "sign", [None, 0.1]),
+        (VISCOUS, 2.0 * COULOMB, PATHS[:2], "sign", -COULOMB),
     ],
 )
 def test_what_was_left_out_is_named_by_joint_and_size(

@@ -692,7 +692,8 @@ def test_a_multiplier_is_what_a_looser_limit_is_worth(paper):
     tight, best, loose = (tuned(9.0 * factor) for factor in (0.99, 1.0, 1.01))
     price = (tight.objective - loose.objective) / 0.18
     assert best.limit_multipliers == pytest.approx({"peak torque < 9 N m": price}, rel=0.02)
-    assert price > 1e-3 and best.stopped == "converged" and best.evaluations <= 60
+    assert price > 1e-3 and best.stopped == "converged"
+    assert best.evaluations <= 250  # 189: of 32 starts, a third of which goes on every five steps
     assert 8.99 < float(np.max(ij.simulate(best.scenario, **SHORT).metrics.peak_torque)) < 9.0
     assert f"would fall by {best.limit_multipliers['peak torque < 9 N m']:.3g} for each N m" in str(
         best.report
