@@ -50,7 +50,7 @@ def folder(tmp_path: Path) -> Path:
         (tmp_path / name).chmod(0o755)
     (tmp_path / ".ci").mkdir()
     shutil.copy(ROOT / ".ci" / "run", tmp_path / ".ci" / "run")
-    (tmp_path / ".ci" / "tested").write_text("a_commit\n")
+    (tmp_path / ".ci" / "base").write_text("a_commit\n")
     command = "<!-- test command -->\n```bash\n./readme_command\n```\n"
     (tmp_path / "README.md").write_text(command)
     os.mkfifo(tmp_path / "ready")
