@@ -79,8 +79,6 @@ STARTS = {"two_link": 1, "chain_4": 8, "chain_7": 1}
 BACKEND = {"two_link": "auto", "chain_4": "auto", "chain_7": "native"}
 """With "auto" no C compiler works on derivatives of 200,000 operations, which takes it some
 minutes."""
-FOUND_LIMITS = (0.1, 1e3)
-"""Where no upper limit is given to the searches: far above what any of them wants."""
 
 
 def chain(n: int) -> ij.Scenario:

@@ -3,10 +3,11 @@
 
     python3 tools/select_tests.py [BASE]
 
-A change is the difference between the commit BASE and the working tree, new files included.
-Without BASE it is all that a branch adds to main, and in a merge all that the merge adds to its
-first parent; elsewhere nobody knows where the change begins, and all tests are selected.  The last
-commit alone is never taken: a change may have several.
+A change is the difference between the commit BASE and the working tree, new files included; the
+variable $BASE may name it, too, and an empty one selects all tests.  Without BASE it is all that a
+branch adds to main, and in a merge all that the merge adds to its first parent; elsewhere nobody
+knows where the change begins, and all tests are selected.  The last commit alone is never taken: a
+change may have several.
 
 **Files of the package.**  All tests import `iblf_jax`, so imports of modules select nothing.  The
 nodes of the graph are the names that modules define:
@@ -520,13 +521,17 @@ def changed_files(base: str) -> list[str] | None:
 
 def main() -> None:
     """Prints the selection."""
-    base = (sys.argv[1] if sys.argv[1:] else os.environ.get("BASE")) or base_of_change()
+    base = sys.argv[1] if sys.argv[1:] else os.environ.get("BASE")
+    if base is None:
+        base = base_of_change()
     changed = changed_files(base) if base else None
+    graph = Graph()
     if changed is None:
         print("all tests, because it is not known where the change begins", file=sys.stderr)
-        changed = [EVERYTHING[0]]
-    files = selected(Graph(), changed)
-    print(f"{len(changed)} files changed; {len(files)} files of tests", file=sys.stderr)
+        files = sorted(graph.distances)
+    else:
+        files = selected(graph, changed)
+        print(f"{len(changed)} files changed; {len(files)} files of tests", file=sys.stderr)
     print(*files, sep="\n")
 
 

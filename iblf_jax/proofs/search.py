@@ -458,12 +458,12 @@ def search(
     rows = np.zeros((1, 0))
     if patterns is not None:
         rows = np.asarray(patterns, np.float64)
-    widths = high - low
+    widths = None
     if scales is not None:
         widths = np.asarray(scales, np.float64)
         if widths.shape != low.shape or not (np.isfinite(widths) & (widths > 0.0)).all():
             raise checks.fail("scales", scales, f"{len(low)} positive numbers")
-    widths = np.concatenate([widths, np.zeros(rows.shape[1])])
+        widths = np.concatenate([widths, np.zeros(rows.shape[1])])
     # The corners of the boxes of all patterns, each (p, d).
     low, high = (
         np.concatenate([np.broadcast_to(corner, (len(rows), len(corner))), rows], axis=1)

@@ -39,8 +39,8 @@ Retired starts.  A start that is `finished` takes no steps until the smoothing c
 begins; a start that is `retired` is finished and takes no steps in the rest of its phase.  Starts
 are retired in three places: `_select` keeps the better third after every `selection` steps of a
 phase, `_next_stage` keeps the better half at each stage, and `_begin_phase` retires all starts of
-the previous phase.  Rows that only fill up a batch are retired before the first step.  A start that
-takes no step costs nothing, as the others are evaluated in groups of a few rows (`Evaluator`).
+the previous phase.  Rows that only fill up a batch are retired before the first step.  Starts that
+take no step cost only the rows that fill the last group of the others (`Evaluator`).
 """
 
 from __future__ import annotations

@@ -230,6 +230,17 @@ def test_a_base_that_does_not_exist_is_not_known(repository):
     assert select_tests.changed_files("0" * 40) is None
 
 
+def test_an_empty_base_selects_all(repository, graph, monkeypatch, capsys):
+    """Also on a branch, of which it is known where it begins."""
+    monkeypatch.setattr(select_tests, "Graph", lambda: graph)
+    monkeypatch.setattr(sys, "argv", ["select_tests.py"])
+    monkeypatch.setenv("BASE", "")
+    select_tests.main()
+    printed = capsys.readouterr()
+    assert printed.out.split() == sorted(graph.distances)
+    assert "not known where the change begins" in printed.err
+
+
 def test_a_removed_file_is_changed(repository):
     (repository / "b").unlink()
     assert changed() == ["b", "c", "d"]
