@@ -140,6 +140,7 @@ def test_every_case_is_stored():
     assert list(stored_texts()) == list(CASES)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "case", [x if x in QUICK else pytest.param(x, marks=pytest.mark.slow) for x in CASES]
 )

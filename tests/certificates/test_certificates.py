@@ -80,6 +80,7 @@ def left_side(batch, proof):
     return np.asarray(proof.dV + rho * proof.V - 0.5 * jnp.sum(proof.dd**2, axis=-1))
 
 
+@pytest.mark.slow
 def test_the_role_of_a_line_and_not_its_name_decides_the_verdict(paper_certificate):
     for role, verdict in ((Role.INEQUALITY, "holds"), (Role.OTHER, "not applicable")):
         line = Statement("decay", "(X.1)", "V' <= -V", role=role).line("holds")
@@ -395,6 +396,7 @@ def test_with_the_papers_weights_its_own_conditions_decide(corrected_run):
     assert alone.headline == 'fails in "K2"'
 
 
+@pytest.mark.slow
 def test_a_broken_claim_with_weights_is_seen(corrected_run, monkeypatch):
     """With a rate that is too large the inequality fails where the right one holds."""
     best = weighted.best_constants
@@ -410,6 +412,7 @@ def test_a_broken_claim_with_weights_is_seen(corrected_run, monkeypatch):
     assert "the claim with weights holds" not in certificate.headline
 
 
+@pytest.mark.slow
 def test_the_papers_claim_scales_with_the_weights(corrected_run):
     """V1 = sum w_i V1_i in every line: the inequality, the envelope, and xi by the barrier of its
     own joint."""
@@ -532,6 +535,7 @@ def test_certificate_never_contradicts_the_status(corrected_run):
     assert certify(run.scenario, lost).verdict == "fails"
 
 
+@pytest.mark.slow
 def test_batch_with_an_invalid_run_does_not_hold(corrected_run):
     lost = dataclasses.replace(corrected_run, status=jnp.int32(int(ij.Status.NOT_FINITE)))
     certificate = certify(
@@ -744,6 +748,7 @@ def test_an_own_claim_is_drawn_as_one(own, paper_certificate):
     assert not paper_certificate.is_of_own_claim
 
 
+@pytest.mark.slow
 def test_a_claim_that_is_too_strong_fails_and_says_when_first(own):
     certificate = certify(ij.with_parameters(own, {"controller.share": 1.02}), **OWN)
     line = certificate["inequality, own V"]

@@ -314,6 +314,7 @@ def test_as_a_process_with_its_own_cache(tmp_path):
     assert any((tmp_path / "iblf_jax").iterdir())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("module", "started"), [("_start", "-m"), ("iblf_jax.cli", "-m"), ("jax", "script")]
 )

@@ -280,6 +280,7 @@ def test_without_an_error_the_law_is_the_wrapped_one_and_nothing_adapts():
     np.testing.assert_array_equal(rates.theta, 0.0)
 
 
+@pytest.mark.slow
 def test_one_rule_is_the_integral_of_the_velocity_error_with_a_leak(rng):
     law = controllers.AdaptiveRBF(k1=2.0, K2=20.0, nodes=1, normalised=True, Gamma=3.0, sigma=0.1)
     scenario = network(law)

@@ -53,6 +53,7 @@ def near(rng, tube):
 # --- the independent programs ---------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_vector_field_of_an_arm_is_that_of_the_independent_program(rng):
     field = jax.jit(evaluate)
     for _ in range(40):
@@ -184,6 +185,7 @@ def _limited(law, limit=LIMIT, auxiliary=K):
     return controllers.Saturated(law, limit=limit, auxiliary=auxiliary)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LAWS)
 def test_without_a_reached_limit_it_is_the_law_without_it(name):
     part = {}
@@ -203,6 +205,7 @@ def test_without_a_reached_limit_it_is_the_law_without_it(name):
         np.testing.assert_array_equal(one, same)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["adaptive_rbf", "adaptive_network"])
 def test_the_command_of_a_network_with_an_auxiliary_state_needs_no_model(name):
     scenario = canonical(ij.with_parts(PAPER, controller=_limited(LAWS[name], 1e4)))

@@ -27,6 +27,7 @@ def commanded(scenario, t, x, d_hat, beta, filtered):
     return scenario.controller.command(t, x, d_hat, scenario.context, state)[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", other.CASES)
 def test_input_and_virtual_controls_at_random_states(name):
     scenario, case = chain_cases.scenario(name), other.CASES[name]

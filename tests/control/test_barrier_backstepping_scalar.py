@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from scipy.integrate import solve_ivp
 
 import iblf_jax as ij
@@ -74,6 +75,7 @@ def alone(t, x):
     return [dx1, rate - e2 / s2 * slope]
 
 
+@pytest.mark.slow
 def test_bounds_on_both_levels_are_kept_and_the_motion_is_that_of_the_other_program():
     run = ij.simulate(scenario(0.3), duration=8.0, dt=1e-3)
     assert run.ok, run

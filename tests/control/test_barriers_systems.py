@@ -311,6 +311,7 @@ def test_switch_at_zero_error_is_continuous(name):
         np.testing.assert_allclose(below, above, atol=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_removable_singularities_are_accurate(dtype):
     u = np.concatenate(

@@ -103,6 +103,7 @@ class Halved(ij.controllers.RobotLaw):
         return command._replace(tau=0.5 * command.tau), rate
 
 
+@pytest.mark.slow
 def test_a_law_of_q_and_dq_that_calls_a_law_of_x_is_told_what_to_change():
     scenario = ij.presets.zhang_yan_2024()
     plain = ij.with_parts(scenario, controller=Halved(scenario.controller))

@@ -94,6 +94,7 @@ def _elsewhere(qpsolvers, *args):
         )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options", [{"nearest": "acceleration"}, {}, LIMITED | {"nearest": "acceleration"}]
 )
@@ -278,6 +279,7 @@ def test_the_reference_of_a_filter_may_leave_the_bounds_and_that_of_no_other_law
     assert certificate["reference inside"].verdict == certificate.verdict == "fails"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("nearest", ["torque", "acceleration"])
 def test_an_estimate_of_rates_acts_as_its_torque(nearest):
     """A `LevelObserver` passes rates d_hat to a law of x; M0 d_hat_2 is the same estimate as a

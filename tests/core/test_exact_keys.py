@@ -223,6 +223,7 @@ def test_each_value_of_a_static_field_has_its_own_program(paper):
     assert all(one == other for one, other in runs.values())
 
 
+@pytest.mark.slow
 def test_a_replaced_method_or_attribute_is_compiled(paper, monkeypatch):
     class Own(Push):
         size = 1.0

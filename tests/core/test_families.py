@@ -145,6 +145,7 @@ def test_the_key_of_a_class_changes_once(base):
     assert jax.tree.structure(barrier) == first
 
 
+@pytest.mark.slow
 def test_a_class_that_another_process_gets_by_value_has_the_members():
     cloudpickle = pytest.importorskip("cloudpickle")
     packed = cloudpickle.dumps(law_with(own_class()(gain=5.0)))
@@ -247,6 +248,7 @@ def test_copies_have_the_members():
         assert float(twin.gain) == 4.0 and twin.value_unit == "1"
 
 
+@pytest.mark.slow
 def test_a_process_that_imports_the_class_adopts_it(tmp_path, monkeypatch):
     (tmp_path / "own_barriers.py").write_text(OWN)
     monkeypatch.syspath_prepend(tmp_path)

@@ -123,6 +123,7 @@ def test_the_mode_of_a_run_that_left_its_bounds_recommends_at_most_a_tenth_of_th
         ij.simulate(stiff, **SHORT)
 
 
+@pytest.mark.slow
 def test_recommended_dt_and_the_measured_mode(paper, short_run):
     """About K2 / lambda_min(M0): 850 to 1010 1/s on the paper's run."""
     assert ij.recommended_dt(paper) == 1e-3
@@ -148,6 +149,7 @@ def test_the_fastest_mode_is_the_largest_spectral_radius(paper, short_run):
     assert float(run.fastest_mode) == pytest.approx(max(radii), rel=0.05)
 
 
+@pytest.mark.slow
 def test_a_run_away_state_is_frozen_at_its_last_good_value(paper):
     run = quiet(ij.with_parameters(paper, {"controller.K2": 150.0}))
     assert int(run.status) & Status.NOT_FINITE
@@ -238,6 +240,7 @@ def test_gains_below_the_theorem_are_advised_against(paper):
         )  # nothing to say about a number that is not known yet
 
 
+@pytest.mark.slow
 def test_a_reference_that_is_too_fast_is_named_with_its_limit(paper):
     slow = ij.bounds.Constant([0.1, 9.0])
     speeds = ij.Bounds(lower=ij.bounds.Constant(-9.0), upper=slow)

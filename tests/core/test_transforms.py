@@ -439,6 +439,7 @@ def test_no_warning_on_a_good_run(paper):
         ij.simulate(paper, **SHORT)
 
 
+@pytest.mark.slow
 def test_a_rollout_is_a_pytree_and_indexes_runs(short_run):
     doubled = jax.tree.map(lambda x: jnp.stack([x, x]), short_run)
     assert len(doubled) == 2

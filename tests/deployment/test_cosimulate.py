@@ -242,6 +242,7 @@ def test_callbacks_of_others_are_kept():
         mujoco.set_mjcb_control(None)
 
 
+@pytest.mark.slow
 def test_a_run_that_flies_away_is_told():
     wild = ij.with_parameters(PAPER, {"controller.K2": 2000.0})
     with pytest.warns(ij.SimulationWarning, match="ran away|not finite|bound"):

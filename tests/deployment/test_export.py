@@ -224,6 +224,7 @@ def test_what_cannot_be_written_says_why(base, tmp_path):
             ij.export(base, tmp_path, **wrong)
 
 
+@pytest.mark.slow
 def test_a_users_law_in_files_is_registered_before_the_export_is_repeated(tmp_path, monkeypatch):
     monkeypatch.setattr("iblf_jax.deployment.export.VECTORS_DURATION", 0.02)
     Own = law_of(damped)
@@ -249,6 +250,7 @@ def test_a_users_law_in_files_is_registered_before_the_export_is_repeated(tmp_pa
     assert "`python -m iblf_jax export scenario.toml" in (own.folder / "README.md").read_text()
 
 
+@pytest.mark.slow
 def test_memories_may_hold_whole_numbers_and_flags(base, tmp_path):
     @ij.component
     class Counting:
@@ -442,6 +444,7 @@ def test_a_law_as_an_fmu_gives_the_torque_of_simulate(lab, tmp_path):
     fmu.freeInstance()
 
 
+@pytest.mark.slow
 def test_a_closed_loop_in_webassembly_is_simulate(lab, tmp_path):
     ij.export(lab, tmp_path, target="wasm", dt=1e-3, seed=4)
     store = wasmtime.Store()
@@ -499,6 +502,7 @@ def test_the_command_line_exports(tmp_path, capsys):
 # ----------------------------------------------------------------- no numbers
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("path", "size", "options"),
     [

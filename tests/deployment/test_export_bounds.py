@@ -44,6 +44,7 @@ def test_bounds_are_a_function_of_time(name, tmp_path):
     np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_bounds_around_a_given_reference(tmp_path):
     scenario = ij.with_parts(ij.presets.zhang_yan_2024_funnel(), sampling=ij.Sampling(PERIOD))
     ij.export(scenario, tmp_path, reference="given")

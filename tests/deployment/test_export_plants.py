@@ -38,6 +38,7 @@ def test_the_c_of_a_law_gives_the_inputs_of_simulate(tmp_path, case, reference, 
     assert (f"*d{order}q_d" in header) == (order > 2 and reference == "given")
 
 
+@pytest.mark.slow
 def test_a_law_of_a_rigid_model_has_no_parameters_of_the_plant(tmp_path):
     exported = ij.export(loops_of_plants.rigid_law(), tmp_path, period=PERIOD)
     assert not [path for path in exported.parameters if path.startswith("plant")]

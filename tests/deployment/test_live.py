@@ -132,6 +132,7 @@ def test_numbers_of_the_address_are_those_of_sliders_and_curves(two_laws, tmp_pa
     assert in_node(two_laws, tmp_path, [{}], "?law=constructor")[0]["law"] == "integral"
 
 
+@pytest.mark.slow
 def test_values_of_the_address_that_are_not_used_are_named(two_laws, tmp_path):
     plain, good = (
         in_node(two_laws, tmp_path, [{}], address)[0]
@@ -144,6 +145,7 @@ def test_values_of_the_address_that_are_not_used_are_named(two_laws, tmp_path):
     assert bad["q"] != good["q"]
 
 
+@pytest.mark.slow
 def test_gains_that_differ_between_joints_are_all_shown_until_the_slider_is_moved(page, tmp_path):
     before, after = in_node(page, tmp_path, [{}, {"move": "controller.K2", "to": np.log(20.0)}])
     assert before["shown"]["controller.K2"].startswith("20.0, 33.0 ")
@@ -220,6 +222,7 @@ def test_gains_starts_and_bounds_have_sliders(page):
     assert not re.search(r'(?:src|href)="(?!data:)', page.text)
 
 
+@pytest.mark.slow
 def test_a_notebook_shows_it_in_a_frame_and_without_a_compiler_its_figure(
     page, monkeypatch, tmp_path
 ):

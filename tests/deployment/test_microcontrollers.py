@@ -126,6 +126,7 @@ int main(void) {
 """
 
 
+@pytest.mark.slow
 def test_the_c_caller_block_of_the_page_returns_the_torques_of_the_self_test(law):
     """A second run after a reset is the first one again."""
     (law / "arm_law_block.c").write_text(block_of("arm_law_block.c"))
@@ -136,6 +137,7 @@ def test_the_c_caller_block_of_the_page_returns_the_torques_of_the_self_test(law
     assert float(run(["./block_test"], law)) < 1e-6
 
 
+@pytest.mark.slow
 def test_the_s_function_of_the_page_returns_the_torques_of_the_self_test(law):
     (law / "arm_law_sfun.c").write_text(block_of("arm_law_sfun.c"))
     includes = ("-I", STUBS, "-I", law)
@@ -165,6 +167,7 @@ int main(void) {
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("precision", ["double", "float"])
 def test_the_timer_of_the_page_checks_the_bounds_and_clips_the_torque(precision, law, small_law):
     folder = small_law if precision == "float" else law
@@ -177,6 +180,7 @@ def test_the_timer_of_the_page_checks_the_bounds_and_clips_the_torque(precision,
     assert [abs(x) for x in torques] == [20.0, 20.0]
 
 
+@pytest.mark.slow
 def test_the_check_of_the_page_prints_the_end_of_the_run(sampled, tmp_path):
     pytest.importorskip("ziglang", reason="ziglang of the extra `export` is not installed")
     node = shutil.which("node")
@@ -189,6 +193,7 @@ def test_the_check_of_the_page_prints_the_end_of_the_run(sampled, tmp_path):
     np.testing.assert_allclose(found, expected, atol=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", ["", "f"])
 def test_the_law_of_the_page_needs_the_functions_that_it_lists(suffix, law, small_law):
     folder = small_law if suffix else law

@@ -221,6 +221,7 @@ def test_the_length_of_a_segment(steps, bytes_per_step, expected):
 # ------------------------------------------------------------------------------------ which kernel
 
 
+@pytest.mark.slow
 def test_a_step_whose_adjoint_does_not_lower_is_differentiated_by_the_scan(problem, monkeypatch):
     def refused(*args):
         raise UnsupportedError("made up")

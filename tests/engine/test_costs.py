@@ -79,6 +79,7 @@ def step_counts(name: str) -> dict[str, dict[str, int]]:
     return {often: dict(sorted(counter.items())) for often, counter in counts.items()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", [pytest.param(x, marks=pytest.mark.slow) if x in LONG else x for x in SCENARIOS]
 )

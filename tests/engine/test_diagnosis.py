@@ -112,6 +112,7 @@ def test_an_inaccurate_run_names_the_unit_of_the_worst_component():
     assert " rad, " not in text
 
 
+@pytest.mark.slow
 def test_errors_before_a_run_name_components():
     far = ij.references.Sinusoid(offset=0.0, amplitude=[4.0, 2.0, 3.0], frequency=1.0)
     with pytest.raises(ValueError, match="reference of heading"):
@@ -165,6 +166,7 @@ def message_for(run, status, **metrics) -> str:
 CONSEQUENCES = Status.INACCURATE | Status.GUARD_STAYED | Status.INFINITE_SLOPE
 
 
+@pytest.mark.slow
 def test_the_consequences_of_a_divergence_are_left_out_of_its_message(run):
     text = message_for(run, Status.BOUND_VIOLATED | Status.NOT_FINITE | CONSEQUENCES)
     assert "a bound was violated" in text
@@ -173,6 +175,7 @@ def test_the_consequences_of_a_divergence_are_left_out_of_its_message(run):
     assert "guard stayed active" in message_for(run, Status.BOUND_VIOLATED | Status.GUARD_STAYED)
 
 
+@pytest.mark.slow
 def test_the_first_violation_is_named_first(run):
     both = Status.BOUND_VIOLATED | Status.VELOCITY_VIOLATED
     times = {"first_violation_time": 0.01, "first_velocity_violation_time": 0.004}

@@ -82,6 +82,7 @@ def test_backends_agree_with_the_reference(name, dtype):
     agree(name, dtype, RunRequest(STEPS, method, 250))
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_native_agrees_on_a_short_run():
     agree("zhang_yan_2024", "float64", RunRequest(STEPS // 10, "euler", 250))

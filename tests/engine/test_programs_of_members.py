@@ -57,6 +57,7 @@ def check(names: list[str], method: str, folder: Path) -> None:
     assert apart == {key: end for key, end in together.items() if key[1] == "native"}
 
 
+@pytest.mark.slow
 def test_laws_that_are_alike_have_their_own_programs(tmp_path):
     check(ALIKE, "rk4", tmp_path)
 

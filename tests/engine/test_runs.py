@@ -18,6 +18,7 @@ TAKING = (
 )
 
 
+@pytest.mark.slow
 def test_a_run_is_that_of_the_keywords(paper):
     by_keywords = ij.simulate(paper, duration=0.02, method="heun")
     by_object = ij.simulate(paper, runs_as=SHORT)
@@ -26,6 +27,7 @@ def test_a_run_is_that_of_the_keywords(paper):
     assert SHORT.request(by_object.scenario).steps == 20
 
 
+@pytest.mark.slow
 def test_a_study_has_the_seed_and_the_backend(paper):
     draws = {"initial.q": ij.offset(ij.uniform(-0.01, 0.01))}
     runs = ij.Runs(0.005, backend="vmap", seed=3)

@@ -162,6 +162,7 @@ def test_the_recommended_step_is_one_that_the_run_itself_is_content_with(paper):
     assert not int(run.status) & (Status.INACCURATE | Status.STEP_TOO_LARGE)
 
 
+@pytest.mark.slow
 def test_no_step_will_do(shaken, monkeypatch):
     """A torque that no affordable step resolves: the advice of the loop's modes, and a warning."""
     monkeypatch.setattr(step_size, "MAX_TRIED", 20_000)
@@ -211,6 +212,7 @@ def test_a_study_without_failed_runs_mentions_none():
     assert "left their bounds" not in str(found[0].message)
 
 
+@pytest.mark.slow
 def test_runs_that_fail_at_every_step_do_not_reduce_the_recommended_one(paper, monkeypatch):
     """Runs that leave their bounds at any step have a mode of 1e15 1/s beside the bound."""
 

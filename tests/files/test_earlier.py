@@ -65,6 +65,7 @@ def test_runs(kind, count, ending):
         np.testing.assert_array_equal(get(run.scenario, VARIED[kind][0]), value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", PRESETS)
 def test_a_run_can_be_done_again(kind):
     run = ij.load(EARLIER / f"{kind}.result")

@@ -36,6 +36,7 @@ def test_a_file_keeps_levels_and_units(run, tmp_path, ending):
     assert data.identical(run.to_xarray())
 
 
+@pytest.mark.slow
 def test_a_study_has_dimensions_and_units_of_levels():
     study = ij.monte_carlo(
         pendulum(),
@@ -54,12 +55,14 @@ def test_a_study_has_dimensions_and_units_of_levels():
     assert np.all(np.asarray(study.metrics.level_margin)[:, 0] <= 20.0 - drawn + 1e-12)
 
 
+@pytest.mark.slow
 def test_components_of_different_units():
     data = ij.simulate(body(), duration=0.1, dt=1e-2).to_xarray()
     assert data.q.attrs == {"units": "m, m, rad", "description": "pose"}
     assert data.margin.attrs["units"] == "m, m, rad"
 
 
+@pytest.mark.slow
 def test_estimated_levels_of_a_robot_within_a_plant_have_rows_of_the_model(tmp_path):
     """The plant has four levels, and its model two."""
     plant = rigid_law().plant

@@ -315,6 +315,7 @@ def run() -> ij.Rollout:
     return ij.simulate(PAPER, **TIMES)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", [".nc", ".npz"])
 def test_runs_of_save_rollouts_come_back_as_rollouts(run, ending, tmp_path):
     many = _many()
@@ -335,6 +336,7 @@ def test_a_sampled_run_of_levels_comes_back_from_netcdf(tmp_path):
     assert_equal(run, ij.load(tmp_path / "run.nc"), "run")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("enabled", [False, True])
 def test_numbers_keep_their_precision_in_both_modes_of_jax(enabled, tmp_path):
     with jax.enable_x64(True):

@@ -98,6 +98,7 @@ def test_files_give_the_same_datasets_back(ending, short_run, batch, tmp_path):
         xarray.testing.assert_identical(found[name], run.to_xarray())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", [".nc", ".npz"])
 def test_batches_of_earlier_versions_load(ending, paper, tmp_path):
     """Bounds of velocities had a field of their own; two bounds differ between the runs."""

@@ -174,6 +174,7 @@ def test_true_values_are_within_their_errors_and_masses_within_a_percent(known):
     assert abs(known.delay) < 4.0 * known.delay_error < 1e-3
 
 
+@pytest.mark.slow
 def test_the_fit_is_as_good_as_the_encoder_also_on_what_was_held_back(known):
     for one in known.fit:
         for left in (one.after, one.held_back):
@@ -205,6 +206,7 @@ def test_friction_that_sticks_is_left_to_the_log(scenario):
     np.testing.assert_array_equal(known.scenario.disturbance.width, scenario.disturbance.width)
 
 
+@pytest.mark.slow
 def test_the_scenario_has_the_new_numbers_in_plant_and_model(known, scenario):
     for robot in (known.scenario.plant, known.scenario.model):
         np.testing.assert_allclose(robot.mass, known.values["robot.mass"])
@@ -407,6 +409,7 @@ def test_a_fit_that_lacks_nothing_has_no_finding(known, scenario, other_logs):
         assert not lacking(with_friction(scenario, VISCOUS, COULOMB), log, PATHS).findings
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("viscous", "coulomb", "paths", "kind", "sizes"),
     [
@@ -428,6 +431,7 @@ def test_what_was_left_out_is_named_by_joint_and_size(
         assert one.error < 0.2 * abs(one.size) and one.gain > 0.3
 
 
+@pytest.mark.slow
 def test_gravity_and_inertia_that_were_left_out_are_named(scenario, other_logs):
     """Another payload's worth of gravity, and a rotor: of the torques that are logged, so that
     nothing else is wrong."""
@@ -509,6 +513,7 @@ WRONG = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", WRONG)
 def test_a_wrong_log_is_told(name, scenario, log):
     spoil, words = WRONG[name]
@@ -586,6 +591,7 @@ def test_files(tmp_path, log):
 # ----------------------------------------------------------------- report, parts
 
 
+@pytest.mark.slow
 def test_the_report_is_words_json_and_a_page(known, tmp_path):
     text = repr(known)
     assert "robot.mass[0]" in text and "held back" in text and "6 of" not in text.split("\n")[2]

@@ -112,6 +112,7 @@ def test_results_do_not_depend_on_place_or_number_of_runs():
             np.testing.assert_array_equal(x[few], y)
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_a_run_that_fails_does_not_touch_the_others():
     values = draws(5)
@@ -128,6 +129,7 @@ def test_a_run_that_fails_does_not_touch_the_others():
     np.testing.assert_array_equal(found.status, batch(backend="vmap", values=broken).status)
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_a_step_that_is_too_large_is_seen_by_every_backend():
     values = {
@@ -305,6 +307,7 @@ def test_one_run_on_the_native_backend_is_the_run(paper):
         ij.simulate(paper, duration=0.5, dt=1e-3, backend="fortran")
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize("every", [1, 7])
 def test_a_long_run_in_several_calls_is_the_same_run(monkeypatch, every):

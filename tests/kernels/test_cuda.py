@@ -275,6 +275,7 @@ def test_the_image_is_loaded_once_and_launched_for_some_steps_at_a_time(paper, m
     np.testing.assert_array_equal(ints, carry.ints)
 
 
+@pytest.mark.slow
 @needs_a_cpu
 @needs_compiler
 def test_what_the_driver_refuses_is_an_error_of_jax(paper):

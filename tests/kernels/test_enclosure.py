@@ -80,6 +80,7 @@ def contains(lower: float, upper: float, value) -> bool:
     return not (lower > value) and not (upper < value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", UNARY)
 def test_functions_contain_exact_values(name):
     function, exact, lowest = UNARY[name]
@@ -113,6 +114,7 @@ def exact_binary(a, b):
     return [a + b, a - b, a * b, quotient, max(a, b), min(a, b)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("constant", [0.0, -0.7, 3.0, 1e-310, -1e308])
 def test_arithmetic_at_the_edges(constant):
     """Denormal and huge numbers, overflow, divisors that contain zero, points and half-lines."""
@@ -346,6 +348,7 @@ def test_more_random_expressions(seed):
 # --- refusals ----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_kernel_that_does_not_round_outward_is_refused(monkeypatch):
     source = enclosure.compiled(jnp_square, 1, ()).source
     assert source.count("FE_UPWARD") > 0

@@ -418,6 +418,7 @@ def test_a_call_for_samples_alone_does_not_write_over_what_the_carry_reads():
     assert order == [node.value.size for node in p.nodes if node.op == "call"] and len(order) == 2
 
 
+@pytest.mark.slow
 def test_classes_of_a_program():
     scenario = canonical(PRESET)
     varied = {"plant.mass[1]": jnp.asarray([0.9])}

@@ -205,6 +205,7 @@ def all_operations(dtype, runs=256):
     return program, carry, expected, names
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "executor",
     [pytest.param("native", marks=needs_compiler), pytest.param("gpu", marks=needs_compiler)],

@@ -728,6 +728,7 @@ def test_the_first_arguments_of_a_compiler(cache, tmp_path, monkeypatch):
             toolchain.compiler()
 
 
+@pytest.mark.slow
 def test_ziglang_where_the_system_has_no_compiler(cache, tmp_path, monkeypatch):
     """With the wheel there is a compiler, without it the message names the wheel."""
     pytest.importorskip("ziglang")

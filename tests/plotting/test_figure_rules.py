@@ -213,6 +213,7 @@ def study():
     return cases.study(64)
 
 
+@pytest.mark.slow
 def test_a_scatter_shows_every_run(study):
     margins = np.asarray(study.metrics["margin"]).copy()
     margins[3] = -1e4
@@ -320,6 +321,7 @@ def test_a_panel_of_rounding_errors_says_zero(size):
             assert ("rounding" in says_zero[0]) == (size > 0.0)
 
 
+@pytest.mark.slow
 def test_the_overview_says_zero():
     run = made_up(chain(2))
     still = dataclasses.replace(run, disturbance=0.0 * run.q, disturbance_estimate=noise(run))

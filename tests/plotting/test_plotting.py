@@ -49,6 +49,7 @@ def drawn(figure):
         return figure._repr_png_()
 
 
+@pytest.mark.slow
 def test_the_paper_s_figures_have_their_panels_and_units(runs):
     figures = plotting.paper_figures(runs)
     assert list(figures) == SIX
@@ -234,6 +235,7 @@ def test_bad_arguments_are_named(runs, tmp_path):
     assert not list(tmp_path.iterdir()), "nothing is written when an argument is bad"
 
 
+@pytest.mark.slow
 def test_save_writes_every_format(runs, tmp_path):
     figures = plotting.paper_figures(runs)
     paths = plotting.save({"figure_6": figures["figure_6"]}, tmp_path / "new" / "folder")
@@ -243,6 +245,7 @@ def test_save_writes_every_format(runs, tmp_path):
     assert figures["figure_6"].get_layout_engine() is not None
 
 
+@pytest.mark.slow
 def test_no_global_state_is_touched_and_no_figure_stays_open(runs):
     from matplotlib import pyplot
 
@@ -367,6 +370,7 @@ def test_thinning_keeps_every_peak_and_both_ends():
     np.testing.assert_array_equal(thin_y, y[np.searchsorted(t, thin_t)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("plant", [chain(4), Arm3D(3)], ids=["plane", "space"])
 def test_an_animation_moves(plant, tmp_path):
     runs = {"a": made_up(plant, duration=1.0), "b": made_up(plant, duration=0.5, shift=0.1)}
@@ -382,6 +386,7 @@ def test_an_animation_moves(plant, tmp_path):
     assert all(np.abs(a - b).max() > 50 for a, b in itertools.pairwise(pictures))
 
 
+@pytest.mark.slow
 def test_an_animation_as_a_page(tmp_path):
     path = plotting.animate(
         made_up(chain(2), duration=1.0), tmp_path / "arm.html", fps=8, speed=2.0
@@ -404,6 +409,7 @@ def test_joint_limits_are_drawn_where_the_robot_would_be_at_them():
             np.testing.assert_allclose(world.fans[0, joint, corner], expected, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_paper_s_figures_3_and_5_magnify_the_transient_in_half_of_their_width():
     runs = made_up(chain(2), duration=20.0)
     figures = plotting.paper_figures(runs, note="the arm is assumed")

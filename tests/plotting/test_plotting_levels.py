@@ -55,6 +55,7 @@ def test_the_overview_has_a_row_for_every_level(run):
     assert [x for x in labels if "$d_" in x] == [r"$d_{2}$ (broad), $\hat d_{2}$ [rad/s^2]"]
 
 
+@pytest.mark.slow
 def test_a_level_is_drawn_with_its_bounds_and_virtual_control(run):
     current = run.plot().axes[2]
     guide = line_of(current, r"virtual control $\alpha_{i-1}$")
@@ -99,6 +100,7 @@ def test_components_of_different_units_have_labels_of_their_own(body_run):
     assert "force $u$ [N, N, N m]" in labels
 
 
+@pytest.mark.slow
 def test_figures_have_the_names_and_units_of_the_plant(run, body_run):
     assert labels_of(plotting.levels(run))[::2] == [
         "angle $x_1$ [rad]",
@@ -144,6 +146,7 @@ _ORDER_2 = {
 }
 
 
+@pytest.mark.slow
 def test_bounds_of_levels_mark_where_a_run_failed():
     law = ij.controllers.BarrierBackstepping(k=(3.0, 10.0, 30.0))
     scenario = pendulum(controller=law, bounds=(ANGLES, None, symmetric(2.0)))
@@ -155,6 +158,7 @@ def test_bounds_of_levels_mark_where_a_run_failed():
     assert curve.exit_index("q", 0) is None
 
 
+@pytest.mark.slow
 def test_a_plant_with_an_outline_is_animated_and_drawn_along_its_path(body_run, tmp_path):
     path = plotting.animate(body_run, tmp_path / "body.gif", fps=2)
     assert path.stat().st_size > 1000
@@ -179,6 +183,7 @@ def test_a_flexible_arm_is_animated_with_its_motors(flexible_run, tmp_path):
     assert plotting.animate(flexible_run, tmp_path / "arm.gif", fps=5).exists()
 
 
+@pytest.mark.slow
 def test_a_plant_without_a_shape_is_refused(run, tmp_path):
     for draw in (plotting.workspace, lambda run: plotting.animate(run, tmp_path / "film.gif")):
         with pytest.raises(ValueError, match="expected a plant with a shape"):

@@ -37,6 +37,7 @@ def test_study_at_a_glance(study):
     assert f"{len(study.failed)} failed" in figure.get_suptitle()
 
 
+@pytest.mark.slow
 def test_bands_are_the_quantiles(study):
     figure = drawn(plotting.bands(study, runs=256))
     data = study.bands(runs=256)
@@ -62,6 +63,7 @@ def test_scatter_shows_the_correlation(study):
     assert figure.axes[0].get_title() == f"rank correlation {rho:.2f}"
 
 
+@pytest.mark.slow
 def test_a_heat_map_of_equal_values_says_so(table):
     def title(**values):
         metric = next(iter(values))
@@ -74,6 +76,7 @@ def test_a_heat_map_of_equal_values_says_so(table):
     assert title(fastest_mode=0.0 * growing.min("joint") + 0.25) == "equal at all points"
 
 
+@pytest.mark.slow
 def test_heat_maps_show_shares_and_medians(table):
     figure = drawn(plotting.heat_map(table, ["violated", "margin"]))
     maps = [axes for axes in figure.axes if axes.images and not axes.get_label()]

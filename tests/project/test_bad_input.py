@@ -634,6 +634,7 @@ def test_a_component_with_a_constructor_of_its_own_keeps_its_errors():
 # -------------------------------------------------------------------------------------- warnings
 
 
+@pytest.mark.slow
 def test_a_warning_points_at_the_callers_line(paper):
     weak = ij.with_parameters(paper, {"controller.K2": 0.4})
     with warnings.catch_warnings(record=True) as caught:

@@ -61,6 +61,7 @@ def test_examples_run(name, tmp_path, monkeypatch, capsys, request):
     assert WORDS[name] in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_the_arm_of_the_examples_is_the_one_that_readme_speaks_of():
     pytest.importorskip("mujoco")
     arm = ij.robots.load(EXAMPLES / "arm.urdf", tip="tool0")

@@ -469,6 +469,7 @@ def test_the_quick_measurement(tmp_path, monkeypatch, capsys):
         assert row["margin"] <= 1.0
 
 
+@pytest.mark.slow
 def test_a_law_that_does_not_apply_is_refused(tmp_path, monkeypatch, capsys):
     words = ["measure.py", "liu_2018", "--quick", "--only", "no law", "--out", str(tmp_path)]
     monkeypatch.setattr(sys, "argv", words)
@@ -477,6 +478,7 @@ def test_a_law_that_does_not_apply_is_refused(tmp_path, monkeypatch, capsys):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_a_published_law_that_fails_leaves_the_former_results(tmp_path, monkeypatch):
     def fails(*arguments):
         raise RuntimeError("no run")

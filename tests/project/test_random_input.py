@@ -125,6 +125,7 @@ PATHLIKE = st.one_of(
 )
 
 
+@pytest.mark.slow
 @many
 @given(path=PATHLIKE)
 def test_parse_and_get(paper, path):

@@ -84,6 +84,7 @@ def test_a_card_has_words_a_table_and_a_picture_and_a_page_needs_nothing_else(
     assert ("factor uniform, low 0.8, high 1.25, shared" in text) == (kind == "Study")
 
 
+@pytest.mark.slow
 def test_numbers_are_those_of_the_result(results):
     run, study = results["Rollout"], results["Study"]
     assert f"{float(run.metrics.rmse[0]):.4g}" in run._repr_html_()
@@ -92,6 +93,7 @@ def test_numbers_are_those_of_the_result(results):
     assert f"{worst:.4g}" in row
 
 
+@pytest.mark.slow
 def test_a_title_does_not_repeat_the_name_of_the_class(results):
     """Of every kind: the heading, then the numbers, without the class's name around them."""
     for kind in set(MADE) - {"TuneResult"}:  # its report takes long: the test below looks at it
@@ -155,6 +157,7 @@ def test_the_tuning_report_begins_with_bounds_then_requirements_then_the_objecti
     assert "not kept" not in str(made_up_report(0, ["pass"], seed))
 
 
+@pytest.mark.slow
 def test_the_page_of_a_tuning_begins_with_its_report(results):
     first, second, *rest = reports.shown(results["TuneResult"]).words
     assert first.startswith("Report on one nominal run")

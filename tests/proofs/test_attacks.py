@@ -187,6 +187,7 @@ def test_a_spline_is_refused_because_of_its_pieces():
         arm_problem(pendulum(reference=reference), {}, duration=2.0)
 
 
+@pytest.mark.slow
 def test_a_mass_matrix_that_is_singular_inside_the_box_is_not_proved():
     """The mass of the model is far from zero, that of the box is zero at an inner point."""
     problem = arm_problem(pendulum(), {"plant.mass": ij.factor(ij.interval(0.9, 1.1))})
@@ -226,6 +227,7 @@ def with_barrier(barrier):
     return pendulum(controller=law)
 
 
+@pytest.mark.slow
 def test_barriers_of_users_are_without_a_length_and_their_claims_are_assumed():
     with pytest.raises(ValueError, match="without a length of its own"):
         arm_problem(with_barrier(WithLength()), {})

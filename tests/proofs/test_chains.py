@@ -232,6 +232,7 @@ def test_lever_with_uncertain_parameters_is_proved():
     assert largest < 0.0
 
 
+@pytest.mark.slow
 def test_lever_with_too_uncertain_parameters_is_not_proved():
     scenario = lever(kappa=(0.0, 2.0))
     found, largest = proved(chain_problem(scenario, within(0.5, *LEVER)), 1.0, 0.3, 200_000)

@@ -67,6 +67,7 @@ def test_a_proof_says_what_it_proves():
     assert "Assumed:" in repr(found)
 
 
+@pytest.mark.slow
 def test_the_tube_is_where_the_barrier_has_the_level():
     found = proof()
     # V1 = -log(1 - xi^2) of the integral barrier with k_l = k_u scaled to the side
@@ -89,6 +90,7 @@ def test_the_nominal_plant_is_proved():
     assert "the plant as given" in repr(found)
 
 
+@pytest.mark.slow
 def test_a_proof_is_repeatable():
     a = proof()
     b = ij.prove(pendulum(), level=LEVEL, parameters=within(3.0), progress=False, threads=1, seed=0)
@@ -250,6 +252,7 @@ def test_an_interval_with_a_singular_mass_matrix_is_refused():
         )
 
 
+@pytest.mark.slow
 def test_figure_file_and_report(tmp_path):
     found = proof()
     figure = found.plot(runs=2)

@@ -122,6 +122,7 @@ def test_a_pattern_is_proved_for_each_row():
     assert found.worst.lower[3] == found.worst.upper[3] == 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("constant", "limit"), [(-1.01, 10**9), (-1.001, 40_000), (-0.9, 10**9)])
 def test_nothing_depends_on_the_number_of_threads(constant, limit):
     results = [
@@ -166,6 +167,7 @@ def coupled(x, c):
     return (jnp.maximum(zeros[0], zeros[1]) + 0.01 * zeros[2] + c[0])[None], NOWHERE
 
 
+@pytest.mark.slow
 def test_no_coordinate_is_bisected_alone_for_ever(monkeypatch):
     """Without the guard x_2 alone is bisected: each of its bisections gains a little."""
     options = {"max_boxes": 60_000, "progress": False}
@@ -204,6 +206,7 @@ def test_the_halves_of_a_box_cover_it():
         assert is_inside or waves(point, [-1.01])[0] < 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("constant", [-1.01, -1.001, -1.0003])
 def test_descents_estimate_the_number_of_boxes(constant):
     found = search(waves, LOW, HIGH, [constant], progress=False)

@@ -136,6 +136,7 @@ TABLE = {"gain": 1.0, "array": np.array([1.0, 2.0])}
 """Numbers that a function reads from elsewhere."""
 
 
+@pytest.mark.slow
 def test_a_function_whose_numbers_changed_has_another_program(monkeypatch):
     function = jax.jit(lambda v: TABLE["gain"] * jnp.outer(jnp.asarray(TABLE["array"]), v)[1])
 
@@ -248,6 +249,7 @@ def test_plants_that_jump_are_refused(name):
         chain_problem(with_drift(lambda x: -JUMPS[name](x), 1), {})
 
 
+@pytest.mark.slow
 def test_a_kink_is_admitted_in_the_last_level_only():
     """The law contains the derivative of the drift of the first level."""
     chain_problem(with_drift(lambda x: -x * jnp.abs(x), 1), {})
@@ -634,6 +636,7 @@ def digests_of(barrier, n):
     return check_barrier("barrier", barrier, jnp.asarray(0.1), n=n, homogeneous=True)
 
 
+@pytest.mark.slow
 def test_the_barriers_of_the_package_satisfy_what_is_required_of_others():
     for barrier in (ij.barriers.Integral(), ij.barriers.Log(), ij.barriers.TransformedError()):
         digests_of(barrier, 2)
@@ -663,6 +666,7 @@ def test_a_barrier_whose_joints_mix_is_refused(method):
         digests_of(Shifted(method=method), 2)
 
 
+@pytest.mark.slow
 def test_joints_may_not_mix_for_the_number_of_joints_of_the_arm():
     digests_of(Shifted(move=lambda q: jnp.roll(q, 2)), 2)
     with pytest.raises(ValueError, match="depends on another joint"):
@@ -686,6 +690,7 @@ def test_a_ratio_that_jumps_although_the_barrier_denies_it_is_refused():
         digests_of(barrier, 1)
 
 
+@pytest.mark.slow
 def test_a_changed_ratio_of_a_barrier_has_another_digest(monkeypatch):
     """The ratio e1/s is in the law of every level above the first one."""
     barrier = Altered(of_ratio=lambda tube, q: one(tube, q) + 1e-9 * (TABLE["gain"] - 1.0))

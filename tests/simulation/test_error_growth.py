@@ -213,6 +213,7 @@ def test_the_executors_agree(name):
         np.testing.assert_allclose(found[0].metrics[of], found[1].metrics[of], rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_the_bounds_are_those_of_the_worst_and_of_random_rounding_errors():
     """The sums over periods, against some in NumPy, over a run of few periods and a long one."""
     scenario = canonical(LOOPS["both"]())
@@ -246,6 +247,7 @@ def test_the_bounds_are_those_of_the_worst_and_of_random_rounding_errors():
     np.testing.assert_array_equal(lower, np.minimum(rigorous, probable))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("periods", [2.0**15, 2.0**20, 2.0**31])
 def test_the_bound_covers_the_longest_run(periods):
     """Of x' = tau, which forgets no rounding error, it is N times that of a period."""
@@ -259,6 +261,7 @@ def test_the_bound_covers_the_longest_run(periods):
     np.testing.assert_allclose(found, periods * 4e-3 * 1.5, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_bound_that_overflows_is_infinite():
     scenario = canonical(LOOPS["quantiser"]())
     state = initial_state(scenario)
@@ -296,6 +299,7 @@ def test_a_smaller_step_reduces_what_is_no_bound(bounds, error, by_step):
     assert assessed(1.0, bounds, error)[2] == pytest.approx(by_step, rel=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("distance", "jumped"), [(0.4, 1.0), (0.6, 0.0)])
 def test_the_error_of_the_held_command_moves_the_threshold(distance, jumped):
     """Command and held command have one error c, so only that of 0.5 |u_held| remains: 0.5 |c|."""

@@ -88,6 +88,7 @@ def test_order_on_a_nonlinear_problem_in_time(method):
     assert order == pytest.approx(tableau(method).order, abs=0.15)
 
 
+@pytest.mark.slow
 @methods
 def test_order_on_the_closed_loop(method):
     """Softer gains and a short stretch on which e1 keeps its sign, so that the loop is smooth."""

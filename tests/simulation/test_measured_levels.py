@@ -136,6 +136,7 @@ FINE = Encoder(counts=2**18, noise=2e-5, velocity=FilteredDifference(cutoff=500.
 """Its noise exceeds a step, so that the rounding error of a joint at rest is white."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("encoder", [FINE, TRACKED], ids=["filtered", "tracking"])
 def test_the_noise_of_measured_levels_is_that_of_many_samples(encoder, rng):
     """Against the standard deviation of 40,000 readings of a drive at rest, rounding included."""
@@ -164,6 +165,7 @@ def with_noise_in_the_current():
     return loop(DRIVE, sensor=sensor, observer=observer)
 
 
+@pytest.mark.slow
 def test_noise_through_a_level_observer_is_reported():
     scenario = with_noise_in_the_current()
     with pytest.warns(UserWarning, match="LevelObserver amplifies the sensor's noise"):

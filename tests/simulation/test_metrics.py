@@ -27,6 +27,7 @@ def recorded(short_run):
 RECORDED = ("t", "q", "tau", "e1", "xi", "lower", "upper", "disturbance", "disturbance_estimate")
 
 
+@pytest.mark.slow
 def test_integrals_and_peaks(short_run, recorded):
     r, dt = recorded
     metrics, size, t = short_run.metrics, np.abs(r["e1"]), r["t"][:, None]

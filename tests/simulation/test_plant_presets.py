@@ -55,6 +55,7 @@ def test_documented_durations_steps_and_assumptions(name):
     assert "ASSUMPTION" in text
 
 
+@pytest.mark.slow
 def test_the_presets_of_plants_are_all_tested_here():
     robots = {"zhang_yan_2024", "printed_gap", "ur5", "iiwa14"}
     others = {x for x in ij.presets.PRESETS if not x.startswith("zhang_yan_2024_")}

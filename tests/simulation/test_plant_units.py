@@ -114,6 +114,7 @@ def test_metrics_have_the_units_of_the_plant(pendulum_run, body_run):
     assert "m, m, rad" in repr(body_run.metrics)
 
 
+@pytest.mark.slow
 def test_signals_have_the_units_and_names_of_the_plant(pendulum_run):
     scenario = pendulum_run.scenario
     assert signal_unit(scenario, "tau") == "V"

@@ -203,6 +203,7 @@ def test_the_recommended_step_is_that_of_a_noisy_mode():
         ij.recommended_dt(scenario, duration=1.0)
 
 
+@pytest.mark.slow
 def test_a_divided_step_has_the_increment_of_the_step():
     scenario, dt = canonical(link(process_noise.Additive(1.0))), jnp.asarray(0.1)
     times = jnp.asarray([0.13, 0.16])
@@ -272,6 +273,7 @@ def test_moments_of_an_ornstein_uhlenbeck_process(study):
     assert np.all(np.abs(ends_of_runs.var(axis=0) / exact - 1) < 4 * np.sqrt(2 / count) + 0.02)
 
 
+@pytest.mark.slow
 def test_runs_do_not_depend_on_chunks_or_the_number_of_runs(study):
     other = make_study(runs=300, executor=ij.studies.LocalExecutor(chunk=256))
     for name in ("end_q", "end_dq", "first_exit_time"):

@@ -148,6 +148,7 @@ def agree(scenario, program, duration=0.3, dt=5e-4, q=1e-7, tau=1e-5):
     return run
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay", [0.0, pytest.param(3.7e-3, marks=pytest.mark.slow)])
 def test_a_disturbance_that_jumps_between_samples_is_that_of_an_independent_program(delay):
     """In steps as long as the period: the jump is within one, where its error was 5e-3 rad and its

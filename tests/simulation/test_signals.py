@@ -21,6 +21,7 @@ def loop(*above: ij.Bounds | None) -> ij.Scenario:
     return ij.with_parts(base, controller=law, bounds=(base.bounds[0], *above))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("above", [(), (limits(9.0),), (None, limits(90.0))])
 def test_views_are_rows_and_bounds_end_with_the_last_level_that_has_some(above):
     run = ij.simulate(loop(*above), **SHORT)

@@ -55,6 +55,7 @@ def test_the_equilibrium(page):
     assert np.all(np.real(page["modes"]) < 0)
 
 
+@pytest.mark.slow
 def test_scipy_agrees_with_an_independent_program(paper, reference_data):
     from scipy.integrate import solve_ivp
 

@@ -73,6 +73,7 @@ def test_the_text_says_what_was_held_equal(comparison):
     assert "integral form" not in repr(without)
 
 
+@pytest.mark.slow
 def test_margins_of_the_start_are_said_to_be_those(comparison):
     words = "those of the start (at t = 0) in every run"
     assert repr(comparison).count(words) == 2
@@ -88,6 +89,7 @@ def test_margins_of_the_start_are_said_to_be_those(comparison):
     assert words not in " ".join(closer.notes["gains"])
 
 
+@pytest.mark.slow
 def test_the_table_is_the_metrics_of_the_runs(comparison):
     row, run = comparison.table["gains"][1], comparison.rollouts["log"]
     assert row.law == "log"
@@ -99,6 +101,7 @@ def test_the_table_is_the_metrics_of_the_runs(comparison):
     assert frame.shape == (6, 10)
 
 
+@pytest.mark.slow
 def test_a_metric_replaces_the_standard_one_of_its_class(comparison):
     folds = (ij.metrics.Settling(tolerance=[0.02, 0.04]), ij.metrics.LyapunovValue())
     options = RUN | {"record_every": 1}

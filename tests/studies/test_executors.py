@@ -89,6 +89,7 @@ def test_a_lost_worker_ends_the_call_and_another_executor_resumes(error, table, 
     assert cases.table(store=path, executor=threads).identical(table)
 
 
+@pytest.mark.slow
 def test_errors_of_a_task_are_the_users(threads):
     """They are not taken for a lost worker."""
     with pytest.raises(ValueError, match="from the task"):

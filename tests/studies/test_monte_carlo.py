@@ -50,6 +50,7 @@ def test_chunk_changes_nothing(study, chunk):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("chunk", "together"), [(256, 1), (None, sizes.MAX_IN_FLIGHT)])
 def test_as_many_blocks_are_made_beside_each_other_as_are_in_flight(
     study, chunk, together, monkeypatch
@@ -211,6 +212,7 @@ def test_designs_fill_the_range_evenly(sampler):
 # --------------------------------------------------------------------------------- one run again
 
 
+@pytest.mark.slow
 def test_all_of_a_study_are_leaves(study):
     """Its setup too: it can be moved to the host, and goes through jit."""
     host = jax.tree.map(np.asarray, study)
@@ -516,6 +518,7 @@ def test_an_interrupted_study_ends_without_a_crash(what):
         assert time.monotonic() - begin < 30
 
 
+@pytest.mark.slow
 def test_growth_and_large_errors_of_single_runs_are_remarked(paper):
     sampled = dataclasses.replace(paper, sampling=ij.Sampling(period=1e-3))
     options = {"runs": 4, "duration": 0.01, "dt": 1e-3}

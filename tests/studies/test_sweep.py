@@ -72,6 +72,7 @@ def test_dataset_is_labelled(table):
     assert config["scenario"]["plant.mass"] == pytest.approx([2.0, 0.85])
 
 
+@pytest.mark.slow
 def test_points_are_the_studies_of_their_scenarios(table):
     """Common random numbers: run r of every point draws what run r of a study does."""
     for K2, kf in ((10.0, 20.0), (40.0, 10.0)):
@@ -85,6 +86,7 @@ def test_points_are_the_studies_of_their_scenarios(table):
         )
 
 
+@pytest.mark.slow
 def test_chunk_changes_nothing(table):
     assert cases.table(executor=ij.studies.LocalExecutor(chunk=700)).identical(table)
 
@@ -141,6 +143,7 @@ def test_bad_grids_are_refused(grid, more, message):
 # ---------------------------------------------------------------------------------------- stores
 
 
+@pytest.mark.slow
 def test_store_opens_with_xarray_and_load(written, table):
     xarray = pytest.importorskip("xarray")
     flat = xarray.open_zarr(written, chunks=None)
@@ -154,6 +157,7 @@ def test_a_finished_store_is_not_computed_again(finished, table, monkeypatch):
     assert cases.table(store=finished).identical(table)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -352,6 +356,7 @@ def test_a_description_that_is_wrong_is_refused(finished, change):
     assert len(str(caught.value)) < 600 + len(str(finished))
 
 
+@pytest.mark.slow
 def test_an_empty_grid_is_one_point():
     ways = {"controller.K2": ij.factor(ij.uniform(0.9, 1.1))}
     data = ij.sweep(ij.presets.zhang_yan_2024(), {}, perturbations=ways, runs=2, **cases.options())
@@ -443,6 +448,7 @@ def cut_in(monkeypatch, count, deed):
     monkeypatch.setattr(zarr.Array, "__setitem__", write)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 9, 25])
 def test_a_store_that_is_deleted_meanwhile_is_begun_anew(tmp_path, table, monkeypatch, count):
     """Noticed at the unit at hand; nothing of it stays that would be in the way of the same
@@ -570,6 +576,7 @@ def test_killed_after_a_unit_only_the_rest_is_computed(tmp_path, compiled, table
     assert computed == list(range(5, 12))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("number", "word"), [(signal.SIGINT, "Ctrl-C"), (signal.SIGTERM, "SIGTERM")]
 )

@@ -119,6 +119,7 @@ def test_broken_plants(make, words):
         assert word in str(caught.value)
 
 
+@pytest.mark.slow
 def test_states_may_be_given_for_a_plant_that_is_defined_in_a_part_of_the_space():
     tank = plant_of(drift=lambda t, x: jnp.stack([-jnp.sqrt(x[0]), -x[1]]))
     with pytest.raises(ContractError, match="not finite"):

@@ -107,6 +107,7 @@ class Gusts:
         return self.size * (1.0 + x[:1] ** 2)
 
 
+@pytest.mark.slow
 def test_process_noise_of_a_user():
     ij.testing.check_process_noise(Gusts(0.3))
     for methods, words in (
@@ -186,6 +187,7 @@ def test_broken_robots(methods, words):
     rejects(ij.testing.check_robot, arm(**methods), *words)
 
 
+@pytest.mark.slow
 def test_broken_reference_and_bound():
     kink = changed(
         ij.references.Sinusoid,
@@ -285,6 +287,7 @@ def test_broken_law():
     )
 
 
+@pytest.mark.slow
 def test_class_attributes_that_do_not_fit_the_law_are_found():
     """`gains` names fields, and a law that reads f_hat uses the observer."""
 
@@ -654,6 +657,7 @@ class FiniteBarrier:
         return tube.dq_d - (k1 - error.dk / error.k) * (q - tube.q_d)
 
 
+@pytest.mark.slow
 def test_a_barrier_that_is_finite_at_its_bound_is_refused():
     with pytest.raises(ij.testing.ContractError, match=r"V1 is finite at the bound: it is 0\.5 "):
         ij.testing.check_barrier(FiniteBarrier())

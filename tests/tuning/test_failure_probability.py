@@ -86,6 +86,7 @@ def test_the_most_likely_failure_fails_again(rare):
     )
 
 
+@pytest.mark.slow
 def test_the_words_of_a_result(rare):
     found, _, _ = rare
     text = repr(found)
@@ -116,6 +117,7 @@ def test_importance_sampling_and_monte_carlo_agree(scenario, rare):
     assert again.estimate == crude.estimate
 
 
+@pytest.mark.slow
 def test_the_same_bits_for_a_seed_whatever_the_chunks(scenario, rare):
     found, perturbations, _ = rare
     chunks = ij.studies.LocalExecutor(chunk=256)
@@ -265,6 +267,7 @@ def test_a_run_without_a_margin_fails(scenario, monkeypatch):
     assert found.excluded == 0
 
 
+@pytest.mark.slow
 def test_gradients_of_draws_that_cannot_be_run(scenario, monkeypatch):
     """A negative mass has no margin, and no search continues from it."""
     pieces_at = {}
@@ -280,6 +283,7 @@ def test_gradients_of_draws_that_cannot_be_run(scenario, monkeypatch):
     assert np.all(np.isnan(pieces_at["z"].margins[1]))
 
 
+@pytest.mark.slow
 def test_importance_sampling_without_failures_reports_subset_simulation(
     scenario, rare, monkeypatch
 ):
@@ -481,6 +485,7 @@ def test_leaves_of_a_group_have_the_same_draws(scenario):
         )
 
 
+@pytest.mark.slow
 def test_the_draws_near_failure_are_perturbations(scenario, rare):
     """All of the draws fail or nearly fail, and keep their leaves together."""
     found, _, _ = rare

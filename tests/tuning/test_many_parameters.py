@@ -186,6 +186,7 @@ def test_a_mini_batch_finds_the_optimum_of_all_runs_and_values_compare_all_of_th
     assert evaluate.candidates.index.shape == (1, 12)
 
 
+@pytest.mark.slow
 def test_a_search_by_mini_batches_continues_from_its_state_bit_by_bit():
     solver = Optax(optax.adamw(0.1), batch=5)
     evaluate = Bowls()
@@ -219,6 +220,7 @@ def test_a_mini_batch_without_the_worst_runs_warns(risk, warns):
     solver.step(evaluate, state, 0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "optimiser",
     [

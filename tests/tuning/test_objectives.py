@@ -218,6 +218,7 @@ def test_a_quantity_of_ones_own_passes():
     ij.testing.check_objective(ij.component(Square)(), duration=0.5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("methods", "words"),
     [

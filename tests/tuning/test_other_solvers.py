@@ -122,6 +122,7 @@ def test_its_gradients_are_those_of_its_values(arm, before, goal, kind):
         assert np.mean(fine) > 0.9
 
 
+@pytest.mark.slow
 def test_its_constraints_contain_what_the_requirements_are_violated_by(arm, before):
     study = of_worst_runs(before)
     programme, problem = programme_of(arm, study.pop("objective"), **study)
@@ -131,6 +132,7 @@ def test_its_constraints_contain_what_the_requirements_are_violated_by(arm, befo
     np.testing.assert_allclose(programme.excess(z), value.exact_excess[0] + TARGET_EXCESS)
 
 
+@pytest.mark.slow
 def test_one_point_costs_one_evaluation(arm, goal):
     programme, _ = programme_of(arm, goal)
     before = programme.evaluate.evaluations
@@ -151,6 +153,7 @@ def test_a_piece_that_no_gain_changes_is_no_constraint(arm, before):
     assert np.all(moved)
 
 
+@pytest.mark.slow
 def test_an_invalid_run_gives_finite_numbers(arm, goal):
     programme, _ = programme_of(arm, goal)
     real = programme.evaluate
@@ -183,6 +186,7 @@ def test_several_starts_end_at_the_best_of_their_ends(arm, goal, reference):
 # -------------------------------------------------------------------------------- populations
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [DifferentialEvolution, CMAES, Optuna])
 def test_a_search_that_was_stopped_goes_on_to_the_same_result(arm, goal, tmp_path, make):
     needs_its_package(make.name)
@@ -205,6 +209,7 @@ def test_a_search_that_was_stopped_goes_on_to_the_same_result(arm, goal, tmp_pat
     assert resumed.probes == whole.probes
 
 
+@pytest.mark.slow
 def test_other_random_numbers_are_left_alone(arm, goal):
     pytest.importorskip("cma")
     np.random.seed(3)

@@ -95,6 +95,7 @@ def test_the_perturbation_that_decides_is_found_with_its_side(paper, failing, si
     assert f"rank statistic {influence.statistic:.3g}" in str(found)
 
 
+@pytest.mark.slow
 def test_noise_is_seldom_called_an_influence(paper):
     """Failures without a cause: with a level of 5 %, 200 of them are explained 10 times at most on
     average."""

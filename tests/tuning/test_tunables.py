@@ -64,6 +64,7 @@ def test_one_number_for_all_joints_keeps_the_limits_of_each(lab):
     np.testing.assert_allclose([in_units(blocks, box.low), in_units(blocks, box.high)], [[1], [7]])
 
 
+@pytest.mark.slow
 def test_a_limit_that_is_infinite_cannot_be_tuned():
     arm = ij.with_parameters(ij.presets.ur5(), {"plant.effort": np.inf})
     with pytest.raises(ValueError, match=r"plant.effort.*finite numbers that tuning can start"):
@@ -93,6 +94,7 @@ def test_scales_of_a_start_that_leaves_its_bounds_are_announced():
     assert complete(goal, [4.0, 3.0], margin=0.1).terms[0].scale == 4.0
 
 
+@pytest.mark.slow
 def test_default_ranges_of_filters_keep_the_loop_stable(lab):
     for path in ("sensor.velocity.cutoff", "actuator.bandwidth"):
         low, high, (below, above) = ends(lab, path)
@@ -107,6 +109,7 @@ def test_default_ranges_of_filters_keep_the_loop_stable(lab):
     np.testing.assert_allclose(nyquist, np.pi / 2e-3)
 
 
+@pytest.mark.slow
 def test_a_cutoff_above_the_nyquist_frequency_starts_at_the_upper_end(lab):
     fast = ij.with_parameters(lab, {"sensor.velocity.cutoff": [400.0, 2000.0]})
     _, high, (_, above) = ends(fast, "sensor.velocity.cutoff")
@@ -127,6 +130,7 @@ def test_a_time_constant_has_a_lower_end_and_a_gain_an_upper_one(lab):
     assert ranges.sampled_too_slowly(below_it)
 
 
+@pytest.mark.slow
 def test_the_range_of_an_unstable_start_ends_close_to_it_and_says_so(lab):
     unstable = ij.with_parameters(lab, {"controller.K2": 20.0})
     assert ranges.sampled_too_slowly(unstable)
@@ -140,6 +144,7 @@ def test_the_range_of_an_unstable_start_ends_close_to_it_and_says_so(lab):
     assert box.reasons[0][1] == ranges.AT_START[ranges.BY_STEP]
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:sampling.period is a whole number")
 def test_the_period_is_a_multiple_of_the_step_within_what_loop_and_queue_allow(lab):
     low, high, (below, above) = ends(lab, "sampling.period")

@@ -980,6 +980,7 @@ def test_a_start_too_stiff_for_the_step_is_brought_in_or_refused(paper, monkeypa
         )
 
 
+@pytest.mark.slow
 def test_a_start_of_which_some_runs_are_too_stiff_says_how_many(nominal, monkeypatch):
     """The nominal run may be fine where some perturbed ones are not: dry friction of a narrow width
     is what no gain makes slower."""
@@ -1141,6 +1142,7 @@ class Halving(Adam):
         return state["rate"] < 0.2
 
 
+@pytest.mark.slow
 def test_a_solver_of_the_users_own(paper):
     best = ij.tune(paper, ["controller.k1"], objectives.tracking(), solver=Halving(), **SHORT)
     # It says that it has converged, but the gradient is not small.
@@ -1267,6 +1269,7 @@ def test_more_peaks_than_the_memory_holds_are_refused(paper, monkeypatch):
         ij.tune(paper, paths, goal, perturbations=perturbed, runs=200, **SHORT)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("runs", "share"), [(300, 0.3), (60, 0.1)])
 def test_a_share_of_many_runs_is_in_the_programme(runs, share):
     """All runs break g = z + 0.2 < 0, and the objective pulls z up: the step has to go down,

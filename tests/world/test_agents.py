@@ -210,6 +210,7 @@ REFUSED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", REFUSED)
 def test_refused_with_a_remedy(what):
     make, message = REFUSED[what]

@@ -78,6 +78,7 @@ def test_the_run_does_its_job():
     assert ij.recommended_dt(scenario, duration=RUN["duration"]) >= RUN["dt"]
 
 
+@pytest.mark.slow
 def test_bounds_are_inside_the_joint_limits(scenario):
     """Strictly, at every time; other below than above; and they move."""
     t = jnp.linspace(0.0, 120.0, 12001)
@@ -95,6 +96,7 @@ def test_bounds_are_inside_the_joint_limits(scenario):
     assert np.all(np.abs((q_d - lower) - (upper - q_d)).max(axis=0) > 0.05)
 
 
+@pytest.mark.slow
 def test_the_payload_is_in_the_plant_alone(name, scenario):
     assert float(scenario.plant.payload) > 0
     assert float(scenario.model.payload) == 0
@@ -262,6 +264,7 @@ def test_a_light_wrist_keeps_its_bounds_whatever_its_masses_are():
     assert float(np.min(study.metrics["margin"])) > 0.03
 
 
+@pytest.mark.slow
 def test_the_weight_makes_every_barrier_as_stiff_at_the_reference():
     """ds/de1 at e1 = 0 is that of the barrier: 2/k^2 of the integral one, 1 of the tangent."""
     for law, stiffness in (
@@ -304,6 +307,7 @@ def test_the_weight_is_that_of_the_nearer_bound_whichever_side_it_is_on():
         np.testing.assert_allclose(get(scenario, "controller.weight"), expected, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_weight_is_that_of_the_nearest_bound_of_a_short_motion():
     """A motion of 0.2 s comes nearest to its bounds at 0.1 s."""
     arm, k = arms.arm("ur5"), 0.15

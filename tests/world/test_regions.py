@@ -327,6 +327,7 @@ def test_starts_beyond_a_wall_are_told_from_violations():
         study.replay(int(np.flatnonzero(outside)[0]))
 
 
+@pytest.mark.slow
 def test_files_and_datasets_hold_them(alone):
     scenario = filtered(stepping())
     assert "[[regions]]" in scenario_to_toml(scenario)

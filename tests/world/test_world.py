@@ -80,6 +80,7 @@ def test_spline_passes_its_waypoints_and_rests_at_the_ends():
             )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("m", [1, 4])
 def test_spline_with_more_derivatives_rests_at_its_ends(m):
     """Its first m derivatives vanish at the ends, where the next one jumps."""

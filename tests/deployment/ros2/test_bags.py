@@ -378,6 +378,7 @@ def test_a_recorded_run_is_the_simulated_run(sensor, scenario, tmp_path):
     assert found.plot() is not None
 
 
+@pytest.mark.slow
 def test_the_law_of_a_recorded_run_has_its_own_period(scenario, tmp_path):
     """Joint states at 1 kHz, the law at 500 Hz: the signals change at every second row only."""
     run = ij.simulate(scenario, duration=0.2, dt=1e-3)
@@ -408,6 +409,7 @@ def test_another_law_or_origin_of_time_is_reported(scenario, tmp_path):
     np.testing.assert_allclose(found.alpha, run.alpha[250:], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_gaps_are_not_integrated(scenario, tmp_path):
     run = ij.simulate(scenario, duration=0.4, dt=PERIOD)
     t, q, dq, tau = (np.asarray(x) for x in (run.t, run.q, run.dq, run.tau))
@@ -564,6 +566,7 @@ def test_paths_that_are_no_recordings(scenario, tmp_path):
         read_log(tmp_path / "log.csv", scenario)
 
 
+@pytest.mark.slow
 def test_a_plant_in_strict_feedback_form_has_no_recorded_run(motion, tmp_path):
     t, q, _, tau = motion
     folder = write_bag(tmp_path / "bag", messages_of(t, NAMES, q, tau))

@@ -39,6 +39,7 @@ def test_the_joints_of_a_file_have_its_names_unless_others_are_given():
         plant_of(PAPER, file, ["elbow"])
 
 
+@pytest.mark.slow
 def test_a_robot_without_a_file_is_named():
     with pytest.raises(ValueError, match=r"plant: got 'Arm'.*--plant"):
         plant_of(ij.presets.ur5(), None, None)

@@ -115,6 +115,7 @@ def test_a_robot_answered_at_once_moves_as_in_cosimulate(scenario):
     assert int(rollout.status) == int(run.status)
 
 
+@pytest.mark.slow
 def test_a_motion_survives_its_file(tmp_path):
     motion = closed_with_law(robot(), PAPER, periods=5)
     motion.save(tmp_path / "motion.npz")

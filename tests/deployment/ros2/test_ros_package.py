@@ -52,6 +52,7 @@ def run(package) -> ij.Rollout:
     return ij.simulate(package.scenario, duration=2.0, dt=1e-3, record_every=10)
 
 
+@pytest.mark.slow
 def test_the_library_is_the_law_of_the_simulation(law, run):
     assert law.init(run.measured.q[0].tolist(), run.measured.dq[0].tolist())
     for k in range(len(run.t) - 1):
@@ -61,6 +62,7 @@ def test_the_library_is_the_law_of_the_simulation(law, run):
         np.testing.assert_allclose(torque, run.tau[k], rtol=1e-9, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_the_bounds_are_those_of_the_scenario(law, package):
     scenario = canonical(package.scenario)
     inputs = inputs_at_start(scenario)
@@ -186,6 +188,7 @@ def test_the_modules_need_neither_this_package_nor_jax(package):
                 assert str(node.module).split(".")[0] not in {"jax", "numpy"}
 
 
+@pytest.mark.slow
 def test_the_own_test_of_the_package_passes(package):
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "test"]
     environment = {"PYTHONPATH": str(package.modules), "PATH": "/usr/bin:/bin"}
@@ -324,12 +327,14 @@ def test_a_tied_gain_with_different_numbers_is_refused(tmp_path):
         ij.export(scenario, tmp_path / "arm", gains=gains, **ROS)
 
 
+@pytest.mark.slow
 def test_levels_beyond_q_and_dq_are_refused(tmp_path):
     scenario = ij.presets.motor_driven_two_link()
     with pytest.raises(ValueError, match=r"scenario.model: got .*a robot, whose state is q and q'"):
         ij.export(scenario, tmp_path / "arm", **ROS)
 
 
+@pytest.mark.slow
 def test_limits_are_those_of_the_model_and_not_above(tmp_path):
     scenario = ij.with_parts(ij.presets.iiwa14(), sampling=ij.Sampling(2e-3))
     scenario = canonical(scenario)
@@ -348,6 +353,7 @@ def test_limits_below_gravity_are_reported(tmp_path):
         ij.export(scenario, tmp_path, target="ros2", torque_limits=[1.0, 15.0])
 
 
+@pytest.mark.slow
 def test_ranges_without_limits_are_those_of_tune_and_not_simulated(package):
     with pytest.warns(UserWarning, match=r"controller.K2: the range .* default end.*simulated"):
         options = ros_options(canonical(package.scenario), ["controller.K2"], 100.0, "zero")
@@ -473,6 +479,7 @@ def test_hostile_names_of_joints_and_links_stay_text(case, named, tmp_path):
     subprocess.run(["c++", "-std=c++17", *flags, *include, source], check=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["a\nb", "a\tb", "a\0", "\x7f", "a\u2028b", "\ud83d", "a\u202eb", "x" * 501]
 )
