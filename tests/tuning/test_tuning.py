@@ -1104,7 +1104,7 @@ def test_signature_of_tune_is_short_and_solvers_fit_their_protocol():
     own = inspect.signature(ij.tune).parameters.keys() - {
         "runs_as"
     }  # which stands for five of them
-    assert len(own) <= 16
+    assert len(own) <= 17
     members = [name for name in vars(ij.tuning.Solver) if not name.startswith("_")]
     assert {"init", "step", "converged"} <= set(members)
     for name, solver in ij.tuning.SOLVERS.items():
@@ -1155,6 +1155,7 @@ def test_a_solver_of_the_users_own(paper):
         ('solver = "lbfgs"', {"solver": LBFGS()}),
         ('[tune.solver]\nkind = "sqp"\nstarts = 4', {"solver": SQP(starts=4)}),
         ("[tune.report]\nruns = 20\nseed = 5", {"report": ij.tuning.Report(20, 5)}),
+        ("confirm = 0.01", {"confirm": 0.01}),
     ],
 )
 def test_a_tuning_file_has_the_options_as_tables(tmp_path, table, expected):
