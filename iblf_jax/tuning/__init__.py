@@ -22,7 +22,7 @@ and validates the result on fresh runs.
 | `evaluation` | value and derivatives of the problem |
 | `solvers` | the contract `Solver`; `SQP`, `LBFGS`, `Adam`, `Optax`, and those of other libraries |
 | `starts`, `search`, `checkpoints` | where a search begins, its steps, its stored state |
-| `optimality` | multipliers and residuals at the returned gains |
+| `optimality`, `kinks` | multipliers and residuals at the returned gains, also where slopes jump |
 | `result`, `report` | what `tune` returns, and its validation on fresh runs |
 | `samples`, `failures`, `step_check` | runs for the report, why fresh runs failed, and dt / 2 |
 | `confirmation` | fresh runs that show how seldom the tuned gains fail |

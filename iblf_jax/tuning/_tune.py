@@ -95,9 +95,10 @@ def tune(
         subject to  the requirements and the ranges of the parameters
 
     With the default solver and effort, the tuning evaluates 1,024 points besides the scenario's
-    gains without derivatives.  It begins searches at up to 32 of these points; after every five
-    steps the better third of them continues.  This takes about 260 evaluations with derivatives,
-    and more if the search finds no gains that keep the requirements, or if it does not converge.
+    gains without derivatives.  It begins searches at up to 32 of these points, of which those that
+    differ continue after five steps, and the better third of these after every five further ones.
+    This takes about 350 evaluations with derivatives, and more if the search finds no gains that
+    keep the requirements, or if it does not converge.
 
     The requirements of the result are evaluated again at half the time step.  If one of them is
     then broken by more than `step_check.STEP_TOLERANCE`, a short search at dt / 2 follows, and its
