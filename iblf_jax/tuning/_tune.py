@@ -175,7 +175,7 @@ def tune(
         confidence = setup.report.confidence
         confirmation = confirmation_of(confirm, confidence, problem.objective, problem.options)
     solver, mode = chosen_solver(options.solver, problem.size)
-    search = search_of(problem, solver, mode, options.effort)
+    search = search_of(problem, solver, mode, options.effort, options.show)
     stopped = _run(search, mode, options.effort.iterations, checkpoint, options)
     if not np.any(np.isfinite(search.state.incumbent_key)):
         raise problem.unstable_error()
@@ -188,12 +188,15 @@ def tune(
     return _result(outcomes, setup, confirmation, mode=mode, seconds=seconds)
 
 
-def search_of(problem: TuningProblem, solver: Solver, mode: str, effort: Effort) -> Search:
+def search_of(
+    problem: TuningProblem, solver: Solver, mode: str, effort: Effort, show: bool | None = False
+) -> Search:
     """The search with its starting points and, if the solver leaves the number of starts open, a
     `Strategy` for several phases.
 
     Values are evaluated before the derivatives are compiled, so that an error is raised early.
-    With a checkpoint the starting points are determined again; they are the same as before.
+    With a checkpoint the starting points are determined again; they are the same as before.  A bar
+    shows the points, unless `show` is False, and what will follow.
     """
     starts = solver.starts or number_of_starts(effort.starts, problem.runs, solver)
     checks.fits_memory("starts", starts, 8.0 * problem.size * NUMBERS_A_RUN)
@@ -201,7 +204,9 @@ def search_of(problem: TuningProblem, solver: Solver, mode: str, effort: Effort)
     strategy = None
     if solver.starts is None:
         count = min(effort.values, MAX_SCREENED_RUNS // problem.runs)
-        screening = screen(problem, count, seed)
+        with bar(show, count + 1, unit="points") as shown:
+            shown.set_description(_cost_in_words(problem, count + 1, starts, effort))
+            screening = screen(problem, count, seed, shown.update)
         z = _chosen_starts(problem, screening, starts)
         strategy = Strategy(screening, effort.selection, len(z))
     else:
@@ -218,6 +223,15 @@ def search_of(problem: TuningProblem, solver: Solver, mode: str, effort: Effort)
     search = Search(evaluate, solver, z, strategy)
     search.retire(slice(starts_used, None))
     return search
+
+
+def _cost_in_words(problem: TuningProblem, points: int, starts: int, effort: Effort) -> str:
+    """What a search will evaluate, without and with derivatives."""
+    of_runs = f" of {problem.runs} runs" if problem.runs > 1 else ""
+    return (
+        f"{points:,} points{of_runs} without derivatives, then {starts} starts{of_runs} with them,"
+        f" up to {effort.iterations} steps"
+    )
 
 
 def _chosen_starts(problem: TuningProblem, screening: Screening, starts: int) -> np.ndarray:

@@ -72,12 +72,16 @@ class Screening(NamedTuple):
         return np.argsort(self.objective + weight * self.excess, kind="stable")
 
 
-def screen(problem: TuningProblem, count: int, seed: int) -> Screening:
-    """Evaluates the scenario's gains, the first point, and `count` further points."""
+def screen(
+    problem: TuningProblem, count: int, seed: int, advance: Callable[[int], object]
+) -> Screening:
+    """Evaluates the scenario's gains, the first point, and `count` further points; `advance` is
+    called with the number of points of each group.
+    """
     points = problem.box.z[None]
     if count:
         points = np.concatenate([points, spread_points(problem.box, count, seed)])
-    return ranked(points, values(problem, points))
+    return ranked(points, values(problem, points, advance))
 
 
 def ranked(points: np.ndarray, found: Value) -> Screening:

@@ -27,7 +27,7 @@ from iblf_jax.files.tuning import load_tuning_file
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.metrics import standard
 from iblf_jax.simulation.scenario import canonical
-from iblf_jax.tuning import LBFGS, SQP, Adam, Report, evaluation, starts
+from iblf_jax.tuning import LBFGS, SQP, Adam, Report, _tune, evaluation, starts
 from iblf_jax.tuning.checkpoints import load_checkpoint, save_checkpoint
 from iblf_jax.tuning.conflicts import conflicts_in_words
 from iblf_jax.tuning.evaluation import Derivatives, Evaluator, Value
@@ -39,6 +39,7 @@ from iblf_jax.tuning.ranges import BY_STEP, BY_THEOREM, STABILITY_FRACTION, TIME
 from iblf_jax.tuning.result import STUCK
 from iblf_jax.tuning.robust import Risk, combine
 from iblf_jax.tuning.rollouts import fold_of
+from iblf_jax.tuning.runs import in_groups
 from iblf_jax.tuning.search import REPAIR, Search, SearchState, Strategy
 from iblf_jax.tuning.solvers import Constraints, SearchSpace, quadratic, sqp
 from iblf_jax.tuning.solvers.sqp import subproblem
@@ -990,6 +991,18 @@ def test_only_active_starts_are_evaluated_in_groups_of_one_shape(nominal, most, 
         found.value.loss, np.where(evaluator.active, np.arange(20.0), np.inf)
     )
     np.testing.assert_array_equal(found.value.valid, evaluator.active)
+
+
+def test_a_bar_states_what_a_search_will_evaluate_and_counts_the_points():
+    problem = SimpleNamespace(runs=64)
+    text = _tune._cost_in_words(problem, 782, 6, ij.tuning.Effort())
+    assert text == (
+        "782 points of 64 runs without derivatives, then 6 starts of 64 runs with them, up to 60"
+        " steps"
+    )
+    counted = []
+    rows = in_groups(lambda rows: rows, 35, 16, counted.append)
+    assert counted == [16, 16, 3] and rows.tolist() == list(range(35))
 
 
 @pytest.mark.slow
