@@ -92,7 +92,8 @@ class Effort:
     All starts take `selection` steps, those that have not come near a better one take as many
     again, the better third of these takes as many again, and so on until the best one is left.
     Until then a search takes at most 405 evaluations with derivatives with the defaults: five steps
-    each of 32, 32, 11, 4 and 2 starts.
+    each of 32, 32, 11, 4 and 2 starts.  In problems of twelve gains or more, two thirds of points
+    and starts are those of a first search, and one third those of a second one around its result.
 
     Args:
       values: number of points that are evaluated without derivatives to find the starts.  With many

@@ -115,7 +115,7 @@ class TuneResult(Result):
     coordinates and in the units of the gains); evaluations is (steps,).
 
     With requirements there may be more rows than starts, as a later phase may begin at more points.
-    A row that takes no step is invalid there.  The second search uses the first two rows."""
+    A row that takes no step is invalid there.  The second search uses the first rows."""
     best_start: int
     """The column of the history with the start that found the result."""
     stopped: str

@@ -31,6 +31,9 @@ Phases.  A search with a `Strategy` has up to three phases:
    converged, or after REPAIR_STEPS steps.
 3. SECOND_SEARCH, if phase 2 found a feasible point, or if phase 1 found one but did not converge.
    It begins at the incumbent and at the best screened point that is far from all earlier starts.
+   With `Strategy.second_points` it always follows a feasible point, and begins at the best of so
+   many further points instead, which are spread around the incumbent as those of phase 1 around the
+   scenario's gains: the best optimum is often near a good one.
 
 Every phase also ends after `patience` steps without a better result.  A search without a strategy
 has phase 1 only.
@@ -73,6 +76,7 @@ from iblf_jax.tuning.solvers._base import EXCESS_WEIGHT, violations
 from iblf_jax.tuning.solvers.sqp import STATIONARITY_TOLERANCE, Point
 from iblf_jax.tuning.starts import (
     FEW_POINTS,
+    WEIGHTS,
     Screening,
     distinct,
     is_near,
@@ -87,6 +91,8 @@ STEPS_PER_UPDATE = 12
 """Largest number of steps between two updates of the multipliers."""
 REPAIR_SEED_OFFSET = 1000
 """Added to the seed for the points that are evaluated in the phase REPAIR."""
+SECOND_SEED_OFFSET = 2000
+"""Added to the seed for the points that are evaluated before the phase SECOND_SEARCH."""
 MAX_UPDATES = 12
 """Largest number of updates of the multipliers in a stage."""
 PENALTY_FACTOR = 5.0
@@ -129,6 +135,11 @@ class Strategy(NamedTuple):
     starts: int
     """Number of starts in the first phase.  A search has more rows than that where a later phase
     may begin at more points."""
+    second_points: int = 0
+    """Number of points around the best gains that are evaluated before the phase SECOND_SEARCH."""
+    second_starts: int = 0
+    """Number of starts of this phase besides the best gains.  If it is 0, the phase follows only
+    where the first one did not converge."""
 
 
 @dataclasses.dataclass
@@ -345,17 +356,35 @@ class Search:
             # Only screened points or retired starts may be known in the valley of the incumbent.
             distance = np.max(np.abs(state.best_z - state.incumbent_z), axis=1)
             is_explored = bool(np.any((distance <= SAME_VALLEY) & ~state.retired))
-            if stopped == "converged" and is_explored and self.conditions().hold:
+            is_last = self.strategy.second_starts == 0
+            if is_last and stopped == "converged" and is_explored and self.conditions().hold:
                 return False
-        # The second search begins at the incumbent and at the best screened point that is far from
-        # all earlier starts.
-        best = state.incumbent_z[None]
-        explored = np.concatenate([best, self.history["z"][0], state.best_z])
-        order = self.strategy.screening.order()
-        count = min(2, len(state.finished)) - 1
-        further = self._distinct(self.strategy.screening, order, count, explored)
-        self._begin_phase(SECOND_SEARCH, np.concatenate([best, further]))
+        self._begin_phase(SECOND_SEARCH, self._second_starts())
         return True
+
+    def _second_starts(self) -> np.ndarray:
+        """The incumbent, and the best of the points around it that differ; without such points, the
+        best screened point that is far from all earlier starts, (k, p).
+        """
+        assert self.strategy is not None
+        problem = self.evaluate.problem
+        best = self.state.incumbent_z[None]
+        if self.strategy.second_points:
+            box = dataclasses.replace(problem.box, z=best[0])
+            seed = int(problem.options.seed) + SECOND_SEED_OFFSET
+            points = spread_points(box, self.strategy.second_points, seed)
+            screening = ranked(points, self.evaluate.values(points))
+            orders = [screening.order(weight) for weight in WEIGHTS]
+            count = self.strategy.second_starts
+            explored = best
+        else:
+            screening = self.strategy.screening
+            orders = [screening.order()]
+            count = min(2, len(self.state.finished)) - 1
+            explored = np.concatenate([best, self.history["z"][0], self.state.best_z])
+        refused = problem.sampled_too_slowly
+        further = distinct(screening, orders, count, problem.box, refused, explored)
+        return np.concatenate([self.state.incumbent_z[None], further])
 
     def conditions(self) -> Conditions:
         """The optimality conditions at the incumbent, which is evaluated once more; determined once
@@ -527,16 +556,8 @@ class Search:
             return best
         starts = min(REPAIR_STARTS, len(self.state.finished)) - 1
         order = np.argsort(both.excess, kind="stable")
-        return np.concatenate([best, self._distinct(both, order, starts, best)])
-
-    def _distinct(
-        self, screening: Screening, order: np.ndarray, count: int, others: np.ndarray
-    ) -> np.ndarray:
-        """`starts.distinct` with the ranges of this problem; empty where no point is requested."""
-        problem = self.evaluate.problem
-        if count == 0:
-            return np.zeros((0, problem.size))
-        return distinct(screening, [order], count, problem.box, problem.sampled_too_slowly, others)
+        further = distinct(both, [order], starts, problem.box, problem.sampled_too_slowly, best)
+        return np.concatenate([best, further])
 
     def _valleys(self) -> np.ndarray:
         """Number of valleys in which the starts ended or were retired, and number of starts in the
@@ -557,10 +578,9 @@ class Search:
         """Retires starts after every `selection` steps of the phase: those that have come near a
         better one, as they will end where that one ends, and all but the better third.
 
-        In the first phase the better third is only determined from the second time on, as the
-        order of the starts says little after the first steps: on a problem of six gains the only
-        start that ended in the best valley was the 23rd of 32 then, and the first one of all at
-        the second selection.
+        The better third is only determined from the second time on, as the order of the starts
+        says little after the first steps: on a problem of six gains the only start that ended in
+        the best valley was the 23rd of 32 then, and the first one at the second selection.
         """
         state = self.state
         if self.strategy is None or state.phase == REPAIR:
@@ -573,7 +593,7 @@ class Search:
         for s in order:
             if not np.any(is_near(state.best_z[kept], state.best_z[s], box)):
                 kept.append(s)
-        if state.phase != OPTIMISE or state.phase_steps > self.strategy.selection:
+        if state.phase_steps > self.strategy.selection:
             kept = kept[: checks.ceil_div(len(order), KEPT)]
         self.retire(sorted(set(order) - set(kept)))
 

@@ -40,7 +40,7 @@ from iblf_jax.tuning.result import STUCK
 from iblf_jax.tuning.robust import Risk, combine
 from iblf_jax.tuning.rollouts import fold_of
 from iblf_jax.tuning.runs import in_groups
-from iblf_jax.tuning.search import REPAIR, Search, SearchState, Strategy
+from iblf_jax.tuning.search import REPAIR, SECOND_SEARCH, Search, SearchState, Strategy
 from iblf_jax.tuning.solvers import Constraints, SearchSpace, quadratic, sqp
 from iblf_jax.tuning.solvers.sqp import subproblem
 from iblf_jax.tuning.starts import (
@@ -487,6 +487,28 @@ def test_a_search_from_several_starts_goes_on_in_the_deeper_valley():
     assert search.state.retired.sum() >= 2 and search.state.phase == 0
     found = search.conditions()
     assert found.hold and np.max(np.abs(found.residuals)) < 1e-3
+
+
+def test_a_second_search_begins_at_the_best_gains_and_at_the_best_points_around_them():
+    box = Box(np.full(7, 0.5), np.full(7, -4.0), np.full(7, 4.0))
+    starts = np.stack([np.full(7, x) for x in (0.5, 1.9)])
+    evaluate = Counted(SearchSpace(box, Constraints.of((1,), (0.0,), 1)), 4)
+    screening = ranked(starts, Valleys()(starts).value)
+    strategy = Strategy(screening, 2, len(starts), second_points=60, second_starts=3)
+    search = Search(evaluate, SQP(), starts[np.array([0, 1, 1, 1])], strategy)
+    begun = []
+
+    def note(search):
+        if search.state.phase == SECOND_SEARCH:
+            begun.append((search.history["z"][-1], search.state.best_key.copy()))
+
+    assert search.run(60, note) == "converged"
+    assert search.state.plain_values == 2 + 60
+    z = begun[0][0]
+    np.testing.assert_allclose(z[0], np.ones(7), atol=1e-3)
+    distances = np.max(np.abs(z - z[0]), axis=1)
+    assert np.all(distances[1:] >= 1.0) and np.all(np.isfinite(begun[0][1]))
+    assert search.state.incumbent_key[1] == pytest.approx(Valleys.DEEP)
 
 
 def test_starts_that_come_near_a_better_one_end_first_and_then_all_but_the_better_third():
