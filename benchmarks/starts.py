@@ -105,7 +105,7 @@ def adaptive_network() -> Problem:
 
 PROBLEMS: dict[str, Callable[[], Problem]] = {
     "two links, tan (6)": lambda: Problem(
-        two_links("tan"), ["controller.k1", "controller.K2", "observer.kf"], 0.85, 0.9
+        two_links("tan"), ["controller.k1", "controller.K2", "observer.kf"], 1.0, 0.9
     ),
     "two links, low torque, late error (4)": lambda: Problem(
         two_links("integral"),

@@ -60,7 +60,7 @@ PAGES: dict[str, tuple[str, str]] = {
             "tune TuneResult tunable pareto ParetoFront falsify WorstCase cvar tune_file"
             " tuning.SQP tuning.LBFGS tuning.Adam tuning.Optax tuning.SLSQP"
             " tuning.TrustConstr tuning.DifferentialEvolution tuning.CMAES tuning.Optuna tuning.Uno"
-            " tuning.Report tuning.Solver"
+            " tuning.Report tuning.Confirmation tuning.Solver"
         ),
     ),
     "objectives": (

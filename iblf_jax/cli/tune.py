@@ -17,7 +17,8 @@ DESCRIPTION = (
 )
 EPILOG = (
     "Exit code 1 if a bound is violated (more often than a requirement allows, if there is one), a"
-    " requirement failed, also at half the time step, or the objective did not decrease."
+    " requirement failed, also at half the time step, the objective did not decrease, or the claim"
+    " `confirm` of the file was not confirmed."
 )
 
 
@@ -78,7 +79,8 @@ def run(args: argparse.Namespace) -> int:
         (folder / "report.txt").write_text(f"{result.report}\n{result}\n", encoding="utf-8")
         plotting.save({"tuning": result.plot()}, folder, formats=("png",))
         print(f"\nwritten to {folder}: scenario.toml, tuning.npz, report.txt, tuning.png")
-    return int(_has_failed(result.report))
+    is_refuted = result.confirmation is not None and not result.confirmation.is_confirmed
+    return int(is_refuted or _has_failed(result.report))
 
 
 def _has_failed(report: TuningReport) -> bool:

@@ -85,6 +85,7 @@ RECORDS: dict[str, tuple[str, str]] = {
     "Change": ("tuning.report", "Change"),
     "ChainLevelState": ("proofs.chains", "ChainLevelSetState"),
     "Comparison": ("studies.comparison", "Comparison"),
+    "Confirmation": ("tuning.confirmation", "Confirmation"),
     "Counterexample": ("certificates._counterexample", "Counterexample"),
     "EffortSearch": ("studies.equal_effort", "EffortSearch"),
     "Explanation": ("engine.explain", "Explanation"),

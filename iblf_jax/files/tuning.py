@@ -6,7 +6,7 @@ is that of a study file (`files.study`):
     preset = "zhang_yan_2024"
     [run]                                   # duration, dt, method
     duration = 5.0
-    [tune]                                  # runs, seed, risk, level, effort of `tune`
+    [tune]                                  # runs, seed, risk, level, effort, confirm of `tune`
     parameters = [
       "controller.k1",
       { path = "controller.K2", low = 0.6, high = 40.0, tied = true },
@@ -105,7 +105,7 @@ HISTORY = dict.fromkeys(
     "evaluations": "iu",
 }
 """Name of an array in the history of a result -> the kinds of number that it may have."""
-ARGUMENTS = ("runs", "seed", "backend")
+ARGUMENTS = ("runs", "seed", "backend", "confirm")
 """Keys of [tune] besides `parameters`, `risk`, `level`, `solver`, `effort` and `report`."""
 
 
@@ -413,5 +413,7 @@ def _decoded(data: dict[str, Any], modules: Mapping[str, Any] | None) -> TuneRes
         probes=checks.positive_integer("probes", data["probes"], least=0),
         objective=_tuned_objective(data, history),
         tried=tuple(checks.string("tried", x, "a string") for x in data.get("tried", ())),
-        **words,
+        stopped=words["stopped"],
+        optimiser=words["optimiser"],
+        mode=words["mode"],
     )

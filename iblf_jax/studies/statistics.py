@@ -94,6 +94,18 @@ def probability(
     return Probability(count / runs, low, high, confidence, count, runs, method)
 
 
+def runs_without_event(limit: float, confidence: float) -> int:
+    """The smallest number of independent runs that show, if the event occurs in none of them, that
+    its probability is below a limit: the upper end of the two-sided Clopper-Pearson interval is at
+    most the limit.
+
+    Args:
+      limit: in (0, 1).
+      confidence: of the interval.
+    """
+    return int(np.ceil(np.log((1 - confidence) / 2) / np.log1p(-limit)))
+
+
 def _replicate_interval(
     events: np.ndarray, valid: np.ndarray, confidence: float, sampler: str, replicates: int
 ) -> tuple[float | None, float | None, str]:

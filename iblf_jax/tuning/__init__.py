@@ -22,9 +22,10 @@ and validates the result on fresh runs.
 | `evaluation` | value and derivatives of the problem |
 | `solvers` | the contract `Solver`; `SQP`, `LBFGS`, `Adam`, `Optax`, and those of other libraries |
 | `starts`, `search`, `checkpoints` | where a search begins, its steps, its stored state |
-| `optimality` | multipliers and residuals at the returned gains |
+| `optimality`, `kinks` | multipliers and residuals at the returned gains, also where slopes jump |
 | `result`, `report` | what `tune` returns, and its validation on fresh runs |
 | `samples`, `failures`, `step_check` | runs for the report, why fresh runs failed, and dt / 2 |
+| `confirmation` | fresh runs that show how seldom the tuned gains fail |
 | `_tune` | `tune`, which calls these in this order |
 | `_pareto`, `_falsify` | fronts of two objectives, and attacks on a result |
 | `_failure_probability`, `margins` | probabilities of rare failures, gradients of margins |
@@ -37,6 +38,7 @@ from iblf_jax.tuning._falsify import falsify as falsify
 from iblf_jax.tuning._pareto import ParetoFront as ParetoFront
 from iblf_jax.tuning._pareto import pareto as pareto
 from iblf_jax.tuning._tune import tune as tune
+from iblf_jax.tuning.confirmation import Confirmation as Confirmation
 from iblf_jax.tuning.failures import FailedRuns as FailedRuns
 from iblf_jax.tuning.options import Effort as Effort
 from iblf_jax.tuning.options import Report as Report

@@ -189,10 +189,18 @@ def value(problem: TuningProblem, candidates: Candidate) -> Value:
     return _values(problem, candidates, problem.rollouts(candidates))
 
 
-def values(problem: TuningProblem, z: np.ndarray) -> Value:
-    """The problem without derivatives at points z, (S, p), as NumPy arrays."""
+def values(
+    problem: TuningProblem, z: np.ndarray, advance: Callable[[int], object] = lambda points: None
+) -> Value:
+    """The problem without derivatives at points z, (S, p), as NumPy arrays; `advance` is called
+    with the number of points of each group.
+    """
     group = problem.points_together(len(z))
-    return in_groups(lambda rows: value(problem, problem.candidates(z[rows])), len(z), group)
+
+    def of_rows(rows: np.ndarray) -> Value:
+        return value(problem, problem.candidates(z[rows]))
+
+    return in_groups(of_rows, len(z), group, advance)
 
 
 @programs.jit

@@ -306,6 +306,13 @@ def depends_on_torque(objective: Objective) -> bool:
     )
 
 
+def tighter(objective: Objective, amounts: tuple[float, ...]) -> Objective:
+    """The objective with the limit of each requirement tightened by an amount of its scale."""
+    pairs = zip(objective.requirements, amounts, strict=True)
+    requirements = (dataclasses.replace(r, limit=r.limit - x * r.scale) for r, x in pairs)
+    return dataclasses.replace(objective, requirements=tuple(requirements))
+
+
 def fitted(objective: Objective, scenario: Scenario) -> Objective:
     """The objective for the joints and signals of a scenario.
 

@@ -8,7 +8,7 @@ At a minimum of f subject to G_r <= 0 there are multipliers y_r >= 0 with
 The largest value of a signal over time has kinks: where two peaks are equally large its gradient
 jumps.  An optimum may be at a kink.  The conditions then hold only with the gradients of both
 peaks.  One evaluation gives the gradient of one peak; that of the other one is known from a
-rejected trial of the solver nearby.
+rejected trial of the solver nearby, or from random points around (`kinks`).
 
 If no feasible gains are known, the conditions are those of the smallest largest excess:
 

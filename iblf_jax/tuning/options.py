@@ -89,9 +89,11 @@ class Report:
 class Effort:
     """How much a tuning evaluates at most.
 
-    All starts take `selection` steps, the better third of them takes as many again, and so on
-    until the best one is left.  Until then a search takes at most 245 evaluations with derivatives
-    with the defaults: five steps each of 32, 11, 4 and 2 starts.
+    All starts take `selection` steps, those that have not come near a better one take as many
+    again, the better third of these takes as many again, and so on until the best one is left.
+    Until then a search takes at most 405 evaluations with derivatives with the defaults: five steps
+    each of 32, 32, 11, 4 and 2 starts.  In problems of twelve gains or more, two thirds of points
+    and starts are those of a first search, and one third those of a second one around its result.
 
     Args:
       values: number of points that are evaluated without derivatives to find the starts.  With many
@@ -101,7 +103,8 @@ class Effort:
         six.
       iterations: largest number of steps of the solver in each phase of the search.  A step
         evaluates every start that is still active.
-      selection: number of steps after which the better third of the starts continues.
+      selection: number of steps after which starts near better ones end, and from the second time
+        on all but the better third.
     """
 
     values: int = 1024

@@ -33,7 +33,12 @@ from iblf_jax.core.status import Status, has_flag
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.units import unit_text
-from iblf_jax.studies.statistics import Probability, probability, scalar_samples
+from iblf_jax.studies.statistics import (
+    Probability,
+    probability,
+    runs_without_event,
+    scalar_samples,
+)
 from iblf_jax.tuning.failures import (
     FailedRuns,
     FreshRuns,
@@ -133,7 +138,7 @@ class Verdict:
         if self.verdict != "undecided" or self.after.count or not self.allowed > 0:
             return text
         confidence = self.after.confidence
-        needed = int(np.ceil(np.log((1 - confidence) / 2) / np.log1p(-self.allowed)))
+        needed = runs_without_event(self.allowed, confidence)
         return (
             f"{text}; no run broke it, but {needed} such runs are needed to conclude that with"
             f" {confidence:.0%} confidence"

@@ -22,6 +22,7 @@ from iblf_jax.simulation.advice import advice_of
 from iblf_jax.simulation.metrics import as_folds
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical
+from iblf_jax.tuning.confirmation import Confirmation
 from iblf_jax.tuning.objectives import Objective, depends_on_torque
 from iblf_jax.tuning.options import Report, TuningRunOptions
 from iblf_jax.tuning.quantities import Quantities
@@ -114,7 +115,7 @@ class TuneResult(Result):
     coordinates and in the units of the gains); evaluations is (steps,).
 
     With requirements there may be more rows than starts, as a later phase may begin at more points.
-    A row that takes no step is invalid there.  The second search uses the first two rows."""
+    A row that takes no step is invalid there.  The second search uses the first rows."""
     best_start: int
     """The column of the history with the start that found the result."""
     stopped: str
@@ -148,6 +149,8 @@ class TuneResult(Result):
     """What the search did, in words: number of starts, number of valleys (regions around one local
     minimum) and further phases; if no evaluated gains keep the requirements, also which of them are
     never kept (see `conflicts`)."""
+    confirmation: Confirmation | None = None
+    """Fresh runs that show how seldom the tuned gains fail, if `tune` was called with `confirm`."""
 
     @property
     def is_violated(self) -> bool:
@@ -214,6 +217,8 @@ class TuneResult(Result):
                 f" complementarity {complementarity:.2g}; objective {self.objective:.5g})"
             )
         lines += self.tried
+        if self.confirmation is not None:
+            lines.append(str(self.confirmation))
         if objective.requirements and self.is_violated:
             lines.append(
                 "WARNING: these gains break the requirements as little as was found: loosen one,"
@@ -422,6 +427,8 @@ class TuneResult(Result):
             f" {self.evaluations} evaluations{probes}, {self.seconds:.3g} s; {self.stopped})"
         ]
         lines += [f"  {words}" for words in self._bounds_and_requirements()]
+        if self.confirmation is not None:
+            lines.append(f"  {self.confirmation}")
         for path, value in self.values.items():
             before = np.array2string(np.asarray(paths.get(self.start, path)), precision=5)
             lines.append(f"  {path}: {before} -> {np.array2string(np.asarray(value), precision=5)}")

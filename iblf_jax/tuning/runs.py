@@ -29,16 +29,29 @@ NUMBERS_A_RUN = 100
 stages, its folds."""
 
 
-def in_groups(function: Callable[[np.ndarray], Any], count: int, size: int) -> Any:
+def in_groups(
+    function: Callable[[np.ndarray], Any],
+    count: int,
+    size: int,
+    advance: Callable[[int], object] = lambda rows: None,
+) -> Any:
     """What a function of row numbers returns for rows 0 to `count` - 1, as NumPy arrays.
 
     It is called with `size` rows at a time, so that one shape is compiled; the last group is filled
     up with rows that it already has.
+
+    Args:
+      function: of row numbers, (size,).
+      count: number of rows.
+      size: number of rows of a group.
+      advance: called with the number of rows of each group once it is computed.
     """
     parts = []
     for first in range(0, count, size):
-        rows = np.resize(np.arange(first, min(first + size, count)), size)
+        own = min(size, count - first)
+        rows = np.resize(np.arange(first, first + own), size)
         parts.append(jax.tree.map(np.asarray, function(rows)))
+        advance(own)
     return jax.tree.map(lambda *x: np.concatenate(x)[:count], *parts)
 
 

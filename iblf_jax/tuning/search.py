@@ -31,13 +31,16 @@ Phases.  A search with a `Strategy` has up to three phases:
    converged, or after REPAIR_STEPS steps.
 3. SECOND_SEARCH, if phase 2 found a feasible point, or if phase 1 found one but did not converge.
    It begins at the incumbent and at the best screened point that is far from all earlier starts.
+   With `Strategy.second_points` it always follows a feasible point, and begins at the best of so
+   many further points instead, which are spread around the incumbent as those of phase 1 around the
+   scenario's gains: the best optimum is often near a good one.
 
 Every phase also ends after `patience` steps without a better result.  A search without a strategy
 has phase 1 only.
 
 Retired starts.  A start that is `finished` takes no steps until the smoothing changes or a phase
 begins; a start that is `retired` is finished and takes no steps in the rest of its phase.  Starts
-are retired in three places: `_select` keeps the better third after every `selection` steps of a
+are retired in three places: `_select` keeps the better ones after every `selection` steps of a
 phase, `_next_stage` keeps the better half at each stage, and `_begin_phase` retires all starts of
 the previous phase.  Rows that only fill up a batch are retired before the first step.  Starts that
 take no step cost only the rows that fill the last group of the others (`Evaluator`).
@@ -54,16 +57,29 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.tuning.evaluation import Derivatives, Evaluator, Value
+from iblf_jax.tuning.kinks import (
+    FIRST_REACH,
+    FRACTIONS,
+    IMPROVEMENT,
+    LEAST_REACH,
+    MOST_ROUNDS,
+    SHRINK_FACTOR,
+    points_around,
+    step_between_kinks,
+)
 from iblf_jax.tuning.objectives import is_smoothed, sharper
 from iblf_jax.tuning.optimality import Conditions, conditions, conditions_of_penalty
 from iblf_jax.tuning.parameters import along
 from iblf_jax.tuning.problem import FIRST_PENALTY
 from iblf_jax.tuning.solvers import SQP, SearchSpace, Solver
 from iblf_jax.tuning.solvers._base import EXCESS_WEIGHT, violations
+from iblf_jax.tuning.solvers.sqp import STATIONARITY_TOLERANCE, Point
 from iblf_jax.tuning.starts import (
     FEW_POINTS,
+    WEIGHTS,
     Screening,
     distinct,
+    is_near,
     ranked,
     spread_points,
 )
@@ -75,6 +91,8 @@ STEPS_PER_UPDATE = 12
 """Largest number of steps between two updates of the multipliers."""
 REPAIR_SEED_OFFSET = 1000
 """Added to the seed for the points that are evaluated in the phase REPAIR."""
+SECOND_SEED_OFFSET = 2000
+"""Added to the seed for the points that are evaluated before the phase SECOND_SEARCH."""
 MAX_UPDATES = 12
 """Largest number of updates of the multipliers in a stage."""
 PENALTY_FACTOR = 5.0
@@ -113,10 +131,15 @@ class Strategy(NamedTuple):
     screening: Screening
     """The points that were evaluated without derivatives."""
     selection: int
-    """Number of steps after which the better third of the starts continues, again and again."""
+    """Number of steps after which the better starts continue, again and again."""
     starts: int
     """Number of starts in the first phase.  A search has more rows than that where a later phase
     may begin at more points."""
+    second_points: int = 0
+    """Number of points around the best gains that are evaluated before the phase SECOND_SEARCH."""
+    second_starts: int = 0
+    """Number of starts of this phase besides the best gains.  If it is 0, the phase follows only
+    where the first one did not converge."""
 
 
 @dataclasses.dataclass
@@ -333,17 +356,35 @@ class Search:
             # Only screened points or retired starts may be known in the valley of the incumbent.
             distance = np.max(np.abs(state.best_z - state.incumbent_z), axis=1)
             is_explored = bool(np.any((distance <= SAME_VALLEY) & ~state.retired))
-            if stopped == "converged" and is_explored and self.conditions().hold:
+            is_last = self.strategy.second_starts == 0
+            if is_last and stopped == "converged" and is_explored and self.conditions().hold:
                 return False
-        # The second search begins at the incumbent and at the best screened point that is far from
-        # all earlier starts.
-        best = state.incumbent_z[None]
-        explored = np.concatenate([best, self.history["z"][0], state.best_z])
-        order = self.strategy.screening.order()
-        count = min(2, len(state.finished)) - 1
-        further = self._distinct(self.strategy.screening, order, count, explored)
-        self._begin_phase(SECOND_SEARCH, np.concatenate([best, further]))
+        self._begin_phase(SECOND_SEARCH, self._second_starts())
         return True
+
+    def _second_starts(self) -> np.ndarray:
+        """The incumbent, and the best of the points around it that differ; without such points, the
+        best screened point that is far from all earlier starts, (k, p).
+        """
+        assert self.strategy is not None
+        problem = self.evaluate.problem
+        best = self.state.incumbent_z[None]
+        if self.strategy.second_points:
+            box = dataclasses.replace(problem.box, z=best[0])
+            seed = int(problem.options.seed) + SECOND_SEED_OFFSET
+            points = spread_points(box, self.strategy.second_points, seed)
+            screening = ranked(points, self.evaluate.values(points))
+            orders = [screening.order(weight) for weight in WEIGHTS]
+            count = self.strategy.second_starts
+            explored = best
+        else:
+            screening = self.strategy.screening
+            orders = [screening.order()]
+            count = min(2, len(self.state.finished)) - 1
+            explored = np.concatenate([best, self.history["z"][0], self.state.best_z])
+        refused = problem.sampled_too_slowly
+        further = distinct(screening, orders, count, problem.box, refused, explored)
+        return np.concatenate([self.state.incumbent_z[None], further])
 
     def conditions(self) -> Conditions:
         """The optimality conditions at the incumbent, which is evaluated once more; determined once
@@ -379,7 +420,61 @@ class Search:
         nearby = []
         if isinstance(self.solver, SQP):
             nearby = self.solver.nearby_pieces(state.solver, z, KINK_REACH)
-        return conditions(self.evaluate, found, row, z, violated=self.is_violated, nearby=nearby)
+        result = conditions(self.evaluate, found, row, z, violated=self.is_violated, nearby=nearby)
+        is_examined = np.all(np.isfinite(result.residuals)) and len(result.multipliers) > 0
+        if result.hold or self.is_violated or not is_examined:
+            return result
+        holds = self._holds_at_kink()
+        if not np.array_equal(z, state.incumbent_z):
+            found = self._derivatives_at(row, state.incumbent_z)
+            result = conditions(
+                self.evaluate, found, row, state.incumbent_z, violated=False, nearby=[]
+            )
+        return result._replace(at_kink=holds and not result.are_small)
+
+    def _holds_at_kink(self) -> bool:
+        """Whether the conditions of an optimum hold with the gradients of points around the
+        incumbent, which is replaced by better ones that are found (see `kinks`).
+        """
+        state = self.state
+        box = self.evaluate.problem.box
+        rng = np.random.default_rng([int(self.evaluate.problem.options.seed), 5])
+        reach = FIRST_REACH
+        for _ in range(MOST_ROUNDS):
+            z = state.incumbent_z
+            objective = float(state.incumbent_key[1])
+            size = max(1e-3, abs(objective))
+            points = np.concatenate([z[None], points_around(box, z, reach, rng)])
+            here, *around = self._points_at(points)
+            valid = [
+                (x, point) for x, point in zip(points[1:], around, strict=True) if point.is_finite
+            ]
+            step = step_between_kinks(self.evaluate.space, z, here, valid, reach)
+            line = z + FRACTIONS[:, None] * step.step
+            self.evaluate.values(np.clip(line, box.low, box.high))
+            if objective - float(state.incumbent_key[1]) > IMPROVEMENT * size:
+                continue
+            if -step.change <= STATIONARITY_TOLERANCE * reach * size:
+                return True
+            reach *= SHRINK_FACTOR
+            if reach < LEAST_REACH:
+                break
+        return False
+
+    def _points_at(self, z: np.ndarray) -> list[Point]:
+        """The derivatives at any number of points, (N, p), which are candidates for the
+        incumbent.
+        """
+        rows = len(self.evaluate.active)
+        found = []
+        for first in range(0, len(z), rows):
+            some = z[first : first + rows]
+            derivatives = self._derivatives_at(np.arange(len(some)), some)
+            keys = _keys(derivatives.value)
+            for s in np.flatnonzero(derivatives.value.valid).tolist():
+                self._consider(some[s], keys[s])
+            found += [Point.of(self.evaluate.space, derivatives, s) for s in range(len(some))]
+        return found
 
     def _converged_near_incumbent(self) -> tuple[int, np.ndarray]:
         """The start that has converged nearest to the incumbent in its valley, and its point.
@@ -402,13 +497,17 @@ class Search:
         nearest = min(distances, key=distances.__getitem__)
         return nearest, converged[nearest]
 
-    def _derivatives_at(self, row: int, z: np.ndarray) -> Derivatives:
-        """The derivatives at one point, (p,), with the multipliers of one start and in its row."""
+    def _derivatives_at(self, rows: int | np.ndarray, z: np.ndarray) -> Derivatives:
+        """The derivatives at one point or several, (p,) or (k, p), with the multipliers of some
+        starts and in their rows.
+        """
         evaluate = self.evaluate
         before = evaluate.evaluations
         self._prepare_evaluation()
-        evaluate.active = np.arange(len(evaluate.active)) == row
-        found = evaluate(np.tile(z, (len(evaluate.active), 1)))
+        evaluate.active = np.isin(np.arange(len(evaluate.active)), rows)
+        points = np.tile(self.state.incumbent_z, (len(evaluate.active), 1))
+        points[rows] = z
+        found = evaluate(points)
         self.state.evaluations += evaluate.evaluations - before
         self.history["evaluations"][-1] = np.array(self.state.evaluations)
         return found
@@ -457,16 +556,8 @@ class Search:
             return best
         starts = min(REPAIR_STARTS, len(self.state.finished)) - 1
         order = np.argsort(both.excess, kind="stable")
-        return np.concatenate([best, self._distinct(both, order, starts, best)])
-
-    def _distinct(
-        self, screening: Screening, order: np.ndarray, count: int, others: np.ndarray
-    ) -> np.ndarray:
-        """`starts.distinct` with the ranges of this problem; empty where no point is requested."""
-        problem = self.evaluate.problem
-        if count == 0:
-            return np.zeros((0, problem.size))
-        return distinct(screening, [order], count, problem.box, problem.sampled_too_slowly, others)
+        further = distinct(both, [order], starts, problem.box, problem.sampled_too_slowly, best)
+        return np.concatenate([best, further])
 
     def _valleys(self) -> np.ndarray:
         """Number of valleys in which the starts ended or were retired, and number of starts in the
@@ -484,16 +575,27 @@ class Search:
         return np.asarray([count, of_best])
 
     def _select(self) -> None:
-        """Retires all but the better third of the starts, after every `selection` steps of the
-        phase.
+        """Retires starts after every `selection` steps of the phase: those that have come near a
+        better one, as they will end where that one ends, and all but the better third.
+
+        The better third is only determined from the second time on, as the order of the starts
+        says little after the first steps: on a problem of six gains the only start that ended in
+        the best valley was the 23rd of 32 then, and the first one at the second selection.
         """
-        if self.strategy is None or self.state.phase == REPAIR:
+        state = self.state
+        if self.strategy is None or state.phase == REPAIR:
             return
-        if self.state.phase_steps % self.strategy.selection:
+        if state.phase_steps % self.strategy.selection:
             return
-        remaining = np.flatnonzero(~self.state.retired).tolist()
-        order = sorted(remaining, key=self._rank)
-        self.retire(order[checks.ceil_div(len(order), KEPT) :])
+        order = sorted(np.flatnonzero(~state.retired).tolist(), key=self._rank)
+        kept: list[int] = []
+        box = self.evaluate.problem.box
+        for s in order:
+            if not np.any(is_near(state.best_z[kept], state.best_z[s], box)):
+                kept.append(s)
+        if state.phase_steps > self.strategy.selection:
+            kept = kept[: checks.ceil_div(len(order), KEPT)]
+        self.retire(sorted(set(order) - set(kept)))
 
     def _rank(self, start: int) -> float:
         """The merit of a start, the smaller the better: its objective relative to that of the

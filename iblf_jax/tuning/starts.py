@@ -72,12 +72,16 @@ class Screening(NamedTuple):
         return np.argsort(self.objective + weight * self.excess, kind="stable")
 
 
-def screen(problem: TuningProblem, count: int, seed: int) -> Screening:
-    """Evaluates the scenario's gains, the first point, and `count` further points."""
+def screen(
+    problem: TuningProblem, count: int, seed: int, advance: Callable[[int], object]
+) -> Screening:
+    """Evaluates the scenario's gains, the first point, and `count` further points; `advance` is
+    called with the number of points of each group.
+    """
     points = problem.box.z[None]
     if count:
         points = np.concatenate([points, spread_points(problem.box, count, seed)])
-    return ranked(points, values(problem, points))
+    return ranked(points, values(problem, points, advance))
 
 
 def ranked(points: np.ndarray, found: Value) -> Screening:
@@ -130,15 +134,10 @@ def distinct(
         long, so that no more points are tested than are needed.
       others: further points that the result must differ from, (k, p).
     """
-    distance = np.minimum(MIN_DISTANCE, 0.25 * (box.high - box.low))
     points = screening.points
     remaining = np.isfinite(screening.excess)
-
-    def leave_out_near(z: np.ndarray) -> None:
-        remaining[np.all(np.abs(points - z) < distance, axis=1)] = False
-
     for other in [] if others is None else others:
-        leave_out_near(other)
+        remaining &= ~is_near(points, other, box)
     chosen: list[np.ndarray] = []
     turns = itertools.cycle(orders)
     while len(chosen) < count and np.any(remaining):
@@ -147,8 +146,14 @@ def distinct(
         remaining[i] = False
         if not is_refused(points[i]):
             chosen.append(points[i])
-            leave_out_near(points[i])
+            remaining &= ~is_near(points, points[i], box)
     return np.array(chosen).reshape(-1, len(box.z))
+
+
+def is_near(points: np.ndarray, z: np.ndarray, box: Box) -> np.ndarray:
+    """Whether points, (N, p), are too near to z, (p,), for two starts of one search, (N,)."""
+    distance = np.minimum(MIN_DISTANCE, 0.25 * (box.high - box.low))
+    return np.all(np.abs(points - z) < distance, axis=1)
 
 
 def number_of_starts(starts: int, runs: int, solver: Solver) -> int:

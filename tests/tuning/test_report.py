@@ -14,7 +14,9 @@ import iblf_jax as ij
 from iblf_jax import objectives, reports
 from iblf_jax.cli.tune import _has_failed
 from iblf_jax.studies.statistics import probability
+from iblf_jax.tuning import confirmation
 from iblf_jax.tuning._tune import _tried
+from iblf_jax.tuning.confirmation import confirmation_of
 from iblf_jax.tuning.failures import (
     FailedRuns,
     FreshRuns,
@@ -27,6 +29,7 @@ from iblf_jax.tuning.options import Report, TuningRunOptions
 from iblf_jax.tuning.report import Change, ReportRequest, TuningReport, Verdict, make_report
 from iblf_jax.tuning.result import TuneResult, TuneSetup
 from iblf_jax.tuning.robust import Risk
+from iblf_jax.tuning.samples import Sample, SampleRequest
 from iblf_jax.tuning.step_check import (
     STEP_TOLERANCE,
     RequirementAtSteps,
@@ -431,6 +434,81 @@ def test_a_report_as_numbers_goes_through_json():
     assert first["requirement"] is None and second["requirement"] == "a"
     assert first["influence"]["statistic"] == 0.97 and first["first"] == [3, 8]
     assert numbers["headline"] == report.headline
+
+
+# ------------------------------------------------------------------------------------ confirmation
+
+
+def rounds_of(monkeypatch, failing, confirm=0.01, most=6):
+    """The rounds of a confirmation whose runs exceed the limit by `failing(round)`, (N,), and of
+    which every tenth cannot be run."""
+    goal = complete(objectives.tracking() + objectives.peak_torque_below(10.0), [1.0])
+    options = TuningRunOptions(**BRIEF, perturbations=DRAWS).checked()
+    found = confirmation_of(confirm, 0.95, goal, options)
+    request = SampleRequest(None, (), goal, options, 1e-3, 0, seed=7)
+
+    def sample_runs(request, scenarios):
+        excess = np.resize(failing(len(found.rounds)), request.runs)
+        exact = np.stack([np.ones(request.runs), 10.0 * (1 + excess), np.ones(request.runs)], 1)
+        status = np.zeros(request.runs, int)
+        return [Sample(exact, exact, status, excess, np.arange(request.runs) % 10 > 0)]
+
+    monkeypatch.setattr(confirmation, "sample_runs", sample_runs)
+    tightened = found.tightened
+    while tightened is not None:
+        found = found.after_round(request, None, tightened)
+        tightened = found.next_tightening
+    return found
+
+
+def test_fresh_runs_confirm_a_probability_and_tighten_what_failed(monkeypatch):
+    found = rounds_of(monkeypatch, lambda n: [-0.1] * 50 + [0.03 if n < 2 else -0.01])
+    assert found.is_confirmed and len(found.rounds) == len(set(found.seeds)) == 3
+    assert [x.count > 0 for x in found.rounds] == [True, True, False]
+    assert found.tightened == pytest.approx((2 * 2 * 0.03,))
+    assert str(found).startswith("confirmed with 95% confidence: a run fails with a probability")
+    assert "peak torque < 10 N m by 0.12" in str(found)
+    # Draws that cannot be run do not count: the claim has as many runs as it needs.
+    assert all(x.runs >= least for x, least in zip(found.rounds, (368, 437, 506), strict=True))
+    # The probability that gains which fail once in a hundred runs pass any round.
+    assert sum(0.99**least for least in (368, 437, 506)) < 0.05
+    refuted = rounds_of(monkeypatch, lambda n: [0.03])
+    assert not refuted.is_confirmed and len(refuted.rounds) == confirmation.MOST_ROUNDS
+    assert "NOT confirmed" in str(refuted)
+
+
+def test_a_confirmation_that_cannot_be_is_refused(paper):
+    goal = objectives.tracking() + objectives.peak_torque_below(10.0, allowed=0.02)
+    drawn = TuningRunOptions(**BRIEF, perturbations=DRAWS).checked()
+    for confirm, options, words in (
+        (1.5, drawn, "between 0 and 1"),
+        (0.05, TuningRunOptions(**BRIEF).checked(), "give perturbations"),
+        (0.01, drawn, "0.02 or more, which is the share that may break peak torque.*allowed=0.01"),
+        (1e-12, drawn, "ij.failure_probability"),
+    ):
+        limited = goal if confirm != 1e-12 else objectives.tracking() + objectives.effort()
+        with pytest.raises(ValueError, match=words):
+            confirmation_of(confirm, 0.95, limited, options)
+
+
+@pytest.mark.slow
+def test_gains_that_fail_in_fresh_runs_are_tightened_until_they_are_confirmed(paper, tmp_path):
+    """With four runs the torque is at its limit in one of them, and beyond it in others."""
+    best = ij.tune(
+        paper,
+        ["controller.K2"],
+        objectives.tracking() + objectives.peak_torque_below(12.0),
+        perturbations={"initial.q": ij.offset(ij.uniform(-0.01, 0.01))},
+        runs=4,
+        effort="quick",
+        confirm=0.02,
+        progress=False,
+        **BRIEF,
+    )
+    found = best.confirmation
+    assert found.is_confirmed and len(found.rounds) > 1 and found.tightened[0] > 0
+    assert best.report.verdicts[0].after.estimate < 0.02 and str(found) in str(best.report)
+    assert str(ij.load(best.save(tmp_path / "tuning")).confirmation) == str(found)
 
 
 # ----------------------------------------------------------------------------------- made from runs

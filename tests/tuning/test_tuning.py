@@ -27,7 +27,7 @@ from iblf_jax.files.tuning import load_tuning_file
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.metrics import standard
 from iblf_jax.simulation.scenario import canonical
-from iblf_jax.tuning import LBFGS, SQP, Adam, Report, evaluation, starts
+from iblf_jax.tuning import LBFGS, SQP, Adam, Report, _tune, evaluation, starts
 from iblf_jax.tuning.checkpoints import load_checkpoint, save_checkpoint
 from iblf_jax.tuning.conflicts import conflicts_in_words
 from iblf_jax.tuning.evaluation import Derivatives, Evaluator, Value
@@ -39,7 +39,8 @@ from iblf_jax.tuning.ranges import BY_STEP, BY_THEOREM, STABILITY_FRACTION, TIME
 from iblf_jax.tuning.result import STUCK
 from iblf_jax.tuning.robust import Risk, combine
 from iblf_jax.tuning.rollouts import fold_of
-from iblf_jax.tuning.search import REPAIR, Search, SearchState, Strategy
+from iblf_jax.tuning.runs import in_groups
+from iblf_jax.tuning.search import REPAIR, SECOND_SEARCH, Search, SearchState, Strategy
 from iblf_jax.tuning.solvers import Constraints, SearchSpace, quadratic, sqp
 from iblf_jax.tuning.solvers.sqp import subproblem
 from iblf_jax.tuning.starts import (
@@ -488,9 +489,32 @@ def test_a_search_from_several_starts_goes_on_in_the_deeper_valley():
     assert found.hold and np.max(np.abs(found.residuals)) < 1e-3
 
 
-def test_the_better_third_of_the_starts_continues_after_every_selection():
+def test_a_second_search_begins_at_the_best_gains_and_at_the_best_points_around_them():
+    box = Box(np.full(7, 0.5), np.full(7, -4.0), np.full(7, 4.0))
+    starts = np.stack([np.full(7, x) for x in (0.5, 1.9)])
+    evaluate = Counted(SearchSpace(box, Constraints.of((1,), (0.0,), 1)), 4)
+    screening = ranked(starts, Valleys()(starts).value)
+    strategy = Strategy(screening, 2, len(starts), second_points=60, second_starts=3)
+    search = Search(evaluate, SQP(), starts[np.array([0, 1, 1, 1])], strategy)
+    begun = []
+
+    def note(search):
+        if search.state.phase == SECOND_SEARCH:
+            begun.append((search.history["z"][-1], search.state.best_key.copy()))
+
+    assert search.run(60, note) == "converged"
+    assert search.state.plain_values == 2 + 60
+    z = begun[0][0]
+    np.testing.assert_allclose(z[0], np.ones(7), atol=1e-3)
+    distances = np.max(np.abs(z - z[0]), axis=1)
+    assert np.all(distances[1:] >= 1.0) and np.all(np.isfinite(begun[0][1]))
+    assert search.state.incumbent_key[1] == pytest.approx(Valleys.DEEP)
+
+
+def test_starts_that_come_near_a_better_one_end_first_and_then_all_but_the_better_third():
     box = Box(np.full(7, -0.6), np.full(7, -4.0), np.full(7, 4.0))
     starts = np.random.default_rng(0).uniform(-4.0, 4.0, (12, 7))
+    starts[1] = starts[0] + 0.1
     evaluate = Counted(SearchSpace(box, Constraints.of((1,), (0.0,), 1)), 12)
     strategy = Strategy(ranked(starts, Valleys()(starts).value), selection=2, starts=12)
     search = Search(evaluate, SQP(), starts, strategy)
@@ -501,8 +525,8 @@ def test_the_better_third_of_the_starts_continues_after_every_selection():
         evaluations.append(search.state.evaluations)
 
     search.run(60, note)
-    assert remaining[:4] == [12, 4, 4, 2]
-    assert evaluations[3] <= 2 * 12 + 2 * 4  # a start that is retired costs nothing
+    assert remaining[:3] == [12, 11, 11] and remaining[3] <= 4
+    assert evaluations[3] <= 2 * 12 + 2 * 11  # a start that is retired costs nothing
 
 
 @pytest.mark.parametrize(
@@ -596,6 +620,43 @@ def test_the_excess_alone_is_minimised_before_requirements_are_called_infeasible
     assert search.state.phase == REPAIR
     assert search.state.incumbent_key[0] == pytest.approx(least, abs=1e-3)
     assert search.conditions().residuals[1] == pytest.approx(least, abs=1e-3)
+
+
+class Roof(Counted):
+    """|z|^2 above a roof: one piece, the largest of two slopes that meet at z0 = 0 and z1 = 1, with
+    the gradient of the larger one."""
+
+    sign = 1.0
+
+    def __call__(self, z):
+        self.evaluations += int(self.active.sum())
+        f = np.sum(z**2, axis=1)
+        side = np.where(z[:, :1] > 0, 1.0, -1.0)
+        slope = np.concatenate([3.0 * side, -np.ones_like(side), np.zeros_like(side)], axis=1)
+        excess = np.sum(slope * z, axis=1) + 1.0
+        valid = np.ones(len(z), bool)
+        margin = np.ones(len(z))
+        value = Value(f, f, f[:, None], excess[:, None], excess[:, None], margin, valid, margin)
+        hessian = np.tile(2 * np.eye(3), (len(z), 1, 1))
+        gradient = self.sign * 2 * z
+        return Derivatives(value, gradient, hessian, excess[:, None, None], slope[:, None, :, None])
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0], ids=["gradients", "gradients that are wrong"])
+def test_the_gradients_of_points_around_a_kink_decide_whether_it_is_an_optimum(sign):
+    """Beside the ridge, where the solver's own pieces are those of one side only."""
+    box = Box(np.zeros(3), np.full(3, -4.0), np.full(3, 4.0))
+    beside = np.array([[0.06, 1.3, 0.0]])
+    evaluate = Roof(SearchSpace(box, Constraints.of((1,), (0.0,), 1)), 1)
+    evaluate.sign = sign
+    search = Search(evaluate, SQP(), beside)
+    search.consider_values(beside, evaluate(beside).value)
+    search.history["evaluations"] = [0]
+    found = search.conditions()
+    assert found.hold is (sign > 0)
+    if sign > 0:
+        assert found.at_kink
+        np.testing.assert_allclose(search.state.incumbent_z, [0.0, 1.0, 0.0], atol=0.01)
 
 
 def test_a_feasible_point_without_derivatives_is_never_lost():
@@ -954,6 +1015,18 @@ def test_only_active_starts_are_evaluated_in_groups_of_one_shape(nominal, most, 
     np.testing.assert_array_equal(found.value.valid, evaluator.active)
 
 
+def test_a_bar_states_what_a_search_will_evaluate_and_counts_the_points():
+    problem = SimpleNamespace(runs=64)
+    text = _tune._cost_in_words(problem, 782, 6, ij.tuning.Effort())
+    assert text == (
+        "782 points of 64 runs without derivatives, then 6 starts of 64 runs with them, up to 60"
+        " steps"
+    )
+    counted = []
+    rows = in_groups(lambda rows: rows, 35, 16, counted.append)
+    assert counted == [16, 16, 3] and rows.tolist() == list(range(35))
+
+
 @pytest.mark.slow
 def test_lbfgs_tunes_the_paper_as_well_as_sqp(paper):
     best = ij.tune(
@@ -1105,7 +1178,7 @@ def test_signature_of_tune_is_short_and_solvers_fit_their_protocol():
     own = inspect.signature(ij.tune).parameters.keys() - {
         "runs_as"
     }  # which stands for five of them
-    assert len(own) <= 16
+    assert len(own) <= 17
     members = [name for name in vars(ij.tuning.Solver) if not name.startswith("_")]
     assert {"init", "step", "converged"} <= set(members)
     for name, solver in ij.tuning.SOLVERS.items():
@@ -1157,6 +1230,7 @@ def test_a_solver_of_the_users_own(paper):
         ('solver = "lbfgs"', {"solver": LBFGS()}),
         ('[tune.solver]\nkind = "sqp"\nstarts = 4', {"solver": SQP(starts=4)}),
         ("[tune.report]\nruns = 20\nseed = 5", {"report": ij.tuning.Report(20, 5)}),
+        ("confirm = 0.01", {"confirm": 0.01}),
     ],
 )
 def test_a_tuning_file_has_the_options_as_tables(tmp_path, table, expected):

@@ -69,7 +69,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import jax
 import numpy as np
-from scipy.linalg import block_diag
 
 from iblf_jax.core import checks
 from iblf_jax.tuning.parameters import Box
@@ -205,32 +204,19 @@ def subproblem(
     ]
     runs_and_counts = zip(selected, constraints.worst, strict=True)
     own_columns = [_own_columns(chosen.run, k) for chosen, k in runs_and_counts]
-    # The rows of each requirement in the columns of the step, and the right-hand sides: a_j and
-    # -c_j - TARGET_EXCESS for its pieces, and zeros for the conditions on its own unknowns.
-    rows = []
-    limits = []
-    for chosen, own in zip(selected, own_columns, strict=True):
-        added = len(own) - len(chosen.run)
-        gradients = piece_gradients[chosen.run, :, chosen.piece]
-        rows.append(np.pad(gradients, ((0, added), (0, 0))))
-        limits.append(np.pad(-pieces[chosen.run, chosen.piece] - TARGET_EXCESS, (0, added)))
+    rows, limits = _rows_of_pieces(selected, own_columns, pieces, piece_gradients)
     own_block, violation_columns = _columns_of_requirements(size, own_columns, constraints)
     A = np.hstack([np.vstack([np.eye(size), -np.eye(size), *rows]), own_block])
-    H = block_diag(matrix, np.zeros((own_block.shape[1], own_block.shape[1])))
+    H = np.zeros((A.shape[1], A.shape[1]))
+    H[:size, :size] = matrix
     c = np.zeros(A.shape[1])
     c[:size] = gradient
     c[violation_columns] = penalty
     x, y = yield quadratic.Programme(H, c, A, np.concatenate([high, -low, *limits]))
-
     step = np.clip(x[:size], low, high)
-    piece_multipliers = np.zeros_like(pieces)
+    piece_multipliers = _multipliers_of_pieces(y[2 * size :], selected, own_columns, pieces.shape)
     multipliers = np.zeros(len(selected))
-    row = 2 * size  # the first row of the pieces of requirement r
-    for r, chosen in enumerate(selected):
-        of_pieces = y[row : row + len(chosen.run)]
-        piece_multipliers[chosen.run, chosen.piece] = of_pieces
-        multipliers[r] = of_pieces.sum()
-        row += len(own_columns[r])
+    np.add.at(multipliers, constraints.owner, piece_multipliers.sum(axis=0))
     return Step(
         step=step,
         change=float(gradient @ step + 0.5 * step @ matrix @ step),
@@ -241,6 +227,42 @@ def subproblem(
     )
 
 
+def _rows_of_pieces(
+    selected: list[Selected],
+    own_columns: list[np.ndarray],
+    pieces: np.ndarray,
+    piece_gradients: np.ndarray,
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """The rows of each requirement in the columns of the step, and their right-hand sides: a_j and
+    -c_j - TARGET_EXCESS for its pieces, and zeros for the conditions on its own unknowns.
+    """
+    rows = []
+    limits = []
+    for chosen, own in zip(selected, own_columns, strict=True):
+        added = len(own) - len(chosen.run)
+        gradients = piece_gradients[chosen.run, :, chosen.piece]
+        rows.append(np.pad(gradients, ((0, added), (0, 0))))
+        limits.append(np.pad(-pieces[chosen.run, chosen.piece] - TARGET_EXCESS, (0, added)))
+    return rows, limits
+
+
+def _multipliers_of_pieces(
+    y: np.ndarray,
+    selected: list[Selected],
+    own_columns: list[np.ndarray],
+    shape: tuple[int, ...],
+) -> np.ndarray:
+    """The multiplier of each piece in each run, (B, M), from those of the rows of the
+    requirements.
+    """
+    found = np.zeros(shape)
+    row = 0  # the first row of the pieces of a requirement
+    for chosen, own in zip(selected, own_columns, strict=True):
+        found[chosen.run, chosen.piece] = y[row : row + len(chosen.run)]
+        row += len(own)
+    return found
+
+
 def _columns_of_requirements(
     size: int, own_columns: list[np.ndarray], constraints: Constraints
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -249,13 +271,16 @@ def _columns_of_requirements(
 
     Where only the largest excess counts, all requirements share one unknown v.
     """
+    rows = np.cumsum([2 * size, *(len(own) for own in own_columns)])
+    columns = np.cumsum([0, *(own.shape[1] for own in own_columns)])
+    block = np.zeros((rows[-1], columns[-1]))
+    for own, row, column in zip(own_columns, rows[:-1], columns[:-1], strict=True):
+        block[row : row + own.shape[0], column : column + own.shape[1]] = own
     if not constraints.largest_only:
-        widths = [own.shape[1] for own in own_columns]
-        block = block_diag(np.zeros((2 * size, 0)), *own_columns)
-        return block, size + np.cumsum([0, *widths])[:-1]
-    shared = np.concatenate([np.zeros(2 * size), *(own[:, 0] for own in own_columns)])
-    others = block_diag(np.zeros((2 * size, 0)), *(own[:, 1:] for own in own_columns))
-    return np.hstack([shared[:, None], others]), np.full(len(own_columns), size)
+        return block, size + columns[:-1]
+    shared = block[:, columns[:-1]].sum(axis=1, keepdims=True)
+    others = np.delete(block, columns[:-1], axis=1)
+    return np.hstack([shared, others]), np.full(len(own_columns), size)
 
 
 def _own_columns(run: np.ndarray, k: int) -> np.ndarray:
@@ -657,7 +682,7 @@ def _solve(
     """The subproblem at the accepted point, with `pieces` as c."""
     multipliers = state.piece_multipliers.ravel()[state.curved]
     curvature_of_pieces = np.einsum("k,kpq->pq", multipliers, state.curvatures)
-    scale = float(np.linalg.norm(state.here.matrix, 2))
+    scale = float(np.max(np.abs(np.linalg.eigvalsh(state.here.matrix))))
     matrix = positive_definite(state.here.matrix + state.correction + curvature_of_pieces, scale)
     low = np.maximum(space.box.low - state.z, -state.radius)
     high = np.minimum(space.box.high - state.z, state.radius)
