@@ -55,6 +55,16 @@ def test_what_the_file_leaves_out_follows_from_the_arm(folder):
     np.testing.assert_array_equal(scenario.controller.limit, arm.effort)
     np.testing.assert_allclose(scenario.initial.q, scenario.reference.position(np.zeros(())))
     assert jax.tree.structure(scenario.plant) == jax.tree.structure(arm)
+    middle = np.array([0.0, -1.2, 1.6, -1.4, -1.57, 0.0])
+    near = "".join(
+        f"[bounds.{side}]\nkind = 'constant'\nvalue = {(middle + distance).tolist()}\n"
+        for side, distance in (("lower", -0.35), ("upper", 0.35))
+    )
+    bounded = ij.load_scenario(written(folder, ROBOT + REFERENCE + near))
+    expected = ij.presets.arm_scenario(arm, bounded.reference, bounds=bounded.bounds[0])
+    weight = bounded.controller.law.weight
+    np.testing.assert_array_equal(weight, expected.controller.law.weight)
+    assert np.min(weight) < np.min(scenario.controller.law.weight)
 
 
 def test_what_it_says_counts(folder):
