@@ -282,13 +282,13 @@ def _study_text(project: Project) -> str:
 
 def _tuning_text(project: Project) -> str:
     entries = [f'"{path}" = {entry}' for path, entry in project.perturbations.items()]
-    limits = np.asarray(getattr(project.scenario.loop.plant.robot, "effort", np.inf))
+    limits: Any = project.scenario.plant.effort  # type: ignore[union-attr]
     torque = []
-    if np.all(np.isfinite(limits)):
+    if limits is not None and np.all(np.isfinite(limits)):
         torque = [
             "[[requirement]]  # below the limits of the file, which leave no derivative",
             'kind = "peak_torque_below"',
-            f"limit = {_row(0.9 * limits)}  # N m",
+            f"limit = {_row(0.9 * np.asarray(limits))}  # N m",
             "",
         ]
     return "\n".join(

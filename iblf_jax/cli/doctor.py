@@ -71,7 +71,8 @@ def _versions() -> Iterator[Finding]:
         remedy = "install the package: pip install . in a clone"
         yield Finding("installation", "the package is imported and not installed", remedy)
         return
-    version, remedy = platform.python_version(), ""
+    version = platform.python_version()
+    remedy = ""
     if not _is_within(version, supported):
         remedy = f"take a Python {supported}"
     yield Finding("Python", f"{version}, {sys.executable}", remedy)
