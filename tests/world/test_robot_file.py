@@ -78,6 +78,21 @@ def test_what_it_says_counts(folder):
     assert (float(scenario.plant.mass[2]), float(scenario.model.mass[2])) == (3.0, 2.275)
 
 
+def test_joints_have_one_name_in_paths_and_messages(folder):
+    text = ROBOT + REFERENCE + '[parameters]\n"controller.K2[elbow_joint]" = 9.0\n'
+    scenario = ij.load_scenario(written(folder, text))
+    assert scenario.controller.law.K2[2] == 9.0
+    outside = ij.with_parameters(scenario, {'initial.q["elbow_joint"]': 4.0})
+    with pytest.raises(ValueError, match=r"^initial\.q\[elbow_joint\]: got 4"):
+        ij.simulate(outside, duration=0.01)
+    high = ij.with_parameters(scenario, {"bounds.lower.value[elbow_joint]": 5.0})
+    with pytest.raises(ValueError, match="^bounds of joint elbow_joint: got"):
+        ij.simulate(high, duration=0.01)
+    with pytest.raises(ValueError, match=r"controller\.K2\[elbow\]"):
+        ij.with_parameters(scenario, {"controller.K2[elbow]": 9.0})
+    assert scenario.loop.plant.notation.left_bounds(1, 2) == "Joint elbow_joint left its bounds"
+
+
 @pytest.mark.slow
 def test_plant_and_model_from_two_files_and_a_locked_joint(folder):
     (folder / "believed.urdf").write_text(
