@@ -171,13 +171,13 @@ class Certificate(Result):
         if notes:
             shown.append("notes")
             shown += [f"  {'; '.join(names)}: {note}" for note, names in notes.items()]
-        if self.omitted:
+        if self.verdict == NOT_APPLICABLE:
             shown.append(self.omitted)
         return shown
 
     def table_html(self) -> str:
-        """The lines that apply as an HTML table, those that fail in bold, and below it why the
-        others do not apply.
+        """The lines that apply as an HTML table, those that fail in bold; below it why nothing was
+        decided, where nothing was.
         """
         heading = ("", "equation", "verdict", "margin", "value", "where", "checked", "note")
         rows = [
@@ -188,7 +188,7 @@ class Certificate(Result):
         table = tables.as_html(heading, rows, failing)
         if self.inaccurate:
             table = f"<p>{html.escape(self.accuracy_note)}</p>{table}"
-        if not self.omitted:
+        if self.verdict != NOT_APPLICABLE:
             return table
         return f"{table}<p>{html.escape(self.omitted)}</p>"
 

@@ -28,6 +28,8 @@ from iblf_jax.core import checks
 from iblf_jax.core.disk_cache import keep_programs
 
 COMMANDS = (
+    "new",
+    "doctor",
     "reproduce",
     "simulate",
     "compare",

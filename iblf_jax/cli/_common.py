@@ -158,8 +158,8 @@ def optional_folder(name: str | None) -> Path | None:
     return output_folder(name)
 
 
-def output_folder(name: str) -> Path:
-    """The folder of --out, which is created if it does not exist.
+def output_folder(name: str, argument: str = "--out") -> Path:
+    """The folder of an argument, which is created if it does not exist.
 
     Raises:
       ValueError: the folder cannot be written.
@@ -172,7 +172,7 @@ def output_folder(name: str) -> Path:
             return folder
     except OSError as error:
         reason = str(error.strerror)
-    raise ValueError(f"--out: got {name!r}, expected a folder that can be written ({reason}).")
+    raise ValueError(f"{argument}: got {name!r}, expected a folder that can be written ({reason}).")
 
 
 # ------------------------------------------------------------------------------- numbers as text

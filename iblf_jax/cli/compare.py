@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 from typing import TYPE_CHECKING, Any
 
 from iblf_jax.cli._common import (
@@ -71,6 +72,7 @@ def _write(folder: Path, source: str, result: Comparison, options: dict[str, Any
     import iblf_jax
     from iblf_jax import plotting
     from iblf_jax.files.rollouts import save_rollouts
+    from iblf_jax.world.plants import component_names
 
     (folder / "comparison.txt").write_text(f"{result!r}\n", encoding="utf-8")
     result.to_pandas().to_csv(folder / "comparison.csv")
@@ -85,8 +87,11 @@ def _write(folder: Path, source: str, result: Comparison, options: dict[str, Any
         "effort": {name: status_and_metrics(one) for name, one in result.equal_effort.items()},
     }
     write_json(folder / "comparison.json", report)
-    joints = range(next(iter(result.rollouts.values())).n)
-    figures = {f"comparison_joint_{joint}": plotting.comparison(result, joint) for joint in joints}
+    joints = enumerate(component_names(result.scenario.plant))
+    figures = {
+        f"comparison_{re.sub(r'[^-.a-zA-Z0-9]+', '_', name)}": plotting.comparison(result, i)
+        for i, name in joints
+    }
     plotting.save(figures, folder, formats=("png", "pdf"))
     save_rollouts(result.rollouts, folder / "rollouts.nc")
     names = ", ".join(figures)

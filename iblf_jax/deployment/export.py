@@ -64,6 +64,24 @@ from iblf_jax.world import plants
 
 LAW_TARGETS = ("c", "fmu", "ros2")
 LOOP_TARGETS = ("fmu-loop", "wasm")
+TITLES = {
+    "c": "the law as C99",
+    "fmu": "the law as an FMU",
+    "ros2": "the law as a ROS 2 package",
+    "fmu-loop": "the closed loop as an FMU",
+    "wasm": "the closed loop as WebAssembly",
+}
+"""Target -> what was written, in words."""
+NEXT_STEPS = {
+    "c": "compare the code with a simulated run: cc -std=c99 -O2 {folder}/{name}.c"
+    " {folder}/selftest.c -lm -o {folder}/selftest && {folder}/selftest",
+    "fmu": "list its inputs and outputs: fmpy info {folder}/{name}.fmu",
+    "ros2": "build it in a ROS 2 workspace: cp -r {folder} WORKSPACE/src/{name} && cd WORKSPACE &&"
+    " colcon build --packages-select {name}",
+    "fmu-loop": "run it: fmpy simulate {folder}/{name}.fmu --show-plot",
+    "wasm": "load {name}.wasm in a page; {folder}/README.md has its functions",
+}
+"""Target -> what to do with the files, with the folder and the name."""
 LOOP_DEFAULTS = {"dt": 1e-3, "method": "rk4", "seed": 0}
 """The defaults of the arguments that only a closed loop has."""
 TYPES = {"double": "float64", "float": "float32"}
@@ -84,7 +102,7 @@ LONGEST_IDENTIFIER = 63
 
 @dataclasses.dataclass(frozen=True)
 class Exported:
-    """The result of `export`; prints as a table."""
+    """The result of `export`; prints what was written, what a call costs, and the next step."""
 
     folder: Path
     target: str
@@ -97,14 +115,20 @@ class Exported:
     """Paths of the leaves that can be set in the exported code."""
     notes: tuple[str, ...] = ()
     """What was left out, and why."""
+    next_step: str = ""
+    """What to do with the files."""
 
     def __repr__(self) -> str:
+        described = "; README.md describes them" if "README.md" in self.files else ""
+        sizes = ", ".join(f"{name} {size} bytes" for name, size in self.sizes.items())
         lines = [
-            f"{self.folder}: {', '.join(self.files)}",
+            f"{TITLES[self.target]} in {self.folder}: {len(self.files)} files{described}",
             f"a call: {describe_counts(self.operations)}",
+            f"memory: {sizes}",
+            f"{len(self.parameters)} parameters can be changed without another export",
+            *self.notes,
         ]
-        lines += [f"{name}: {size} bytes" for name, size in self.sizes.items()]
-        return "\n".join([*lines, f"parameters: {', '.join(self.parameters)}", *self.notes])
+        return "\n".join([*lines, f"next: {self.next_step}"])
 
 
 @notices.each_warning_once
@@ -295,7 +319,8 @@ def _export_law(
         "stack, without optimisation": generated.stack_bytes,
     }
     paths = tuple(field.path for field in generated.parameters.fields)
-    return Exported(folder, target, files, generated.operations, sizes, paths, notes)
+    next_step = NEXT_STEPS[target].format(folder=folder, name=name)
+    return Exported(folder, target, files, generated.operations, sizes, paths, notes, next_step)
 
 
 def _export_loop(
@@ -320,7 +345,9 @@ def _export_loop(
     width = loop.step.dtype.itemsize
     sizes = {"state": width * loop.carry_size + 8, "parameters": width * generated.parameters.size}
     paths = tuple(field.path for field in generated.parameters.fields)
-    return Exported(folder, target, files, operations_of(loop.step), sizes, paths)
+    next_step = NEXT_STEPS[target].format(folder=folder, name=name)
+    operations = operations_of(loop.step)
+    return Exported(folder, target, files, operations, sizes, paths, next_step=next_step)
 
 
 def checked_name(name: str | None, default: str) -> str:

@@ -329,7 +329,7 @@ def _fast_reference(result: Rollout) -> str:
         limit = lower[sample, joint]
     unit = unit_text(result.scenario, VELOCITY, int(joint))
     return (
-        f"The reference of {plants.component_names(result.scenario.plant)[joint]} reaches"
+        f"The reference of {plants.components_in_words(result.scenario.plant)[joint]} reaches"
         f" {reached:.4g} {unit} at t = {float(result.t[sample]):.4g} s, its limit is"
         f" {limit:.4g} {unit}: no law can follow it inside the velocity bounds. Slow it down, or"
         " widen scenario.bounds[1]."
@@ -510,7 +510,7 @@ def _infeasible(result: Rollout, steps: int) -> ValueError:
             " inside, or add some there."
         )
     return checks.fail(
-        f"reference of {plants.component_names(result.scenario.plant)[joint]}",
+        f"reference of {plants.components_in_words(result.scenario.plant)[joint]}",
         float(q_d[sample, joint]),
         f"a value inside the bounds ({float(lower[sample, joint]):.6g},"
         f" {float(upper[sample, joint]):.6g}) at {where}",

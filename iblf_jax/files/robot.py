@@ -11,9 +11,10 @@
     [reference]                     # and other tables that differ from
     ...                             # `iblf_jax.presets.arm_scenario`: bounds, controller, ...
 
-A law in the file is limited to the largest torques of the robot, unless it is of `kind =
-"saturated"`.  The scenario contains the numbers of the arm: a saved copy needs neither the robot
-file nor the package that reads it.
+The weight of the default law's barrier follows from the bounds of the file.  A law in the file is
+limited to the largest torques of the robot, unless it is of `kind = "saturated"`.  The scenario
+contains the numbers of the arm: a saved copy needs neither the robot file nor the package that
+reads it.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from iblf_jax.files.components import construct, decode, encode_fields
 from iblf_jax.files.modules import ReadPart
 from iblf_jax.files.values import as_table, known_keys, missing, numbers
 from iblf_jax.presets.arms import arm_scenario
+from iblf_jax.world.bounds import Bounds
 from iblf_jax.world.disturbances import Disturbance
 from iblf_jax.world.references import Reference
 from iblf_jax.world.robots import Robot, load
@@ -63,6 +65,9 @@ def with_robots_read(tables: dict[str, Any], folder: str | os.PathLike) -> dict[
     if "disturbance" in given:
         parts["disturbance"] = decode(given["disturbance"], Disturbance, "disturbance")
     parts |= {"robot": plant, "model": robots.get("model")}
+    if "bounds" in given:  # The weight of the barrier depends on them.
+        levels = decode(given["bounds"], tuple[Bounds | None, ...], "bounds")
+        parts["bounds"] = next(iter(levels), None)
     default = construct(arm_scenario, parts, "robot")
     if "controller" in given:
         law = within_effort(decode(given["controller"], TrackingLaw, "controller"), plant)

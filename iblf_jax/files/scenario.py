@@ -20,6 +20,10 @@ may also start from a preset and change some of its parameters:
     [parameters]                    # path -> value; complete files may have this table too
     "controller.K2" = 30.0
 
+or from another scenario file, whose tables it takes, and change [parameters] and [run] of it:
+
+    scenario = "scenario.toml"      # relative to this file
+
 The optional table `[run]` (duration, dt, method, record_every) describes a simulation.  A scalar
 stands for one number per joint.  `dtype` is present only if the precision of the scenario differs
 from JAX's default.  An unknown table, key or kind, a wrong type or shape, and a missing key raise a
@@ -322,6 +326,8 @@ def from_dict(
     try:
         others = set(other_tables)
         data = {key: x for key, x in as_table(data, "file").items() if key not in others}
+        if "scenario" in data:
+            data, folder = _with_scenario_read(data, folder)
         if "preset" in data:
             with_modules_read({}, folder, modules)  # A preset has none: refuses any that is given.
             scenario = _from_preset(data)
@@ -340,6 +346,29 @@ def from_dict(
         return ScenarioFile(scenario, _run_table(data.get("run", {})))
     except ValueError as error:
         raise checks.with_location(source, error) from error
+
+
+def _with_scenario_read(
+    data: dict[str, Any], folder: str | os.PathLike
+) -> tuple[dict[str, Any], Path]:
+    """The tables of the file that `scenario` names, changed by [parameters] and [run] of this
+    file, and the folder of that file.
+
+    Raises:
+      ValueError: another key beside `scenario`, or a file that is no scenario file.
+      OSError: the file cannot be read.
+    """
+    known_keys(data, "", ("scenario", "parameters", "run"))
+    name = checks.string("scenario", data["scenario"], "the path of a scenario file")
+    path = Path(folder, name)
+    tables = read_toml(path)
+    known_keys(tables, name, (*COMPONENTS, "preset", "arguments", "parameters", "run", "dtype"))
+    changed = {
+        key: as_table(tables.get(key, {}), key) | as_table(data[key], key)
+        for key in ("parameters", "run")
+        if key in data
+    }
+    return tables | changed, path.parent
 
 
 def _from_components(

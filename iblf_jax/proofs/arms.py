@@ -368,7 +368,8 @@ def _check_tube(scenario: Scenario, duration: float) -> None:
     i, joint = np.unravel_index(least.argmin(), least.shape)
     raise checks.fail(
         "prove: scenario.bounds[0]",
-        f"a distance of {least.min():g} rad at t = {float(times[i]):g} s of joint {joint}",
+        f"a distance of {least.min():g} rad at t = {float(times[i]):g} s of"
+        f" {plants.components_in_words(scenario.plant)[joint]}",
         "bounds with the reference strictly inside at all times",
     )
 

@@ -9,6 +9,8 @@ Sweeps, perturbations, tuning and scenario files address leaves by these paths.
   addressed by them: "plant.link[forearm].mass", "plant.joint[elbow].damping"; numbers from 0 work
   as well. A name without a letter, or with a bracket, a line break or the like, is written as a
   JSON string: 'plant.link["a]b"].mass'.
+- The last index of an array with one number for each joint may be the name of the joint, as the
+  robot's file has it: "controller.K2[elbow]", "initial.q[elbow]".
 - `robot.` stands for `plant.` and `model.` together and changes both robots alike.
 - `bounds.lower` and `bounds.upper` without an index are those of the first level:
   "bounds.upper.value" is "bounds[0].upper.value".
@@ -49,6 +51,7 @@ from iblf_jax.core.pytree import field_values, wrapped_field
 from iblf_jax.core.units import Unit, as_text, of_entry, resolved
 from iblf_jax.simulation.scenario import HOW_TO_MAKE, Scenario, canonical
 from iblf_jax.simulation.units import symbols_of
+from iblf_jax.world.plants import component_names
 
 Symbols: TypeAlias = Mapping[str, Unit]
 """Symbol of a formula of a unit -> its unit."""
@@ -345,12 +348,31 @@ def _resolved(scenario: Scenario, path: str, full: str) -> tuple[list[str | int]
     The names of wrapped components are inserted, and the name of a row becomes an index.
     """
     try:
-        return resolve(scenario, full)
+        return resolve(scenario, _with_joint_number(scenario, full))
     except LookupError:
         known = [p.path for p in parameters(scenario)]
         remedy = checks.nearest(full_path(path), known) or "ij.parameters(scenario) lists them."
         expected = "the path of a leaf of this scenario"
         raise checks.fail("path", path, expected, remedy) from None
+
+
+def _with_joint_number(scenario: Scenario, full: str) -> str:
+    """A path whose last index is its number where it is the name of a joint.
+
+    Paths that have a meaning of their own keep it: keys of dicts of modules, and rows of links.
+    """
+    try:
+        last = parse(full)[-1]
+        joints = component_names(scenario.plant)
+        if not isinstance(last, RowName) or joints.count(last) != 1:
+            return full
+        field = full.removesuffix(f"[{last}]").removesuffix(f"[{json.dumps(last)}]")
+        value = resolve(scenario, field)[1]
+    except (LookupError, ValueError, AttributeError):
+        return full
+    if jnp.shape(value) == (len(joints),):
+        return f"{field}[{joints.index(last)}]"
+    return full
 
 
 def with_parameters(scenario: Scenario, values: Mapping[str, Any]) -> Scenario:

@@ -545,8 +545,8 @@ class Start(NamedTuple):
     """What the rules about the start read."""
 
     scenario: Scenario
-    noun: str
-    """Of a component of a level."""
+    components: tuple[str, ...]
+    """The components of a level in words."""
     at: InitialValues
     """On the host."""
 
@@ -559,30 +559,35 @@ Limits = tuple[jax.Array, jax.Array] | None
 """Lower and upper bounds, (n,) each; None without."""
 
 
-def _crossed(bounds: Bounds | None, limits: Limits) -> Found | None:
+def _crossed(s: Start | BoundedLevel, bounds: Bounds | None, limits: Limits) -> Found | None:
     """The first component whose lower bound is not below its upper bound."""
     if bounds is None or limits is None:
         return None
     for i, (low, high) in enumerate(zip(*limits, strict=True)):
         if not low < high:
             remedy = _funnel_remedy(bounds) or "Exchange or widen them."
-            return Found((low, high), {"i": i, "remedy": remedy})
+            return Found((low, high), {"component": s.components[i], "remedy": remedy})
     return None
 
 
-def _outside(values: jax.Array, limits: Limits, bounds: str = "bounds") -> Found | None:
+def _outside(
+    s: Start | BoundedLevel, values: jax.Array, limits: Limits, bounds: str = "bounds"
+) -> Found | None:
     """The first component that is not between its bounds."""
     if limits is None:
         return None
     for i, (value, low, high) in enumerate(zip(values, *limits, strict=True)):
         if not low < value < high:
-            words = {"i": i, "bounds": bounds, "interval": f"({low:.6g}, {high:.6g})"}
+            interval = f"({low:.6g}, {high:.6g})"
+            component = s.components[i]
+            entry = component.removeprefix("joint ").removeprefix("component ")
+            words = {"entry": entry, "bounds": bounds, "interval": interval, "component": component}
             return Found(value, words)
     return None
 
 
 def _reference_outside(s: Start) -> Found | None:
-    found = _outside(s.at.q_d, s.at.limits)
+    found = _outside(s, s.at.q_d, s.at.limits)
     if found is None:
         return None
     remedy = _funnel_remedy(s.scenario.bounds[0])
@@ -603,22 +608,22 @@ START = (
     Rule("bounds[0].lower", lambda s: _infinite(s.at.limits[0]), FINITE),
     Rule("bounds[0].upper", lambda s: _infinite(s.at.limits[1]), FINITE),
     Rule(
-        "bounds of {s.noun} {i}",
-        lambda s: _crossed(s.scenario.bounds[0], s.at.limits),
+        "bounds of {component}",
+        lambda s: _crossed(s, s.scenario.bounds[0], s.at.limits),
         ORDERED,
         "{remedy}",
     ),
-    Rule("reference of {s.noun} {i}", _reference_outside, INSIDE, "{remedy}"),
-    Rule("initial.q[{i}]", lambda s: _outside(s.at.q, s.at.limits), INSIDE, MOVE_START),
+    Rule("reference of {component}", _reference_outside, INSIDE, "{remedy}"),
+    Rule("initial.q[{entry}]", lambda s: _outside(s, s.at.q, s.at.limits), INSIDE, MOVE_START),
     Rule(
-        "bounds[1] of joint {i}",
-        lambda s: _crossed(s.scenario.bounds[1], s.at.speed_limits),
+        "bounds[1] of {component}",
+        lambda s: _crossed(s, s.scenario.bounds[1], s.at.speed_limits),
         ORDERED,
         "{remedy}",
     ),
     Rule(
-        "initial.dq[{i}]",
-        lambda s: _outside(s.at.dq, s.at.speed_limits, "velocity bounds"),
+        "initial.dq[{entry}]",
+        lambda s: _outside(s, s.at.dq, s.at.speed_limits, "velocity bounds"),
         INSIDE,
         MOVE_START,
     ),
@@ -633,7 +638,7 @@ class BoundedLevel(NamedTuple):
 
     level_index: int
     """From 0, as in a path."""
-    noun: str
+    components: tuple[str, ...]
     x: jax.Array
     bounds: Bounds
     limits: Limits
@@ -642,14 +647,14 @@ class BoundedLevel(NamedTuple):
 
 BOUNDED_LEVEL = (
     Rule(
-        "bounds[{s.level_index}] of {s.noun} {i}",
-        lambda s: _crossed(s.bounds, s.limits),
+        "bounds[{s.level_index}] of {component}",
+        lambda s: _crossed(s, s.bounds, s.limits),
         ORDERED,
         "{remedy}",
     ),
     Rule(
-        "initial.x[{s.level_index}][{i}]",
-        lambda s: _outside(s.x, s.limits, f"bounds of level {s.level_index + 1}"),
+        "initial.x[{s.level_index}][{entry}]",
+        lambda s: _outside(s, s.x, s.limits, f"bounds of level {s.level_index + 1}"),
         INSIDE,
         MOVE_START + "{s.without_dq}",
     ),
@@ -665,13 +670,13 @@ def _check_levels(scenario: Scenario) -> None:
     without_dq = "" if x[1].any() else f" {WITHOUT_DQ}"
     if not np.all(np.isfinite(x)):
         raise checks.fail("initial.x", x, "finite levels at the start")
-    noun = plants.component_noun(scenario.plant)
+    components = plants.components_in_words(scenario.plant)
     for i, bounds in enumerate(scenario.bounds[1:], start=1):
         if bounds is None or isinstance(bounds.lower, Funnel) or isinstance(bounds.upper, Funnel):
             continue  # a funnel is around alpha, which the law computes
         limits = jax.tree.map(np.asarray, bounds_at(bounds, t, jnp.zeros_like(state[0])))
         remedy = without_dq if i == 1 else ""
-        check(BOUNDED_LEVEL, BoundedLevel(i, noun, x[i], bounds, limits, remedy))
+        check(BOUNDED_LEVEL, BoundedLevel(i, components, x[i], bounds, limits, remedy))
     plant, model, *_ = scenario.loop
     for name, part in (("plant", plant), ("model", model)):
         if part.is_robot:
@@ -708,7 +713,7 @@ def check_start(scenario: Scenario) -> None:
     """
     at = jax.tree.map(np.asarray, _initial_values(scenario))
     plant, model, *_ = scenario.loop
-    check(START, Start(scenario, plants.component_noun(plant), at))
+    check(START, Start(scenario, plants.components_in_words(plant), at))
     if not plant.is_robot:
         _check_levels(scenario)
     limit = plants.speed_limit(plant)

@@ -297,7 +297,7 @@ def _at_effort_of(
         run = _run(with_parameters(scenario, _scaled(scenario, names, factor)), options)
         if not int(run.status) & NO_EFFORT:
             return _EqualEffort(factor, run, search=found)
-    reason = found.in_words()
+    reason = found.remark()
     if isinstance(unwrapped(scenario.controller), BarrierBackstepping):
         reason += f"; {ONLY_K}"
     return _EqualEffort(float("nan"), reason=reason, search=found)

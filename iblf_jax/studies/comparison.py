@@ -239,14 +239,13 @@ class Comparison(Result):
                 "Each law's gains (k1 and K2, or its own) are scaled by one factor: of those found"
                 " from 1/32 to 32 that do it, the one nearest to 1 (by |ln factor|)."
             )
-            # Why a law has no factor, and for the others what was searched where that says more
-            # than the factor.
+            # Why a law has no factor or one that says little, in one line; `searches` has the rest.
             notes["effort"] = [f"{equal} {scaled}"]
             notes["effort"] += [f"{name}: no factor; {why}." for name, why in self.reasons.items()]
             notes["effort"] += [
-                f"{name}: factor {self.factors[name]:.4g}; {found.in_words()}."
+                f"{name}: factor {self.factors[name]:.4g}; {found.remark()}."
                 for name, found in self.searches.items()
-                if name not in self.reasons and (found.failed or len(found.crossings) > 1)
+                if name not in self.reasons and found.remark()
             ]
         for kind, runs in (("gains", self.rollouts), ("effort", self.equal_effort)):
             if kind in notes and runs and all(map(_is_closest_at_start, runs.values())):

@@ -55,6 +55,11 @@ NO_EFFORT = FAILED & ~(
 obstacle."""
 
 
+INFLUENCE = 0.05
+"""Least change of the effort from half to twice the gains, relative to the target, with which a
+factor says something about a law [1]."""
+
+
 class Trials(NamedTuple):
     """The results of a batch of factors, (N,) each."""
 
@@ -118,6 +123,34 @@ class EffortSearch:
         why = invalid_flags(self.accepts_inaccurate)
         bad = zip(self.factors[~self.valid], self.status[~self.valid], strict=True)
         return {float(factor): describe(int(status) & why, self.texts) for factor, status in bad}
+
+    @property
+    def influence(self) -> float:
+        """How much the effort depends on the gains near the factor: (largest - smallest) / target
+        over the valid trials from half to twice the factor [1]; NaN without a factor.
+        """
+        near = self.valid & (self.factors >= self.factor / 2) & (self.factors <= 2 * self.factor)
+        if not np.any(near):
+            return math.nan
+        return float(np.ptp(self.efforts[near]) / self.target)
+
+    def remark(self) -> str:
+        """Why the factor is missing, or says little about the law, in one line; "" if neither."""
+        if not self.crossings and self.smaller_dt is not None:
+            return f"{self._nothing_found()}; failed trials may be valid with dt={self.smaller_dt:g}"
+        if not self.crossings:
+            return self._nothing_found()
+        if self.influence < INFLUENCE:
+            return (
+                f"half and twice the gains change the effort by {100 * self.influence:.2g} % only,"
+                " so that it says nothing about the law"
+            )
+        words = []
+        if len(self.crossings) > 1:
+            words.append(f"the nearest to 1 of {len(self.crossings)} factors with this effort")
+        if self.smaller_dt is not None:
+            words.append(f"with dt={self.smaller_dt:g} failed trials nearer to 1 may be valid")
+        return "; ".join(words)
 
     def in_words(self) -> str:
         """What was searched, what failed and what was found, in one line."""

@@ -19,7 +19,7 @@ from conftest import ROOT
 
 import iblf_jax as ij
 from iblf_jax import _start, cli
-from iblf_jax.cli import _claims, _common, _paper_figures
+from iblf_jax.cli import _claims, _common, _paper_figures, doctor
 from iblf_jax.core import tables
 from iblf_jax.core.disk_cache import keep_programs
 from iblf_jax.files import scenario as scenario_file
@@ -194,6 +194,81 @@ def test_a_failed_run_exits_with_one(command, tmp_path):
     assert "Take dt=" in err
     report = strict_json(tmp_path / "out" / "metrics.json")
     assert "STEP_TOO_LARGE" in report["flags"]
+
+
+# ------------------------------------------------------------------------------- new and doctor
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "options",
+    [["--robot", f"{ROOT}/examples/arm.urdf", "--tip", "tool0"], ["--preset", "zhang_yan_2024"]],
+)
+def test_every_command_of_a_new_project_runs(command, monkeypatch, tmp_path, options):
+    code, out, err = command("new", "mine", *options)
+    assert (code, err) == (0, "")
+    folder = tmp_path / "mine"
+    readme = (folder / "README.md").read_text()
+    written = {"scenario.toml", "study.toml", "tune.toml", "project.ipynb", "README.md"}
+    assert {path.name for path in folder.iterdir()} == written
+    assert all(f"`{name}`" in readme for name in written - {"README.md"})
+    monkeypatch.chdir(folder)
+    named = re.findall(r"iblf-jax ([^`#\n]+)", readme)
+    assert [words.split()[0] for words in named[:4]] == ["simulate", "montecarlo", "tune", "export"]
+    for words in named:
+        code, out, _ = command(*words.split())
+        assert code == 0, (words, out)
+    cells = json.loads((folder / "project.ipynb").read_text())["cells"]
+    names: dict = {}
+    for cell in cells:
+        if cell["cell_type"] == "code":
+            exec("".join(cell["source"]), names)
+    assert not len(names["study"].failed)
+
+
+def test_new_refuses_before_it_writes(command, tmp_path):
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "mine.txt").write_text("mine")
+    text = (ROOT / "examples" / "arm.urdf").read_text()
+    (tmp_path / "weak.urdf").write_text(text.replace('effort="60"', 'effort="3"'))
+    for words, message in (
+        (["full"], "FOLDER: got 'full', expected a folder that is new or empty"),
+        (["a", "--robot", "none.urdf"], "none.urdf"),
+        (["a", "--robot", "weak.urdf"], "of the limit 3 N m of the joint lift"),
+        (["a", "--robot", "weak.urdf", "--preset", "ur5"], "either --robot or --preset"),
+        (["a", "--preset", "vessel"], "--preset: got 'vessel'"),
+        (["a", "--tip", "tool0"], "--tip: got 'tool0', expected --robot beside it"),
+    ):
+        code, _, err = command("new", *words)
+        assert code == 2
+        assert message in err
+    assert [path.name for path in (tmp_path / "full").iterdir()] == ["mine.txt"]
+    assert not (tmp_path / "a").exists()
+
+
+def test_doctor_names_what_is_missing(command, monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(doctor, "_version_of", lambda package: "" if package == "mujoco" else "1.0")
+    code, out, _ = command("doctor")
+    assert code == 0
+    for words in ("Python ", "jax ", "jaxlib ", "devices ", "compiler ", str(tmp_path / "cache")):
+        assert words in out
+    assert re.search(r"^extra robots +missing +without mujoco$", out, re.MULTILINE)
+    assert '  extra robots: pip install "iblf_jax[robots]", or ".[robots]" in a clone' in out
+    assert "extra export       ok" in out
+
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    code, out, _ = command("doctor")
+    assert code == 1
+    assert "  compiler: there is no C++ compiler 'no-such-compiler' ($CXX)" in out
+
+
+@pytest.mark.parametrize(
+    ("version", "allowed"),
+    [("0.10.2", True), ("0.12.9.dev1", True), ("0.10.1", False), ("0.13.0", False)],
+)
+def test_doctor_reads_the_range_of_versions(version, allowed):
+    assert doctor._is_within(version, ">=0.10.2,<0.13") == allowed
 
 
 # ------------------------------------------------------------------------ presets, parameters, help

@@ -493,7 +493,12 @@ def test_the_command_line_exports(tmp_path, capsys):
     words = ["export", "zhang_yan_2024", "--out", str(tmp_path)]
     options = ["--period", "0.002", "--dtype", "float", "--reference", "given"]
     assert main([*words, *options]) == 0
-    assert re.search(r"stack, without optimisation: \d+ bytes", capsys.readouterr().out)
+    *lines, last = capsys.readouterr().out.splitlines()
+    assert lines[0] == f"the law as C99 in {tmp_path}: 7 files; README.md describes them"
+    assert re.search(r"stack, without optimisation \d+ bytes", lines[2])
+    step = last.removeprefix("next: compare the code with a simulated run: ")
+    ran = subprocess.run(step, shell=True, capture_output=True, text=True, check=True)
+    assert "ok: torque within" in ran.stdout
     assert "ok: torque within" in built_and_run(tmp_path, "-O2")
     assert main([*words, "--target", "exe"]) == 2
     assert "target" in capsys.readouterr().err

@@ -118,7 +118,7 @@ def test_errors_before_a_run_name_components():
     with pytest.raises(ValueError, match="reference of heading"):
         ij.simulate(body(reference=far), duration=10.0, dt=1e-2)
     outside = ij.references.Sinusoid(offset=[9.0, 0.0, 0.0], amplitude=0.0)
-    with pytest.raises(ValueError, match="reference of component 0"):
+    with pytest.raises(ValueError, match="reference of north"):
         ij.simulate(body(reference=outside), duration=1.0, dt=1e-2)
     with pytest.raises(ValueError, match=r"speeds below 1e\+12 m/s, m/s, rad/s"):
         ij.simulate(body(initial=ij.Initial(q=[0.5, 1.0, 0.2], dq=1e13)), duration=1.0, dt=1e-2)

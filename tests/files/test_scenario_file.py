@@ -23,6 +23,7 @@ import tomli_w
 import iblf_jax as ij
 from iblf_jax.core.pytree import layers
 from iblf_jax.files import scenario as scenario_file
+from iblf_jax.files.study import load_study_file
 
 
 def assert_equal(a: ij.Scenario, b: ij.Scenario) -> None:
@@ -242,6 +243,27 @@ def test_a_preset_with_arguments_and_parameters(tmp_path):
         ij.presets.zhang_yan_2024(law="log", p=2), {"robot.mass[1]": 1.1, "controller.K2": 30.0}
     )
     assert_equal(ij.load_scenario(tmp_path / "a.toml"), expected)
+
+
+def test_a_file_takes_the_tables_of_another_one(paper, tmp_path):
+    (tmp_path / "below").mkdir()
+    ij.save_scenario(paper, tmp_path / "below" / "a.toml", run={"duration": 3.0, "dt": 2e-3})
+    own = 'scenario = "below/a.toml"\n[parameters]\ncontroller.K2 = 30\n[run]\ndt = 1e-3\n'
+    (tmp_path / "b.toml").write_text(own)
+    found = scenario_file.load_scenario_file(tmp_path / "b.toml")
+    assert_equal(found.scenario, ij.with_parameters(paper, {"controller.K2": 30.0}))
+    assert found.run == {"duration": 3.0, "dt": 1e-3}
+    study = own + '[perturbations]\n"plant.mass" = { factor = "uniform", low = 0.9, high = 1.1 }\n'
+    (tmp_path / "c.toml").write_text(study + "[study]\nruns = 4\n")
+    assert load_study_file(tmp_path / "c.toml", "study").options["duration"] == 3.0
+    for text, message in (
+        (own + "[observer]\n", r"b\.toml: observer: got an unknown key"),
+        ('scenario = "b.toml"', r"b\.toml: b\.toml\.scenario: got an unknown key"),
+        ("scenario = 3", r"b\.toml: scenario: got 3, expected the path of a scenario file"),
+    ):
+        (tmp_path / "b.toml").write_text(text)
+        with pytest.raises(ValueError, match=message):
+            ij.load_scenario(tmp_path / "b.toml")
 
 
 def test_users_classes_are_refused_until_they_have_a_name(paper, monkeypatch):

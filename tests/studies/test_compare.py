@@ -305,9 +305,15 @@ def test_the_factor_nearest_one_is_found_beyond_trials_that_fail():
     assert all(1.17 <= factor <= 1.23 or factor >= 1.4 for factor in found.failed)
     assert "time step is too large" in next(why for x, why in found.failed.items() if x < 1.23)
     text = repr(wavy)
-    assert "of which 1.28 is the nearest to 1" in text
-    assert f"{len(found.factors)} factors from 0.0312 to 32 were run" in text
-    assert f"with dt={found.smaller_dt:g}" in text and found.smaller_dt < 1e-3
+    [line] = [line for line in text.splitlines() if line.startswith("at 1: ")]
+    assert line == (
+        "at 1: factor 1.28; the nearest to 1 of 2 factors with this effort; with"
+        f" dt={found.smaller_dt:g} failed trials nearer to 1 may be valid."
+    )
+    assert found.smaller_dt < 1e-3
+    words = found.in_words()
+    assert "of which 1.28 is the nearest to 1" in words
+    assert f"{len(found.factors)} factors from 0.0312 to 32 were run" in words
     data = json.loads(json.dumps(found.to_dict(), allow_nan=False))
     assert len(data["trials"]["status"]) == len(found.factors)
     assert {entry["factor"] for entry in data["failed"]} == set(found.failed)
@@ -353,6 +359,18 @@ def test_where_no_factor_is_found_the_nearest_trial_and_a_smaller_step_are_named
     assert beyond.factor == pytest.approx(1.32, rel=1e-6) and beyond.smaller_dt is None
     hiding = search(banded(1.1, 1.2, Status.STEP_TOO_LARGE), 1.32, dt_for)
     assert hiding.factor == pytest.approx(1.32, rel=1e-6) and hiding.smaller_dt == 2e-4
+
+
+def test_a_factor_on_which_the_effort_does_not_depend_says_so():
+    def flat(factors):
+        nothing = np.zeros(len(factors))
+        return Trials(2.0 + 0.01 * np.log2(factors), nothing.astype(int), nothing, nothing)
+
+    found = search(flat, 2.02)
+    assert found.factor == pytest.approx(4.0, rel=1e-4)
+    assert found.influence == pytest.approx(0.02 / 2.02, rel=0.2)
+    assert found.remark().startswith("half and twice the gains change the effort by 0.99 % only")
+    assert search(banded(9.0, 9.1, Status.OK), 1.32).remark() == ""
 
 
 def test_inaccurate_trials_count_only_where_the_given_runs_are_inaccurate_too():

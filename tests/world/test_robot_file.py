@@ -55,6 +55,16 @@ def test_what_the_file_leaves_out_follows_from_the_arm(folder):
     np.testing.assert_array_equal(scenario.controller.limit, arm.effort)
     np.testing.assert_allclose(scenario.initial.q, scenario.reference.position(np.zeros(())))
     assert jax.tree.structure(scenario.plant) == jax.tree.structure(arm)
+    middle = np.array([0.0, -1.2, 1.6, -1.4, -1.57, 0.0])
+    near = "".join(
+        f"[bounds.{side}]\nkind = 'constant'\nvalue = {(middle + distance).tolist()}\n"
+        for side, distance in (("lower", -0.35), ("upper", 0.35))
+    )
+    bounded = ij.load_scenario(written(folder, ROBOT + REFERENCE + near))
+    expected = ij.presets.arm_scenario(arm, bounded.reference, bounds=bounded.bounds[0])
+    weight = bounded.controller.law.weight
+    np.testing.assert_array_equal(weight, expected.controller.law.weight)
+    assert np.min(weight) < np.min(scenario.controller.law.weight)
 
 
 def test_what_it_says_counts(folder):
@@ -66,6 +76,21 @@ def test_what_it_says_counts(folder):
     assert scenario.initial.q[0] == 0.1
     assert (float(scenario.plant.payload), float(scenario.model.payload)) == (2.0, 0.0)
     assert (float(scenario.plant.mass[2]), float(scenario.model.mass[2])) == (3.0, 2.275)
+
+
+def test_joints_have_one_name_in_paths_and_messages(folder):
+    text = ROBOT + REFERENCE + '[parameters]\n"controller.K2[elbow_joint]" = 9.0\n'
+    scenario = ij.load_scenario(written(folder, text))
+    assert scenario.controller.law.K2[2] == 9.0
+    outside = ij.with_parameters(scenario, {'initial.q["elbow_joint"]': 4.0})
+    with pytest.raises(ValueError, match=r"^initial\.q\[elbow_joint\]: got 4"):
+        ij.simulate(outside, duration=0.01)
+    high = ij.with_parameters(scenario, {"bounds.lower.value[elbow_joint]": 5.0})
+    with pytest.raises(ValueError, match="^bounds of joint elbow_joint: got"):
+        ij.simulate(high, duration=0.01)
+    with pytest.raises(ValueError, match=r"controller\.K2\[elbow\]"):
+        ij.with_parameters(scenario, {"controller.K2[elbow]": 9.0})
+    assert scenario.loop.plant.notation.left_bounds(1, 2) == "Joint elbow_joint left its bounds"
 
 
 @pytest.mark.slow

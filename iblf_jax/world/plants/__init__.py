@@ -17,6 +17,7 @@ from iblf_jax.world.plants._base import check_dimensions as check_dimensions
 from iblf_jax.world.plants._base import check_part as check_part
 from iblf_jax.world.plants._base import component_names as component_names
 from iblf_jax.world.plants._base import component_noun as component_noun
+from iblf_jax.world.plants._base import components_in_words as components_in_words
 from iblf_jax.world.plants._base import counted_components as counted_components
 from iblf_jax.world.plants._base import declared_joints as declared_joints
 from iblf_jax.world.plants._base import dependence_on_levels as dependence_on_levels
@@ -93,6 +94,7 @@ __all__ = [
     "as_plant",
     "component_names",
     "component_noun",
+    "components_in_words",
     "counted_components",
     "flow",
     "gain_times",

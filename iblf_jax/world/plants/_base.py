@@ -543,6 +543,16 @@ def component_names(part: Any) -> tuple[str, ...]:
     return tuple(f"component {i}" for i in range(part.n))
 
 
+def components_in_words(part: Any) -> tuple[str, ...]:
+    """The n components of a level as a sentence names them: "joint elbow" and "joint shoulder"
+    where a robot names its joints, else "joint 0", "joint 1", ... or the names that a plant states.
+    """
+    names = component_names(part)
+    if not declared_joints(part):
+        return names
+    return tuple(f"joint {name}" for name in names)
+
+
 def component_noun(part: Any) -> str:
     """The word for a component of a level: "joint" where there is a robot."""
     if robot_of(part) is None:

@@ -12,7 +12,7 @@ from iblf_jax.core import checks
 from iblf_jax.core.linalg import inner, solve_spd
 from iblf_jax.core.pytree import component
 from iblf_jax.core.time import jump_times_of
-from iblf_jax.world.plants._base import Notation, Plant, component_names
+from iblf_jax.world.plants._base import Notation, Plant, component_names, components_in_words
 from iblf_jax.world.robots import Robot, inverse_dynamics, momentum
 
 
@@ -169,10 +169,9 @@ class RobotNotation(Notation):
         return component_names(self.plant)[index]
 
     def left_bounds(self, level: int, index: int) -> str:
-        """That a joint left its bounds, by its number and its name."""
-        name = component_names(self.plant)[index]
-        joint = name.capitalize() if name == f"joint {index}" else f"Joint {index} ({name})"
-        return f"{joint} left its {('bounds', 'velocity bounds')[level - 1]}"
+        """That a joint left its bounds."""
+        joint = components_in_words(self.plant)[index].removeprefix("joint ")
+        return f"Joint {joint} left its {('bounds', 'velocity bounds')[level - 1]}"
 
 
 def robot_acceleration(robot: Robot, q: jax.Array, dq: jax.Array, torque: jax.Array) -> jax.Array:

@@ -1,0 +1,417 @@
+"""The files of `new`: a scenario that was run, and a study, a tuning and a notebook of it."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from iblf_jax.core import checks
+
+if TYPE_CHECKING:
+    from iblf_jax.simulation.scenario import Scenario
+    from iblf_jax.world.robots import Arm
+
+PERIODS = (2e-3, 1e-3, 5e-4)
+"""Sampling periods [s] that are tried, from the longest: the gains of `arm_scenario` are chosen for
+500 Hz."""
+SLOWER = 1.5
+"""Factor of the motion's duration where it saturates the torques, at most SLOWINGS times."""
+SLOWINGS = 4
+LARGEST_TRAVEL = 0.8
+"""Largest motion of a joint [rad or m]; a quarter of the range where this is less."""
+LARGEST_DISTANCE = 0.15
+"""Largest distance of the bounds from the motion [rad or m]; a tenth of the range where this is
+less."""
+HOLDING = 0.8
+"""Largest share of a torque limit that gravity takes, with the payload of the study."""
+DURATIONS = {"zhang_yan_2024": 4.0, "ur5": 4.0, "iiwa14": 4.0}
+"""Preset that a project may start from -> length of its runs [s]."""
+
+
+class Project(NamedTuple):
+    """What the files of a project say."""
+
+    scenario: Scenario
+    text: str
+    """The file scenario.toml, without its table [run]."""
+    about: str
+    """The scenario in a sentence."""
+    duration: float
+    """Length of a run [s]."""
+    perturbations: dict[str, str]
+    """Path -> the entry of the study, in TOML."""
+    margin: float
+    """Least distance to the bounds that the tuning requires [rad]."""
+
+    @property
+    def period(self) -> float:
+        """The sampling period [s]."""
+        return float(self.scenario.sampling.period)  # type: ignore[union-attr]
+
+    @property
+    def dt(self) -> float:
+        """The time step [s]: half a sampling period."""
+        return self.period / 2
+
+
+def of_preset(name: str) -> Project:
+    """The project of a preset, sampled at the longest of PERIODS at which its run is ok.
+
+    Raises:
+      ValueError: a preset that is not in DURATIONS.
+    """
+    from iblf_jax.files.scenario import scenario_to_toml
+    from iblf_jax.presets import PRESETS
+
+    checks.one_of("--preset", name, tuple(DURATIONS))
+    start, duration = PRESETS[name](), DURATIONS[name]
+    scenario = next(filter(None, (_at(start, period, duration) for period in PERIODS)), start)
+    perturbations = {
+        "plant.mass": '{ factor = "uniform", low = 0.9, high = 1.1 }',
+        "initial.q": '{ offset = "uniform", low = -0.02, high = 0.02 }',
+    }
+    about = f"It is the preset {name}, with a sampled law."
+    return Project(scenario, scenario_to_toml(scenario), about, duration, perturbations, 0.02)
+
+
+def of_robot(file: Path, folder: Path, base: str | None, tip: str | None) -> Project:
+    """The project of a robot in a URDF or MJCF file: a motion from rest to rest within the ranges
+    of its joints, and bounds around it.
+
+    The motion and the sampling are those of the first run without a failure and without saturated
+    torques: a motion that saturates them becomes slower, and a loop that fails is sampled faster.
+
+    Args:
+      file: the robot's file.
+      folder: the folder of the project, to which the path of the file is relative.
+      base, tip: links, as for `iblf_jax.robots.load`.
+
+    Raises:
+      ValueError: a file that cannot be read, torque limits that do not hold the robot, or a robot
+        for which no such run was found; the message names the remedy.
+    """
+    from iblf_jax.presets import arm_scenario
+    from iblf_jax.world import references
+    from iblf_jax.world.bounds import Bounds, Constant
+    from iblf_jax.world.robots import load
+
+    arm = load(file, base, tip)
+    middle, half = _ranges(arm)
+    start = np.round(middle - np.minimum(0.25 * half, 0.5 * LARGEST_TRAVEL), 4)
+    end = np.round(middle + np.minimum(0.25 * half, 0.5 * LARGEST_TRAVEL), 4)
+    distance = np.round(np.minimum(0.2 * half, LARGEST_DISTANCE), 4)
+    payload = _payload(arm, np.linspace(start, end, 9), file)
+    bounds = Bounds(lower=Constant(start - distance), upper=Constant(end + distance))
+    speeds = np.where(np.isfinite(arm.speed), np.asarray(arm.speed), np.pi)
+    # The peak speed of a quintic motion is 15/8 of its mean.
+    time = max(1.0, float(np.max(15 / 8 * (end - start) / (0.5 * speeds))))
+    for _ in range(SLOWINGS):
+        time = float(np.ceil(10 * time) / 10)
+        motion = references.Quintic(start=start, end=end, duration=time)
+        loop = arm_scenario(arm, motion, bounds=bounds)
+        scenario = next(filter(None, (_at(loop, x, time + 0.5) for x in PERIODS)), None)
+        if scenario is not None:
+            break
+        time *= SLOWER
+    else:
+        inertia = np.diag(arm.mass_matrix(start))
+        least = int(np.argmin(inertia))
+        raise checks.fail(
+            "--robot",
+            str(file),
+            f"a robot whose law keeps it on a slow motion, sampled every {PERIODS[-1]:g} s",
+            f"The lightest joint is {arm.joints[least]}, with {inertia[least]:.2g} kg m^2: check"
+            " its inertia and that of its rotor (armature), or name a --tip before it.",
+        )
+    perturbations = {
+        "plant.mass": '{ factor = "uniform", low = 0.9, high = 1.1 }  # each link',
+        "plant.payload": f'{{ value = "uniform", low = 0.0, high = {payload} }}  # kg at the tip',
+        "initial.q": _offsets(distance),
+    }
+    if not payload:
+        del perturbations["plant.payload"]
+    text = _scenario_text(file, folder, {"base": base, "tip": tip}, scenario, distance)
+    about = f"Its robot is `{file.name}`, with the joints {', '.join(arm.joints)}."
+    margin = float(np.round(0.2 * np.min(distance), 4))
+    return Project(scenario, text, about, time + 0.5, perturbations, margin)
+
+
+def _ranges(arm: Arm) -> tuple[np.ndarray, np.ndarray]:
+    """Middle and half width of the part of each joint's range that is within half a turn (1 m) of
+    the middle or of the finite limit, (n,) each.
+    """
+    lower, upper = np.asarray(arm.lower, float), np.asarray(arm.upper, float)
+    reach = np.where(np.array(arm.kinds) == "prismatic", 1.0, np.pi)
+    highest = np.where(np.isfinite(upper), upper, reach)
+    low = np.where(np.isfinite(lower), lower, highest - 2 * reach)
+    high = np.where(np.isfinite(upper), upper, low + 2 * reach)
+    return (low + high) / 2, np.minimum((high - low) / 2, reach)
+
+
+def _offsets(distance: np.ndarray) -> str:
+    """The perturbation of the initial positions: a fifth of the distance to the bounds."""
+    width = float(np.round(0.2 * np.min(distance), 4))
+    return f'{{ offset = "uniform", low = {-width}, high = {width} }}  # rad, each joint'
+
+
+def _payload(arm: Arm, positions: np.ndarray, file: Path) -> float:
+    """A payload of at most 5 % of the arm's mass that its torque limits hold [kg].
+
+    Raises:
+      ValueError: the torque limits do not hold the arm itself.
+    """
+    limits = np.asarray(arm.effort)
+    payload = float(np.round(0.05 * np.sum(np.asarray(arm.mass)), 2))
+    for kg in (payload, round(payload / 4, 2), 0.0):
+        loaded = dataclasses.replace(arm, payload=kg)
+        shares = np.max([np.abs(loaded.gravity(q)) for q in positions], axis=0) / limits
+        if np.all(shares <= HOLDING):
+            return kg
+    worst = int(np.argmax(shares))
+    raise checks.fail(
+        "--robot",
+        str(file),
+        "torque limits that hold the robot",
+        f"Gravity takes {100 * shares[worst]:.0f} % of the limit {limits[worst]:g} N m of the joint"
+        f" {arm.joints[worst]}: correct <limit effort> or forcerange in the file.",
+    )
+
+
+def _at(scenario: Scenario, period: float, duration: float) -> Scenario | None:
+    """The scenario sampled at a period; None if its run fails, saturates its torques or is sampled
+    too slowly.
+    """
+    from iblf_jax.core.status import FAILED, Status, has_flag
+    from iblf_jax.engine.diagnosis import SimulationWarning
+    from iblf_jax.engine.simulate import simulate
+    from iblf_jax.simulation.sampling import Sampling
+    from iblf_jax.simulation.scenario import with_parts
+
+    sampled = with_parts(scenario, sampling=Sampling(period=period))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", SimulationWarning)  # the next attempt is the remedy
+        run = simulate(sampled, duration=duration, dt=period / 2)
+    unwanted = FAILED | Status.SAMPLING_TOO_SLOW | Status.TORQUE_SATURATED
+    if has_flag(int(run.status), unwanted):
+        return None
+    return sampled
+
+
+def write(project: Project, folder: Path) -> list[str]:
+    """Writes the files of a project into a folder; returns their names."""
+    run = f"[run]\nduration = {project.duration:g}  # s\ndt = {project.dt:g}  # s\n"
+    files = {
+        "scenario.toml": f"{project.text}\n{run}",
+        "study.toml": _study_text(project),
+        "tune.toml": _tuning_text(project),
+        "project.ipynb": _notebook_text(folder.resolve().name),
+        "README.md": _readme_text(project, folder.resolve().name),
+    }
+    for name, text in files.items():
+        (folder / name).write_text(text, encoding="utf-8")
+    return list(files)
+
+
+def _scenario_text(
+    file: Path,
+    folder: Path,
+    links: Mapping[str, str | None],
+    scenario: Scenario,
+    distance: np.ndarray,
+) -> str:
+    """The file scenario.toml of a robot, without its table [run]."""
+    named = [f"{name} = {json.dumps(link)}" for name, link in links.items() if link is not None]
+    motion: Any = scenario.reference
+    bounds: Any = scenario.bounds[0]
+    lines = [
+        "# The gains, the weight of the barrier and the torque limits follow from the robot's",
+        "# numbers (iblf_jax.presets.arm_scenario); a table [controller] replaces them.",
+        "[robot]",
+        f"file = {json.dumps(os.path.relpath(file, folder))}  # relative to this file",
+        *named,
+        "",
+        "[reference]  # from rest to rest",
+        'kind = "quintic"',
+        f"start = {_row(motion.start)}  # rad",
+        f"end = {_row(motion.end)}",
+        f"duration = {float(motion.duration):g}  # s",
+        "",
+        f"[bounds.lower]  # {_row(distance)} rad from the motion, inside the joint limits",
+        'kind = "constant"',
+        f"value = {_row(bounds.lower.value)}",
+        "",
+        "[bounds.upper]",
+        'kind = "constant"',
+        f"value = {_row(bounds.upper.value)}",
+        "",
+        "[sampling]",
+        f"period = {float(scenario.sampling.period):g}  # s",  # type: ignore[union-attr]
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def _row(values: Any) -> str:
+    return json.dumps(np.round(np.asarray(values, float), 4).tolist())
+
+
+def _study_text(project: Project) -> str:
+    entries = [f'"{path}" = {entry}' for path, entry in project.perturbations.items()]
+    return "\n".join(
+        [
+            "# What is uncertain, and how many runs the study makes.",
+            'scenario = "scenario.toml"',
+            "",
+            "[perturbations]",
+            *entries,
+            "",
+            "[study]",
+            "runs = 256",
+            "seed = 0",
+            "",
+        ]
+    )
+
+
+def _tuning_text(project: Project) -> str:
+    entries = [f'"{path}" = {entry}' for path, entry in project.perturbations.items()]
+    limits: Any = project.scenario.plant.effort  # type: ignore[union-attr]
+    torque = []
+    if limits is not None and np.all(np.isfinite(limits)):
+        torque = [
+            "[[requirement]]  # below the limits of the file, which leave no derivative",
+            'kind = "peak_torque_below"',
+            f"limit = {_row(0.9 * np.asarray(limits))}  # N m",
+            "",
+        ]
+    return "\n".join(
+        [
+            "# Which gains are tuned, what is minimised, and what is required.",
+            'scenario = "scenario.toml"',
+            "",
+            "[tune]",
+            "parameters = [",
+            '  "controller.K2",  # one number for each joint',
+            '  { path = "controller.k1", low = 1.0, high = 12.0, tied = true },  # one for all',
+            '  { path = "observer.kf", low = 2.0, high = 60.0, tied = true },',
+            "]",
+            'effort = "quick"  # or "normal", "thorough"',
+            "runs = 8  # perturbed runs of the search; the report makes others",
+            "",
+            "[tune.report]",
+            "runs = 64",
+            "",
+            "[[objective]]",
+            'kind = "tracking"',
+            "[[objective]]",
+            'kind = "effort"',
+            "weight = 0.1",
+            "",
+            "[[requirement]]",
+            'kind = "margin_above"',
+            f"limit = {project.margin:g}  # rad",
+            "",
+            *torque,
+            "[perturbations]  # those of study.toml",
+            *entries,
+            "",
+        ]
+    )
+
+
+def _notebook_text(name: str) -> str:
+    """The notebook: the scenario, a run, its figure and a study."""
+    cells = [
+        ("markdown", f"# {name}\n\nOne run of `scenario.toml`, and the study of `study.toml`."),
+        (
+            "code",
+            "import jax\n\nimport iblf_jax as ij\nfrom iblf_jax.files.scenario import"
+            " load_scenario_file\nfrom iblf_jax.files.study import load_study_file\n\n"
+            'jax.config.update("jax_enable_x64", True)\n'
+            'file = load_scenario_file("scenario.toml")\n'
+            "run = ij.simulate(file.scenario, **file.run)\nrun",
+        ),
+        ("code", "run.plot();"),
+        (
+            "code",
+            'plan = load_study_file("study.toml", "study")\n'
+            "study = ij.monte_carlo(plan.scenario, plan.perturbations, progress=False,"
+            " **plan.options)\nstudy",
+        ),
+        ("code", "study.plot();"),
+        (
+            "markdown",
+            "`iblf-jax tune tune.toml --out tuned` writes the tuned scenario, which"
+            ' `ij.load_scenario("tuned/scenario.toml")` reads.',
+        ),
+    ]
+    notebook = {
+        "cells": [_cell(i, kind, text) for i, (kind, text) in enumerate(cells)],
+        "metadata": {
+            "kernelspec": {"display_name": "Python 3", "language": "python", "name": "python3"},
+            "language_info": {"name": "python"},
+        },
+        "nbformat": 4,
+        "nbformat_minor": 5,
+    }
+    return json.dumps(notebook, indent=1) + "\n"
+
+
+def _cell(number: int, kind: str, text: str) -> dict[str, Any]:
+    cell: dict[str, Any] = {"cell_type": kind, "id": f"cell-{number}", "metadata": {}}
+    if kind == "code":
+        cell |= {"execution_count": None, "outputs": []}
+    return cell | {"source": text.splitlines(keepends=True)}
+
+
+COMMANDS = (
+    ("iblf-jax simulate scenario.toml --out run", "one run: metrics and `run/overview.png`"),
+    ("iblf-jax montecarlo study.toml --out study.nc", "256 runs with what is uncertain"),
+    ("iblf-jax tune tune.toml --out tuned", "gains for these runs: `tuned/report.txt`"),
+    ("iblf-jax export tuned/scenario.toml --out law", "the tuned law as C99"),
+)
+"""The commands of the README with their purposes: the next three, and the one after a tuning."""
+
+
+def _readme_text(project: Project, name: str) -> str:
+    *three, last = COMMANDS
+    return "\n".join(
+        [
+            f"# {name}",
+            "",
+            f"{project.about} The law runs every {1e3 * project.period:g} ms. It was run once"
+            f" before these files were written: the run of {project.duration:g} s kept its bounds.",
+            "",
+            "The next three commands, in this folder:",
+            "",
+            "```bash",
+            *(f"{command:<46} # {purpose}" for command, purpose in three),
+            "```",
+            "",
+            "When the report of the tuning says that its runs keep the bounds:",
+            "",
+            "```bash",
+            f"{last[0]:<46} # {last[1]}",
+            "```",
+            "",
+            "| File | Content | Change |",
+            "|---|---|---|",
+            "| `scenario.toml` | robot, motion, bounds, sampling | the motion, and the bounds"
+            " around it |",
+            "| `study.toml` | what is uncertain | the ranges of masses, payload and start |",
+            "| `tune.toml` | gains, objective, requirements | the requirements |",
+            "| `project.ipynb` | run and study in Python | |",
+            "",
+            "Sensors and motors are ideal until `scenario.toml` has tables [sensor] and"
+            " [actuator]. `iblf-jax doctor` shows what is installed, and"
+            " `iblf-jax parameters scenario.toml` every number that can be changed.",
+            "",
+        ]
+    )

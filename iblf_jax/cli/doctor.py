@@ -1,0 +1,191 @@
+"""`doctor`: what is installed, what is missing, and the remedy."""
+
+from __future__ import annotations
+
+import argparse
+import importlib.metadata
+import os
+import platform
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+HELP = "show what is installed and what is missing"
+DESCRIPTION = (
+    "Show the Python, JAX with its devices and precision, the compiler, the extras and the caches"
+    " that are found, and a remedy for what is missing or does not work."
+)
+EPILOG = (
+    "Exit code 1 if something is missing that every command needs, or that makes them slow: a"
+    " supported Python and JAX, a compiler, a folder for compiled programs.  A missing extra is"
+    " reported and no error."
+)
+
+TOOLS_OF_THE_PROJECT = ("docs", "browser", "test", "release", "bench")
+"""Extras for work on the package itself, which are not listed."""
+
+
+class Finding(NamedTuple):
+    """One line of the report."""
+
+    subject: str
+    found: str
+    remedy: str = ""
+    """What to do if it is missing."""
+    is_needed: bool = True
+    """Whether the exit code depends on it."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments of the command, of which there are none."""
+
+
+def run(args: argparse.Namespace) -> int:
+    """Runs the command."""
+    from iblf_jax.core import tables
+
+    findings = [*_versions(), _devices(), _compiler(), *_extras(), *_caches()]
+    rows = [(x.subject, "missing" if x.remedy else "ok", x.found) for x in findings]
+    print(*tables.as_text(rows, left=(0, 1, 2)), sep="\n")
+    faults = [x for x in findings if x.remedy]
+    if faults:
+        print("\nRemedies:", *(f"  {x.subject}: {x.remedy}" for x in faults), sep="\n")
+    return int(any(x.is_needed for x in faults))
+
+
+def _requirements() -> list[str]:
+    return importlib.metadata.requires("iblf_jax") or []
+
+
+def _versions() -> Iterator[Finding]:
+    """Package, Python, JAX and jaxlib."""
+    import iblf_jax
+
+    where = Path(iblf_jax.__file__).parent
+    yield Finding("iblf_jax", f"{iblf_jax.__version__}, {where}")
+    try:
+        supported = importlib.metadata.metadata("iblf_jax")["Requires-Python"]
+    except importlib.metadata.PackageNotFoundError:
+        remedy = "install the package: pip install . in a clone"
+        yield Finding("installation", "the package is imported and not installed", remedy)
+        return
+    version = platform.python_version()
+    remedy = ""
+    if not _is_within(version, supported):
+        remedy = f"take a Python {supported}"
+    yield Finding("Python", f"{version}, {sys.executable}", remedy)
+    allowed = {_name(x): re.sub(r"^[\w-]+", "", x) for x in _requirements() if ";" not in x}
+    for name in ("jax", "jaxlib"):
+        version = importlib.metadata.version(name)
+        remedy = ""
+        if not _is_within(version, allowed.get(name, "")):
+            remedy = f'pip install "{name}{allowed[name]}"'
+        yield Finding(name, version, remedy)
+
+
+def _is_within(version: str, specifier: str) -> bool:
+    """Whether a version satisfies conditions such as >=0.10.2,<0.13."""
+    for operator, bound in re.findall(r"(>=|<)\s*([\d.]+)", specifier):
+        is_below = _numbers_of(version) < _numbers_of(bound)
+        if is_below == (operator == ">="):
+            return False
+    return True
+
+
+def _numbers_of(version: str) -> tuple[int, ...]:
+    return tuple(int(x) for x in re.findall(r"\d+", version)[:3])
+
+
+def _name(requirement: str) -> str:
+    return re.split(r"[^\w-]", requirement, maxsplit=1)[0].lower()
+
+
+def _devices() -> Finding:
+    import jax
+
+    try:
+        devices = jax.devices()
+    except RuntimeError as error:
+        remedy = "set JAX_PLATFORMS=cpu, or install the driver and jax for this accelerator"
+        return Finding("devices", str(error).splitlines()[0], remedy)
+    kinds = sorted({f"{x.platform} ({x.device_kind})" for x in devices})
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return Finding("devices", f"{len(devices)}: {', '.join(kinds)}; {cores} cores; float64")
+
+
+def _compiler() -> Finding:
+    from iblf_jax.kernels.toolchain import ToolchainError, built_for
+
+    try:
+        return Finding("compiler", built_for()["compiler"])
+    except ToolchainError as error:
+        return Finding("compiler", "none that works; runs use XLA and are slower", str(error))
+
+
+def _extras() -> Iterator[Finding]:
+    """Every extra for users, with the packages that it lacks."""
+    packages: dict[str, list[str]] = {}
+    for requirement in _requirements():
+        package, _, condition = requirement.partition(";")
+        extra = re.search(r"extra\s*==\s*['\"](\w+)['\"]", condition)
+        if extra and extra[1] not in TOOLS_OF_THE_PROJECT and _is_here(condition):
+            packages.setdefault(extra[1], []).append(_name(package.strip()))
+    for name_of_extra, names in packages.items():
+        lacking = [name for name in names if not _version_of(name)]
+        found = ", ".join(f"{name} {_version_of(name)}".strip() for name in names)
+        remedy = ""
+        if lacking:
+            found = f"without {', '.join(lacking)}"
+            remedy = f'pip install "iblf_jax[{name_of_extra}]", or ".[{name_of_extra}]" in a clone'
+        yield Finding(f"extra {name_of_extra}", found, remedy, is_needed=False)
+
+
+def _is_here(condition: str) -> bool:
+    """Whether a requirement with this condition is one of this Python and platform."""
+    here = {
+        "python_version": ".".join(platform.python_version_tuple()[:2]),
+        "sys_platform": sys.platform,
+        "platform_machine": platform.machine(),
+    }
+    asked = re.findall(r"(\w+)\s*==\s*['\"]([^'\"]+)['\"]", condition)
+    return all(here[name] == value for name, value in asked if name in here)
+
+
+def _version_of(package: str) -> str:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return ""
+
+
+def _caches() -> Iterator[Finding]:
+    """The folder of compiled programs, and that of JAX if the user has chosen another one."""
+    import jax
+
+    from iblf_jax.kernels import directory
+
+    try:
+        folder = directory()
+    except OSError as error:
+        remedy = "set XDG_CACHE_HOME to a folder of yours that can be written"
+        yield Finding("compiled programs", str(error), remedy)
+        return
+    yield Finding("compiled programs", _size_of(folder))
+    config: Any = jax.config  # its fields are made when JAX starts
+    of_jax = config.jax_compilation_cache_dir
+    if of_jax is None:
+        remedy = "unset JAX_ENABLE_COMPILATION_CACHE"
+        if config.jax_enable_compilation_cache:
+            remedy = "none: XLA does not load its own programs on this processor (jax issue 38445)"
+        yield Finding("programs of XLA", "not kept between processes", remedy, is_needed=False)
+    elif not Path(of_jax).is_relative_to(folder):
+        yield Finding("programs of XLA", _size_of(Path(of_jax)))
+
+
+def _size_of(folder: Path) -> str:
+    """A folder, the number of its files and their size."""
+    files = [x for x in folder.rglob("*") if x.is_file() and not x.is_symlink()]
+    size = sum(x.stat().st_size for x in files) / 2**20
+    return f"{folder}, {len(files)} files, {size:.0f} MiB; may be deleted"
