@@ -29,6 +29,7 @@ import jax
 import numpy as np
 
 from iblf_jax.core import devices
+from iblf_jax.kernels import without_garbage_collection
 
 MAPS, MAX_MAPS = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
 COMPILE_EVENT = "/jax/core/compile/backend_compile_duration"
@@ -40,8 +41,14 @@ MAPS_OF_A_PROGRAM = 300
 """Approximate largest number of maps of a program: a step of an arm's closed loop has 250."""
 
 
-UNOPTIMISED = {"xla_backend_optimization_level": 0}
+UNOPTIMISED: dict[str, Any] = {"xla_backend_optimization_level": 0}
 """Compiler options of a program that is not optimised."""
+SHORTEST_TO_COMPILE = dict(UNOPTIMISED)
+"""Compiler options of a program that is not optimised and has no long loops."""
+if jax.__version_info__ < (0, 11):
+    # XLA has two ways to write the code of operations. The older one, which later releases do not
+    # have, needs half the time and gives the same numbers; a loop takes up to three times as long.
+    SHORTEST_TO_COMPILE["xla_cpu_use_fusion_emitters"] = False
 ZERO = np.zeros((), np.float32)
 """Put on a device, it is a tracer while JAX traces the code into a program."""
 MAX_PROGRAMS = 512
@@ -120,23 +127,29 @@ class StructuredFunction:
         programs: Programs,
         static_argnums: tuple[int, ...] = (),
         static_argnames: tuple[str, ...] = (),
-        optimised: bool = True,
+        options: dict[str, Any] | None = None,
     ) -> None:
         self._function = function
         self._programs = programs
         self._static_argnums = static_argnums
         self._static_argnames = static_argnames
-        self._optimised = optimised
+        self._options = options
         update_wrapper(self, function)
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         """The value of the function."""
-        return self._program(args, kwargs)(*args, **kwargs)
+        program = self._program(args, kwargs)
+        if program._cache_size():
+            return program(*args, **kwargs)
+        with without_garbage_collection():
+            return program(*args, **kwargs)
 
+    @without_garbage_collection()
     def trace(self, *args: Any, **kwargs: Any) -> Any:
         """As `trace` of `jax.jit`."""
         return self._program(args, kwargs).trace(*args, **kwargs)
 
+    @without_garbage_collection()
     def lower(self, *args: Any, **kwargs: Any) -> Any:
         """As `lower` of `jax.jit`."""
         return self._program(args, kwargs).lower(*args, **kwargs)
@@ -164,9 +177,9 @@ class StructuredFunction:
         # JAX accepts options for XLA only where it neither transforms the function nor makes it a
         # part of another program.
         options = None
-        if not self._optimised and devices.platform() == "cpu":
+        if self._options is not None and devices.platform() == "cpu":
             traced = any(isinstance(x, jax.core.Tracer) for x in (jax.device_put(ZERO), *leaves))
-            options = None if traced else UNOPTIMISED
+            options = None if traced else self._options
         shapes = tuple([getattr(x, "shape", ()) for x in leaves])
         key = (self._function, options is None, tuple(static), structure, shapes)
         return self._programs.get(key, partial(self._copy, options))
@@ -197,7 +210,7 @@ def jit(
     *,
     static_argnums: int | Sequence[int] = (),
     static_argnames: str | Sequence[str] = (),
-    optimised: bool = True,
+    options: dict[str, Any] | None = None,
 ) -> Any:
     """As `jax.jit`, for a function of many structures (head of this module); also a decorator with
     options.
@@ -206,14 +219,14 @@ def jit(
       function: the function.
       static_argnums: positions of arguments that are compiled in; they are hashable.
       static_argnames: names of keyword arguments that are compiled in.
-      optimised: whether XLA optimises the program on a CPU; one that runs for less time than it
-        compiles compiles sooner without.
+      options: compiler options of the program on a CPU, UNOPTIMISED or SHORTEST_TO_COMPILE for one
+        that runs for less time than it compiles; XLA's own if None.
     """
     numbers = (static_argnums,) if isinstance(static_argnums, int) else tuple(static_argnums)
     names = (static_argnames,) if isinstance(static_argnames, str) else tuple(static_argnames)
 
     def decorated(function: Callable) -> StructuredFunction:
-        return StructuredFunction(function, PROGRAMS, numbers, names, optimised)
+        return StructuredFunction(function, PROGRAMS, numbers, names, options)
 
     if function is None:
         return decorated

@@ -18,6 +18,7 @@ import contextlib
 import dataclasses
 import itertools
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import jax
@@ -30,8 +31,8 @@ from iblf_jax.engine import plan, registry, thresholds
 from iblf_jax.engine.batch import Batch, Stepper, carry_shapes, linearization_batch
 from iblf_jax.engine.carry import Inputs
 from iblf_jax.engine.linearization import LinearizationStep, linearization_steps
-from iblf_jax.engine.loops import kernel_stepper, program_of
-from iblf_jax.engine.plan import ExecutionPlan, Sizes, choose_plan
+from iblf_jax.engine.loops import kernel_stepper, program_of, scan
+from iblf_jax.engine.plan import ExecutionPlan, choose_plan
 from iblf_jax.engine.registry import Executor, Machine
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.time_step import TimeStep
@@ -43,6 +44,7 @@ from iblf_jax.kernels import (
     UnsupportedError,
     jaxprs,
     stop_own_compilers,
+    without_garbage_collection,
 )
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
 from iblf_jax.simulation.noise import needs_key, realised
@@ -142,12 +144,16 @@ def operations(inputs: Inputs) -> int:
     return jaxprs.count_executed_operations(jax.make_jaxpr(evaluate)(*arguments))
 
 
+def scan_of(inputs: Inputs) -> Stepper:
+    """The scan of a closed loop: the stages of a long one are a loop."""
+    return partial(scan, rolled=thresholds.rolls_stages(operations(inputs)))
+
+
 def plan_of_batch(
-    request: RunRequest, inputs: Inputs, varied: Mapping[str, Any], machine: Machine
+    request: RunRequest, varied: Mapping[str, Any], machine: Machine
 ) -> ExecutionPlan:
     """The plan of a batch on a machine."""
-    runs = len(next(iter(varied.values())))
-    return choose_plan(request, Sizes(operations(inputs), runs), machine)
+    return choose_plan(request, len(next(iter(varied.values()))), machine)
 
 
 @contextlib.contextmanager
@@ -226,6 +232,7 @@ class _Static:
     value: object
 
 
+@without_garbage_collection()
 def on_shapes(function: Callable[..., T], shapes: object) -> T:
     """The value of a function that depends only on the shapes of its arrays.
 
@@ -277,10 +284,6 @@ def compiled_plan(
     """
     arguments = _tree_of_shapes(structure, shapes)
 
-    def choose(arguments: Any) -> ExecutionPlan:
-        scenario, varied, folds, dt = arguments
-        return plan_of_batch(request, inputs_of(scenario, folds, dt, request), varied, machine)
-
     def programs(arguments: Any) -> tuple[StepProgram, StepProgram]:
         scenario, varied, folds, dt = arguments
         inputs = inputs_of(scenario, folds, dt, request)
@@ -299,7 +302,7 @@ def compiled_plan(
             executor.build(*step)
         return (executor.name,)
 
-    execution = on_shapes(choose, arguments)
+    execution = plan_of_batch(request, arguments[1], machine)
     return execution._replace(backends=first_that_works(execution, build, lambda: ()), warnings=())
 
 
@@ -333,7 +336,7 @@ def plan_of_single_run(
       shapes: shapes of their leaves (`shapes_of`).
     """
     inputs = _tree_of_shapes(structure, shapes)
-    execution = choose_plan(request, Sizes(on_shapes(operations, inputs), None), machine)
+    execution = choose_plan(request, None, machine)
     if not execution.backends:
         return SingleRunPlan(execution, 0)
 

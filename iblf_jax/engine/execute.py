@@ -38,6 +38,7 @@ from iblf_jax.engine.compile import (
     operations,
     plan_of_batch,
     run_by_executor,
+    scan_of,
     shapes_of,
     structural_part,
 )
@@ -87,7 +88,7 @@ def run_batch(
       ValueError: an unknown backend.
     """
     inputs = inputs_of(scenario, folds, dt, request)
-    execution = plan_of_batch(request, inputs, varied, registry.machine())
+    execution = plan_of_batch(request, varied, registry.machine())
     return _run_planned(execution, inputs, varied, request)
 
 
@@ -104,7 +105,7 @@ def _run_planned(
         return run_by_executor(executor, batch, request, run)
 
     def by_scan() -> Outcome:
-        return run(partial(scan, rolled=execution.rolled), Batch.of(inputs, varied))
+        return run(scan_of(inputs), Batch.of(inputs, varied))
 
     return first_that_works(execution, attempt, by_scan)
 
@@ -165,7 +166,7 @@ class CompiledBatch(NamedTuple):
                 return run(kernel_stepper(executor), batch)
 
         def by_scan() -> dict[str, jax.Array]:
-            return run(partial(scan, rolled=self.execution.rolled), Batch.of(inputs, varied))
+            return run(scan_of(inputs), Batch.of(inputs, varied))
 
         return first_that_works(self.execution, attempt, by_scan)
 
@@ -221,7 +222,7 @@ def run_batch_jvp(
     """
     inputs = inputs_of(scenario, folds, dt, request)
     along = Directions.of(directions)
-    execution = plan_of_batch(request, inputs, varied, registry.machine())
+    execution = plan_of_batch(request, varied, registry.machine())
 
     def attempt(executor: Executor) -> Tangents:
         batch = Batch.of(inputs, varied, request.constants)
@@ -235,8 +236,7 @@ def run_batch_jvp(
         return run_with_tangents(kernel_stepper(executor), batch, along, request)
 
     def by_scan() -> Tangents:
-        run_steps = partial(scan, rolled=execution.rolled)
-        return run_with_tangents(run_steps, Batch.of(inputs, varied), along, request)
+        return run_with_tangents(scan_of(inputs), Batch.of(inputs, varied), along, request)
 
     return first_that_works(execution, attempt, by_scan)
 
@@ -290,7 +290,7 @@ def run_batch_vjp(
       ValueError: an unknown backend or path.
     """
     inputs = inputs_of(scenario, folds, dt, request)
-    execution = plan_of_batch(request, inputs, varied, registry.machine())
+    execution = plan_of_batch(request, varied, registry.machine())
     numbers = {path: varied[path] for path in by}
 
     def attempt(executor: Executor) -> tuple[Outcome, Pullback]:
@@ -363,7 +363,7 @@ def _step_states(
     def by(run_steps: Stepper) -> tuple[Any, Any]:
         return run_steps(step, batch, carry, request.steps, 1)
 
-    by_scan = partial(by, partial(scan, rolled=execution.rolled))
+    by_scan = partial(by, partial(scan, rolled=True))
     return first_that_works(execution, lambda executor: by(kernel_stepper(executor)), by_scan)
 
 
@@ -402,5 +402,5 @@ def _sampled_jacobians(
     def by(run_steps: Stepper) -> jax.Array:
         return jacobians(run_steps, batch, carry)
 
-    by_scan = partial(by, partial(scan, rolled=execution.rolled))
+    by_scan = partial(by, partial(scan, rolled=True))
     return first_that_works(execution, lambda executor: by(kernel_stepper(executor)), by_scan)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -46,9 +45,12 @@ def outcome_of(
     """
     scenario = inputs.scenario
     accuracy = error_estimate.with_unresolved(carry.accuracy, unresolved)
+    maps: jax.Array | None = None
     rounding: dict[str, jax.Array] = {}
+    if inputs.scenario.sampling is not None:
+        maps = _period_maps(inputs, carry, instants)
     if not is_absent(accuracy.error_growth):
-        bounds = _bounds_of_growth(inputs, carry, instants)
+        bounds = _bounds_of_growth(inputs, carry, instants, maps)
         accuracy, rounding = error_growth.with_growth(accuracy, bounds, unresolved.width)
     modes = jax.vmap(partial(fastest_mode, inputs.scenario))(instants)
     mode = jnp.max(jnp.where(jnp.isfinite(modes), modes, 0.0))
@@ -71,8 +73,9 @@ def outcome_of(
         end = inputs.dt * inputs.steps
         metrics |= plant.switching(end)
         status |= flag(~plant.has_complete_path(end), Status.MODES_EXHAUSTED)
-    if inputs.scenario.sampling is not None:
-        radii, growth_by_sampling = jax.lax.stop_gradient(_sampling_radii(inputs, carry, instants))
+    if maps is not None:
+        found = _sampling_radii(inputs, carry, instants, maps)
+        radii, growth_by_sampling = jax.lax.stop_gradient(found)
         metrics[stability.RADIUS] = jnp.max(jnp.where(jnp.isfinite(radii), radii, 0.0))
         metrics |= rounding
         status |= flag(jnp.any(growth_by_sampling > 1.0), Status.SAMPLING_TOO_SLOW)
@@ -80,33 +83,37 @@ def outcome_of(
     return Outcome(None, metrics, status, mode)
 
 
-def _bounds_of_growth(inputs: Inputs, carry: Carry, instants: Linearization) -> jax.Array:
+def _period_maps(inputs: Inputs, carry: Carry, instants: Linearization) -> jax.Array:
+    """The `stability.period_map` at each instant, (k, m, m) [1]."""
+    derivatives = stability.resolved_jacobian(instants.jacobian, sampled=True)
+    return jax.vmap(partial(stability.period_map, inputs.scenario, carry.state))(derivatives)
+
+
+def _bounds_of_growth(
+    inputs: Inputs, carry: Carry, instants: Linearization, maps: jax.Array | None
+) -> jax.Array:
     """The largest `error_growth.bound` of the position error, (n,) [rad]; infinite for a continuous
-    loop.
+    loop, which has no period maps.
     """
-    sampling: Any = inputs.scenario.sampling
-    if sampling is None:
+    if maps is None:
         return jnp.full_like(carry.accuracy.error, jnp.inf)
+    sampling: Any = inputs.scenario.sampling
     derivatives = stability.resolved_jacobian(instants.jacobian, sampled=True)
     periods = inputs.dt * inputs.steps / sampling.period
     bound = partial(error_growth.bound, inputs.scenario, carry.accuracy.error_growth, carry.state)
-    found = jax.vmap(bound, in_axes=(0, None))(derivatives, periods)
+    found = jax.vmap(bound, in_axes=(0, 0, None))(derivatives, maps, periods)
     return jnp.max(found, axis=0)
 
 
 def _sampling_radii(
-    inputs: Inputs, carry: Carry, instants: Linearization
+    inputs: Inputs, carry: Carry, instants: Linearization, maps: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """The spectral radius of the period map at each instant, and the growth by sampling, (k,) each
     [1].
     """
     derivatives = stability.resolved_jacobian(instants.jacobian, sampled=True)
-
-    def radii_of(map_of: Callable) -> jax.Array:
-        maps = jax.vmap(partial(map_of, inputs.scenario, carry.state))(derivatives)
-        return jax.vmap(stability.spectral_radius)(maps)
-
-    radii = radii_of(stability.period_map)
-    continuous = radii_of(stability.continuous_map)
+    continuous_map = partial(stability.continuous_map, inputs.scenario, carry.state)
+    radii = jax.vmap(stability.spectral_radius)(maps)
+    continuous = jax.vmap(stability.spectral_radius)(jax.vmap(continuous_map)(derivatives))
     sampling: Any = inputs.scenario.sampling
     return radii, stability.growth_by_sampling(radii, continuous, sampling.period)

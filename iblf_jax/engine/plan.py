@@ -15,15 +15,6 @@ from iblf_jax.engine.registry import Availability, Machine
 from iblf_jax.engine.request import RunRequest, check_backend
 
 
-class Sizes(NamedTuple):
-    """Sizes that are known before a step is lowered."""
-
-    operations: int
-    """Operations of one evaluation of the closed loop."""
-    runs: int | None
-    """Runs of the batch; None for a single run."""
-
-
 class ExecutionPlan(NamedTuple):
     """How a request is executed."""
 
@@ -31,8 +22,6 @@ class ExecutionPlan(NamedTuple):
     """Names of the executors to try, best first.  If none of them can run it, the scan does."""
     reports_unsupported: bool
     """Whether to warn if the step cannot be lowered."""
-    rolled: bool = False
-    """Whether the integrator's stages are a loop in the scan."""
     warnings: tuple[str, ...] = ()
     """Warnings about the requested backend."""
 
@@ -42,12 +31,12 @@ class ExecutionPlan(NamedTuple):
         return next(iter(self.backends), "vmap")
 
 
-def choose_plan(request: RunRequest, sizes: Sizes, machine: Machine) -> ExecutionPlan:
+def choose_plan(request: RunRequest, runs: int | None, machine: Machine) -> ExecutionPlan:
     """The plan for a request.
 
     Args:
       request: what is to be run.
-      sizes: sizes of the closed loop and of the batch.
+      runs: runs of the batch; None for a single run.
       machine: the platform and its executors.
 
     Raises:
@@ -58,8 +47,7 @@ def choose_plan(request: RunRequest, sizes: Sizes, machine: Machine) -> Executio
     return ExecutionPlan(
         names,
         # A single run takes little time on any backend, so that "auto" does not warn.
-        reports_unsupported=sizes.runs is not None or backend != "auto",
-        rolled=thresholds.rolls_stages(sizes.operations),
+        reports_unsupported=runs is not None or backend != "auto",
         warnings=warnings,
     )
 
@@ -87,7 +75,7 @@ def plan_of_states(operations: int, backend: Availability) -> ExecutionPlan:
     backends: tuple[str, ...] = ()
     if backend.reason is None and operations <= thresholds.LONG_EVALUATION:
         backends = (backend.name,)
-    return ExecutionPlan(backends, reports_unsupported=False, rolled=True)
+    return ExecutionPlan(backends, reports_unsupported=False)
 
 
 def plan_of_jacobians(operations: int, backend: Availability) -> ExecutionPlan:
@@ -97,7 +85,7 @@ def plan_of_jacobians(operations: int, backend: Availability) -> ExecutionPlan:
     of six joints, XLA's program of the same loop 7 s.
     """
     if backend.reason is None and backend.name == "native":
-        return ExecutionPlan((backend.name,), reports_unsupported=False, rolled=True)
+        return ExecutionPlan((backend.name,), reports_unsupported=False)
     return plan_of_states(operations, backend)
 
 

@@ -13,7 +13,6 @@ results are the same.
 
 from __future__ import annotations
 
-from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -30,12 +29,13 @@ from iblf_jax.engine.compile import (
     first_that_works,
     inputs_of,
     plan_of_single_run,
+    scan_of,
     shapes_of,
     single_batch,
     structural_part,
 )
 from iblf_jax.engine.linearization import Linearization
-from iblf_jax.engine.loops import kernel_stepper, scan
+from iblf_jax.engine.loops import kernel_stepper
 from iblf_jax.engine.outcome import Outcome
 from iblf_jax.engine.registry import Executor
 from iblf_jax.engine.request import RunRequest
@@ -90,7 +90,7 @@ def run_one(
             raise
 
     def by_scan() -> Outcome:
-        return _run_by_scan(structure, execution.rolled, request, leaves)
+        return _run_by_scan(structure, request, leaves)
 
     backends = tuple(
         name
@@ -136,7 +136,7 @@ def _run_by_executor(compiled: Compiled, nodes: int, request: RunRequest, leaves
     return _finalize(compiled, without_steps, leaves, carry, at_start)._replace(records=records)
 
 
-@programs.jit(static_argnums=(0, 1), optimised=False)
+@programs.jit(static_argnums=(0, 1), options=programs.SHORTEST_TO_COMPILE)
 def _initialize(
     compiled: Compiled, request: RunRequest, leaves: list
 ) -> tuple[Carry, Linearization]:
@@ -192,7 +192,7 @@ def _steps(
     return carry, jax.tree.map(lambda x: x[0], records)
 
 
-@programs.jit(static_argnums=(0, 1), optimised=False)
+@programs.jit(static_argnums=(0, 1), options=programs.UNOPTIMISED)
 def _finalize(
     compiled: Compiled, request: RunRequest, leaves: list, carry: Carry, at_start: Linearization
 ) -> Outcome:
@@ -201,7 +201,7 @@ def _finalize(
     return jax.tree.map(lambda x: x[0], outcome)
 
 
-@programs.jit(static_argnums=(0, 1, 2))
-def _run_by_scan(structure: PyTreeDef, rolled: bool, request: RunRequest, leaves: list) -> Outcome:
-    batch = Batch.of(jax.tree.unflatten(structure, leaves), None)
-    return run_all(partial(scan, rolled=rolled), batch, request)
+@programs.jit(static_argnums=(0, 1))
+def _run_by_scan(structure: PyTreeDef, request: RunRequest, leaves: list) -> Outcome:
+    inputs = jax.tree.unflatten(structure, leaves)
+    return run_all(scan_of(inputs), Batch.of(inputs, None), request)

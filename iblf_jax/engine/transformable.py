@@ -28,18 +28,18 @@ from jax.custom_derivatives import SymbolicZero
 
 from iblf_jax.core import checks, programs
 from iblf_jax.core.caches import CACHE
-from iblf_jax.engine import registry, thresholds
+from iblf_jax.engine import registry
 from iblf_jax.engine.batch import Batch, run_all
 from iblf_jax.engine.columns import ACCURACY, Places, columns, floats_of, numbers_of
 from iblf_jax.engine.compile import (
     first_that_works,
     inputs_of,
-    operations,
     run_by_executor,
+    scan_of,
 )
 from iblf_jax.engine.derivatives import DerivativeSizes, choose_derivatives
 from iblf_jax.engine.direction import TracedRuns, derivative
-from iblf_jax.engine.loops import kernel_stepper, scan
+from iblf_jax.engine.loops import kernel_stepper
 from iblf_jax.engine.outcome import Outcome
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.single_run import run_one
@@ -79,7 +79,7 @@ def run_transformable(
 def _run_by_scan(runs: TracedRuns, *leaves: jax.Array) -> Outcome:
     """The run by the scan."""
     inputs = jax.tree.unflatten(runs.treedef, leaves)
-    run_steps = partial(scan, rolled=thresholds.rolls_stages(operations(inputs)))
+    run_steps = scan_of(inputs)
     return run_all(run_steps, Batch.of(inputs, None), runs.request)
 
 

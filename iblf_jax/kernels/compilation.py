@@ -43,7 +43,7 @@ class CompiledStep(NamedTuple):
 
 
 @contextlib.contextmanager
-def _without_garbage_collection() -> Iterator[None]:
+def without_garbage_collection() -> Iterator[None]:
     """Context manager, also a decorator, in which Python does not look for garbage.
 
     A trace and a program are many small objects that stay.  Python looks through all of them again
@@ -59,7 +59,7 @@ def _without_garbage_collection() -> Iterator[None]:
 
 
 @CACHES.function(maxsize=64)
-@_without_garbage_collection()
+@without_garbage_collection()
 def compile_step(
     step: Callable,
     dtype: np.dtype,

@@ -77,7 +77,7 @@ def interpret(b: Builder, jaxpr: Any, consts: Sequence[Ids], inputs: Sequence[Id
 
 def _check_float(b: Builder, dtype, eqn) -> None:
     """Refuses floats of another type than the program's, except constants, which are rounded."""
-    if np.issubdtype(dtype, np.floating) and dtype != b.dtype and eqn.invars:
+    if dtype != b.dtype and np.issubdtype(dtype, np.floating) and eqn.invars:
         raise UnsupportedError(f"it mixes {dtype} with {b.dtype} ({eqn.primitive.name})")
 
 

@@ -39,7 +39,7 @@ def rebuilt(program: Program, rule) -> Program:
     b = Builder(program.dtype)
     new: list[int] = []
     for i, node in enumerate(program.nodes):
-        args = tuple(new[a] for a in node.args)
+        args = tuple([new[a] for a in node.args])
         replacement = rule(b, node, args, i)
         if replacement is None:
             replacement = b.copy(node, args)

@@ -35,6 +35,10 @@ number of the step, the numbers that a step of a run reads from a series, and th
 function that a program calls."""
 
 
+SPECIAL = frozenset((*INPUTS, "const", "lookup", "call", "result"))
+"""Operations for which a `Builder` has a method of their own."""
+
+
 Ids = np.ndarray
 """An array of node numbers, int64, with the shape of the array that it represents."""
 
@@ -218,9 +222,9 @@ class Builder:
             rest = without_absent(self, op, args)
             if rest is not None:
                 return rest
-        nodes = [self.nodes[a] for a in args]
-        # The first argument decides most cases, without a generator.
-        if nodes[0].op == "const" and all(node.op == "const" for node in nodes):
+        # The first argument decides most cases.
+        if self.nodes[args[0]].op == "const" and all(self.nodes[a].op == "const" for a in args):
+            nodes = [self.nodes[a] for a in args]
             values = [node.value for node in nodes]
             if not self.exact or is_exact(op, values, kind):
                 folded = fold(op, values, [node.kind for node in nodes], kind, self.dtype)
@@ -254,6 +258,8 @@ class Builder:
 
     def copy(self, node: Node, args: Sequence[int]) -> int:
         """A node of another builder, with arguments of this one."""
+        if node.op not in SPECIAL:
+            return self.emit(node.op, *args, kind=node.kind)
         if node.op == "const":
             return self.constant(node.value, node.kind)
         if node.op in INPUTS:
@@ -264,9 +270,7 @@ class Builder:
             return self.call(node.value, args)
         if node.op == "call":
             return self.call(node.value, args[1:], args[0])
-        if node.op == "result":
-            return self.result(args[0], node.value)
-        return self.emit(node.op, *args, kind=node.kind)
+        return self.result(args[0], node.value)
 
     def depends_on_state(self, node: int) -> bool:
         """Whether a node is of class PER_RUN|TIME."""
@@ -397,26 +401,25 @@ def finished(
     The order matters to a compiler with few registers: a number is computed shortly before its
     first use.
     """
-    order: list[int] = []
+    found = builder.nodes
     place: dict[int, int] = {}
+    nodes: list[Node] = []
     for root in [*carry_out, *outputs]:
         stack = [root]
         while stack:
-            node = stack[-1]
-            if node in place:
+            i = stack[-1]
+            if i in place:
                 stack.pop()
                 continue
-            missing = [a for a in builder.nodes[node].args if a not in place]
+            op, args, kind, value = found[i]
+            missing = [a for a in args if a not in place]
             if missing:
-                stack.extend(reversed(missing))
+                missing.reverse()
+                stack += missing
                 continue
-            place[node] = len(order)
-            order.append(node)
+            place[i] = len(nodes)
+            nodes.append(Node(op, tuple([place[a] for a in args]), kind, value))
             stack.pop()
-    nodes = []
-    for i in order:
-        op, args, kind, value = builder.nodes[i]
-        nodes.append(Node(op, tuple([place[a] for a in args]), kind, value))
     carry = tuple((place.get(a, -1), place[b]) for a, b in zip(carry_in, carry_out, strict=True))
     kinds = tuple(builder.nodes[b].kind for b in carry_out)
     results = tuple(place[i] for i in outputs)

@@ -19,8 +19,11 @@ from iblf_jax.kernels.structure import STRUCTURE
 def each(b: Builder, op: str, eqn, *operands: Ids, kind: str | None = None) -> Ids:
     """Applies an operation entry by entry to operands of one shape (or scalars)."""
     kind = kind or kind_of(eqn.outvars[0].aval.dtype)
-    shape = np.broadcast_shapes(*(x.shape for x in operands))
-    flat = zip(*(np.broadcast_to(x, shape).ravel().tolist() for x in operands), strict=True)
+    shape = operands[0].shape
+    if any(x.shape != shape for x in operands):
+        operands = np.broadcast_arrays(*operands)
+        shape = operands[0].shape
+    flat = zip(*(x.ravel().tolist() for x in operands), strict=True)
     return np.asarray(b.emit_each(op, flat, kind), np.int64).reshape(shape)
 
 

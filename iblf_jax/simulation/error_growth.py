@@ -94,7 +94,7 @@ from iblf_jax.simulation.error_estimate import RELATIVE, TOLERANCE, Accuracy
 from iblf_jax.simulation.noise import normals
 from iblf_jax.simulation.sampling import Instant, step_commands
 from iblf_jax.simulation.scenario import Scenario
-from iblf_jax.simulation.stability import linear_flow, period_map
+from iblf_jax.simulation.stability import linear_flow
 
 T = TypeVar("T")
 
@@ -453,6 +453,7 @@ def bound(
     growth: ErrorGrowth,
     state: LoopState,
     derivative: jax.Array,
+    Phi: jax.Array,
     periods: jax.Array,
 ) -> jax.Array:
     """The smaller one of (A.4) and (A.5), (n,) [rad]; infinite where the sums overflow.
@@ -462,9 +463,10 @@ def bound(
       growth: after the run.
       state: of the loop, for its structure.
       derivative: of `closed_loop.perturbed_rate` by `closed_loop.perturbed_state`, (M, M).
+      Phi: its `stability.period_map`, (m, m) [1].
       periods: in the run, () [1].
     """
-    arguments = jax.lax.stop_gradient((scenario, growth, state, derivative, periods))
+    arguments = jax.lax.stop_gradient((scenario, growth, state, derivative, Phi, periods))
     rigorous, probable = (jnp.where(jnp.isnan(x), jnp.inf, x) for x in _bounds(*arguments))
     return jnp.minimum(rigorous, probable)
 
@@ -474,11 +476,11 @@ def _bounds(
     growth: ErrorGrowth,
     state: LoopState,
     derivative: jax.Array,
+    Phi: jax.Array,
     periods: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
     """(A.4) and (A.5), (n,) [rad] each; infinite or not a number where the sums overflow."""
     n = scenario.n
-    Phi = period_map(scenario, state, derivative)
     others, rounding = _inputs(scenario, growth, state, derivative, len(Phi))
     G = jnp.concatenate([others, rounding], axis=1)
 

@@ -109,6 +109,7 @@ def growth_rate(growth: PowerIteration) -> jax.Array:
     return jnp.exp(growth.log_growth / AVERAGED_STEPS)
 
 
+@jax.jit
 def growth_rate_of_matrix(jacobian: jax.Array) -> jax.Array:
     """The `growth_rate` of a power iteration with a Jacobian J, () [1/s].
 
@@ -223,6 +224,7 @@ def jacobian(scenario: Scenario, t: jax.Array, state: LoopState) -> jax.Array:
     return resolved_jacobian(by_size, scenario.sampling is not None)
 
 
+@jax.jit
 def linear_flow(A: jax.Array, B: jax.Array, t: jax.Array) -> jax.Array:
     """The flow of x' = A x + B u over a time t with a constant u: the derivative of x(t) by x(0)
     and by u, (m, m + n) for A (m, m) and B (m, n).
@@ -244,6 +246,7 @@ def linear_flow(A: jax.Array, B: jax.Array, t: jax.Array) -> jax.Array:
     return jax.lax.fori_loop(0, HALVINGS, doubled, short)
 
 
+@jax.jit
 def spectral_radius(A: jax.Array) -> jax.Array:
     """The spectral radius max |lambda_i(A)|, () [1]: |A^m|^(1/m) for m = 2^SQUARINGS."""
     tiny = jnp.finfo(A.dtype).tiny

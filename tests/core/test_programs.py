@@ -60,7 +60,7 @@ def test_it_may_be_transformed_and_called_in_another_program():
 
 def test_a_program_that_is_not_optimised_may_be_a_part_of_another():
     """JAX accepts options of the compiler for a whole program only."""
-    doubled = programs.jit(lambda x: 2 * x, optimised=False)
+    doubled = programs.jit(lambda x: 2 * x, options=programs.SHORTEST_TO_COMPILE)
     assert float(doubled(3.0)) == 6.0
     assert float(jax.jit(doubled)(3.0)) == 6.0
     assert float(jax.jit(lambda: doubled(3.0))()) == 6.0

@@ -6,6 +6,5 @@ from iblf_jax.engine.request import RunRequest
 
 def with_fallback(backend, run_on, by_scan):
     """`run_on(name)` with the first executor of the plan of a batch that works."""
-    request, sizes = RunRequest(1, backend=backend), plan.Sizes(700, 3)
-    execution = plan.choose_plan(request, sizes, registry.machine())
+    execution = plan.choose_plan(RunRequest(1, backend=backend), 3, registry.machine())
     return compile.first_that_works(execution, lambda executor: run_on(executor.name), by_scan)

@@ -221,7 +221,7 @@ def test_the_bounds_are_those_of_the_worst_and_of_random_rounding_errors():
     derivative = stability.jacobian(scenario, jnp.zeros(()), state)
     growth = error_growth.initial_growth(scenario, state, derivative)
     plant = ravel_pytree(integrated_part(state))[0].size
-    Phi = np.asarray(stability.period_map(scenario, state, derivative))
+    Phi = stability.period_map(scenario, state, derivative)
     A, B = derivative[:plant, :plant], derivative[:plant, plant : plant + 2]
     by_torque = np.asarray(stability.linear_flow(A, B, scenario.sampling.period))[:, plant:]
     law = np.asarray(derivative[plant:, :2])
@@ -230,9 +230,9 @@ def test_the_bounds_are_those_of_the_worst_and_of_random_rounding_errors():
     term, terms = np.concatenate([by_reading, by_level], axis=1), []
     for _ in range(8192):
         terms.append(term[:2])
-        term = Phi @ term
+        term = np.asarray(Phi) @ term
     terms = np.array(terms)
-    found = partial(error_growth._bounds, scenario, growth, state, derivative)
+    found = partial(error_growth._bounds, scenario, growth, state, derivative, Phi)
     worst = np.abs(terms).sum(axis=2)
     np.testing.assert_allclose(found(jnp.asarray(20.0))[0], worst[:20].sum(axis=0), rtol=1e-9)
     rigorous, probable = (np.asarray(x) for x in found(jnp.asarray(5000.0)))
@@ -243,7 +243,7 @@ def test_the_bounds_are_those_of_the_worst_and_of_random_rounding_errors():
     deviations = np.sqrt((terms**2).sum(axis=(0, 2)))
     likely = np.sqrt(2 * np.log(2 * 2 * 5000 / error_growth.PROBABILITY)) * deviations
     np.testing.assert_allclose(probable, constant + likely, rtol=1e-9)
-    lower = error_growth.bound(scenario, growth, state, derivative, jnp.asarray(5000.0))
+    lower = error_growth.bound(scenario, growth, state, derivative, Phi, jnp.asarray(5000.0))
     np.testing.assert_array_equal(lower, np.minimum(rigorous, probable))
 
 
@@ -257,7 +257,8 @@ def test_the_bound_covers_the_longest_run(periods):
     growth = error_growth.initial_growth(scenario, state, derivative)
     plant = ravel_pytree(integrated_part(state))[0].size
     derivative = derivative.at[:2, plant : plant + 2].set(jnp.eye(2))
-    found = error_growth.bound(scenario, growth, state, derivative, jnp.asarray(periods))
+    Phi = stability.period_map(scenario, state, derivative)
+    found = error_growth.bound(scenario, growth, state, derivative, Phi, jnp.asarray(periods))
     np.testing.assert_allclose(found, periods * 4e-3 * 1.5, rtol=1e-9)
 
 
@@ -268,7 +269,8 @@ def test_a_bound_that_overflows_is_infinite():
     derivative = stability.jacobian(scenario, jnp.zeros(()), state)
     growth = error_growth.initial_growth(scenario, state, derivative)
     derivative = derivative + 100.0 * jnp.eye(len(derivative))
-    found = error_growth.bound(scenario, growth, state, derivative, jnp.asarray(1e6))
+    Phi = stability.period_map(scenario, state, derivative)
+    found = error_growth.bound(scenario, growth, state, derivative, Phi, jnp.asarray(1e6))
     assert np.all(np.isposinf(found))
 
 
