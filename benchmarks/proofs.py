@@ -21,7 +21,7 @@ import iblf_jax as ij
 
 COLUMNS = [
     *("case", "K2", "kf", "level", "parameters"),
-    *("verdict", "boxes", "expected boxes", "share", "seconds"),
+    *("verdict", "boxes", "expected boxes", "share", "seconds", "largest torque [N m]"),
 ]
 MASSES = "plant.mass, plant.inertia"
 
@@ -151,6 +151,9 @@ def row(case: Case, boxes: int) -> list[Any]:
     prove(5000)  # compiles
     proof = prove(boxes)
     expected, _ = proof.expected_boxes or (float("nan"), 0.0)
+    torque = ""
+    if proof.torque is not None and proof.torque.is_proved:
+        torque = ", ".join(f"{size:.3g}" for size in proof.torque.largest)
     return [
         case.name,
         case.K2,
@@ -162,6 +165,7 @@ def row(case: Case, boxes: int) -> list[Any]:
         float(f"{expected:.2g}"),
         round(float(proof.done), 4),
         round(proof.seconds, 2),
+        torque,
     ]
 
 

@@ -35,6 +35,9 @@ def proof_to_xarray(proof: Proof) -> xarray.Dataset:
     data["xi"] = (("time", "joint"), tube.xi, {"units": "1"})
     data["range"] = (("path", "end"), np.array(list(proof.ranges.values())).reshape(-1, 2), {})
     data["largest_rate"] = (("weight",), np.array(list(proof.rates.values())), {})
+    if proof.torque is not None:
+        ends = np.stack([proof.torque.lowest, proof.torque.highest], axis=1)
+        data["torque"] = (("joint", "end"), ends, {"units": signal_unit(proof.scenario, "tau")})
     attributes = {
         "verdict": str(proof.verdict),
         "statement": proof.sentence(),

@@ -13,7 +13,9 @@ from iblf_jax.proofs.gains import GuaranteedGains as GuaranteedGains
 from iblf_jax.proofs.gains import gains_for_guarantee as gains_for_guarantee
 from iblf_jax.proofs.largest import largest_level as largest_level
 from iblf_jax.proofs.largest import largest_parameters as largest_parameters
+from iblf_jax.proofs.proposal import LevelChoice as LevelChoice
 from iblf_jax.proofs.result import GrowthPoint as GrowthPoint
 from iblf_jax.proofs.result import GuaranteedTube as GuaranteedTube
 from iblf_jax.proofs.result import Proof as Proof
 from iblf_jax.proofs.result import Verdict as Verdict
+from iblf_jax.proofs.torque import TorqueRange as TorqueRange

@@ -1,18 +1,21 @@
 """`prove`: is a level set of V_w invariant for all times and all parameters of a box?
 
-V_w = V with the weight w of the estimation error.  Three steps answer:
+V_w = V with the weight w of the estimation error.  Four steps answer:
 
 1. Points of the level set are drawn for every weight of a grid, and V_w' is increased from the
    largest ones by random steps.  If every weight has a point with V_w' > 0, no weight proves the
    statement.
 2. At the weight with the least largest V_w', or at a neighbour with which the search advances
    faster, branch and bound with outward rounding decides whether V_w' < 0 everywhere.
-3. Without a proof, runs start at the points with the largest V_w': one that violates the bounds
+3. At this weight, bounds of the torque on the whole set are proved. Limits of the torque are part
+   of the statement: weights with a torque beyond them do not count.
+4. Without a proof, runs start at the points with the largest V_w': one that violates the bounds
    refutes the statement.
 """
 
 from __future__ import annotations
 
+import functools
 import math
 import time
 import warnings
@@ -26,29 +29,25 @@ from numpy.typing import ArrayLike
 
 from iblf_jax.core import checks, notices
 from iblf_jax.core.progress import announced
+from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.status import Status
 from iblf_jax.engine.simulate import SimulationWarning, simulate
 from iblf_jax.kernels import UnsupportedError, enclose
-from iblf_jax.proofs.arms import arm_problem
+from iblf_jax.proofs.arms import ArmProblem, arm_problem
 from iblf_jax.proofs.chains import chain_problem
 from iblf_jax.proofs.periods import AperiodicError
+from iblf_jax.proofs.points import PARENTS, Sampled, sample_weights
 from iblf_jax.proofs.problem import LevelSetProblem
+from iblf_jax.proofs.proposal import LevelChoice, Proposal, Start, proposed_level, start_of
 from iblf_jax.proofs.result import GrowthPoint, Proof, Verdict, Violation, WorstBox
 from iblf_jax.proofs.search import SearchedBox, SearchResult, search
+from iblf_jax.proofs.torque import TorqueRange, found_torque, proved_torque
 from iblf_jax.proofs.undecided import left_over
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.distributions import Perturbation
 
 EXAMPLE = '{"plant.mass": ij.factor(ij.interval(0.97, 1.03))}'
-POINTS = 2048
-"""Points of the level set at which V_w' is computed together."""
-PARENTS = 32
-"""Points from which V_w' is increased."""
-ROUNDS = 8
-"""Rounds of random steps from the best points."""
-SHRINKAGE = 0.6
-"""Factor of the size of the random steps after each round."""
 WEIGHTS_PER_DECADE = 4
 LEAST_RATIO, GREATEST_RATIO = 0.25, 1e3
 """Ends of the grid of weights, in parts of 1/(K2 kf). Below 1/(4 K2 kf), V_w' > 0 for an estimation
@@ -67,21 +66,6 @@ TIME_STEPS = (1e-3, 1e-4, 1e-5)
 """Their time steps [s]: the first one with which a run is accurate."""
 UNRELIABLE = Status.INACCURATE | Status.STEP_TOO_LARGE
 """Flags of runs that refute nothing."""
-
-
-class _Sampled(NamedTuple):
-    """The largest V_w' that was found at a weight."""
-
-    weight: float
-    points: np.ndarray
-    """The points with the largest V_w', in descending order, (PARENTS, p)."""
-    rates: np.ndarray
-    """V_w' there, (PARENTS,)."""
-
-    @property
-    def largest(self) -> float:
-        """The largest V_w'."""
-        return float(self.rates[0])
 
 
 @notices.each_warning_once
@@ -111,10 +95,12 @@ def prove(
 
     Args:
       scenario: the loop of a robot with the corrected backstepping law and the momentum observer,
-        or of a plant in strict-feedback form of order 2 or 3 with one number per level and the law
-        `BarrierBackstepping`.
-      level: level c of V_w, in its unit, N m rad for robots; required. V_w of a start that the set
-        must contain is at least V[0] of its run; `largest_level` searches the greatest level.
+        whose torque may have limits (`Saturated`, `Motor`), or of a plant in strict-feedback form
+        of order 2 or 3 with one number per level and the law `BarrierBackstepping`.
+      level: level c of V_w, in its unit, N m rad for robots. If not given, for a robot half of the
+        greatest level at which no point with V_w' > 0 was found, or the least level whose set
+        contains the start if that is more; `Proof.level_choice` has both. `largest_level` searches
+        the greatest level with a proof.
       parameters: required; path -> `factor`, `offset` or `value` of an `interval`, such as
         {"plant.mass": ij.factor(ij.interval(0.97, 1.03))}; paths joined by commas vary together;
         {} for the plant as given.
@@ -141,73 +127,43 @@ def prove(
     Source: design of this package; branch and bound with interval arithmetic as in R. E. Moore,
       R. B. Kearfott, M. J. Cloud, Introduction to Interval Analysis, 2009.
     """
-    if weight is not None:
-        checks.positive_number("weight", weight, "rad/(N m)")
-    max_boxes = checks.positive_integer("max_boxes", max_boxes, most=10**15)
-    if threads is not None:
-        threads = checks.positive_integer("threads", threads, most=1024)
-    progress = checks.boolean("progress", progress, optional=True)
-    if checkpoint is not None:
-        checkpoint = checks.file_to_write("checkpoint", checkpoint)
-    runs = checks.positive_integer("runs", runs, least=0, most=PARENTS)
-    seed = checks.seed(seed)
-    options = _Options(
-        max_boxes=max_boxes, threads=threads, progress=progress, checkpoint=checkpoint, seed=seed
-    )
-    level, parameters = _chosen(level, parameters)
+    options = _options(weight, max_boxes, threads, progress, checkpoint, runs, seed)
+    parameters = _checked_parameters(parameters)
+    if level is not None:
+        level = checks.positive_number("level", level, "the unit of V_w")
     problem = problem_of(scenario, parameters, duration, disturbance_rate)
-    start = time.monotonic()
+    begin = time.monotonic()
     with jax.enable_x64(True):
         scenario = canonical(scenario)
-        sampled = sample_weights(problem, level, weights_of(scenario, weight), seed)
-        best = min(sampled, key=lambda each: each.largest)
-        result, growth_points, of_search = None, [], {}
-        if best.largest <= 0.0:
-            best, result = _search_best_weight(problem, level, sampled, best, options)
-            of_search = _of_search(problem, level, best.weight, result, seed)
-        else:
-            # For each weight, V_w' > 0 at a point of the set.
-            for each in sampled:
-                constants = problem.constants(each.weight, level)
-                state = problem.state_of(each.points[0], constants)
-                growth_points.append(GrowthPoint(each.weight, each.largest, state))
-        violation, verdict = None, Verdict.PROVED
-        if result is None or not result.proved:
-            violation = _refuted(problem, level, best, runs)
-            verdict = Verdict.NOT_PROVED if result is None else Verdict.UNDECIDED
-        if violation is not None:
-            verdict = Verdict.REFUTED
+        weights = weights_of(scenario, weight)
+        start = None
+        if level is None:
+            start, proposal = _chosen_level(problem, weights, options)
+            level, weights, largest = proposal
+        sampled = sample_weights(problem, level, weights, seed)
+        findings = _decided(problem, level, sampled, options)
+        if start is not None:
+            choice = LevelChoice(start.level(findings["weight"]), largest)
+            findings["level_choice"] = choice
         return Proof(
-            verdict=verdict,
             scenario=scenario,
             parameters=dict(parameters),
             ranges=problem.uncertain.scales(),
             level=level,
-            weight=best.weight,
             duration=problem.duration,
             is_period=problem.is_period,
-            seconds=time.monotonic() - start,
+            seconds=time.monotonic() - begin,
             rates={each.weight: each.largest for each in sampled},
-            growth_points=tuple(growth_points),
-            violation=violation,
             assumptions=problem.assumptions,
             disturbance_rate=disturbance_rate,
-            **of_search,
+            **findings,
         )
 
 
-def _chosen(
-    level: float | None, parameters: Mapping[str, Perturbation] | None
-) -> tuple[float, Mapping[str, Perturbation]]:
-    """Level and parameters; the error says how to choose what is missing."""
-    if level is None:
-        expected = "a level of V_w, such as level=0.5 [the unit of V_w]"
-        remedy = (
-            "V_w of a start that the set must contain is at least V[0] of its run"
-            " (ij.simulate(scenario, ...).V); ij.largest_level(scenario, parameters=...,"
-            " between=(0.01, 10.0)) searches the greatest level that can be proved."
-        )
-        raise checks.fail("level", None, expected, remedy)
+def _checked_parameters(
+    parameters: Mapping[str, Perturbation] | None,
+) -> Mapping[str, Perturbation]:
+    """The parameters; the error says how to choose what is missing."""
     if parameters is None:
         remedy = (
             "Name what is uncertain, with its interval: ij.parameters(scenario) lists the paths,"
@@ -215,17 +171,72 @@ def _chosen(
         )
         raise checks.fail("parameters", None, f"a mapping such as {EXAMPLE}", remedy)
     checks.mapping("parameters", parameters, EXAMPLE)
-    return checks.positive_number("level", level, "the unit of V_w"), parameters
+    return parameters
+
+
+def _chosen_level(
+    problem: LevelSetProblem, weights: Sequence[float], options: _Options
+) -> tuple[Start, Proposal]:
+    """A level whose set contains the start of a robot's scenario."""
+    if not isinstance(problem, ArmProblem):
+        expected = "a level of V_w, such as level=0.5 [the unit of V_w]"
+        remedy = (
+            "V_w of a start that the set must contain is at least V[0] of its run"
+            " (ij.simulate(scenario, ...).V); ij.largest_level(scenario, parameters=...,"
+            " between=(0.01, 10.0)) searches the greatest level that can be proved."
+        )
+        raise checks.fail("level", None, expected, remedy)
+
+    def decreases(level: float, some: list[float]) -> bool:
+        try:
+            problem.constants(some[0], level)
+        except ValueError:  # the level reaches the guard of the barrier
+            return False
+        sampled = sample_weights(problem, level, some, options.seed)
+        return any(
+            each.largest <= 0.0 and _excess(problem, level, each, options) <= 0.0
+            for each in sampled
+        )
+
+    start = start_of(problem)
+    return start, proposed_level(start, weights, decreases)
 
 
 class _Options(NamedTuple):
-    """The options of the searches at all weights."""
+    """The options of the searches at all weights, and of the runs."""
 
     max_boxes: int
     threads: int | None
     progress: bool | None
     checkpoint: str | PathLike | None
+    runs: int
     seed: int
+
+
+def _options(
+    weight: float | None,
+    max_boxes: int,
+    threads: int | None,
+    progress: bool | None,
+    checkpoint: str | PathLike | None,
+    runs: int,
+    seed: int,
+) -> _Options:
+    """The options, checked."""
+    if weight is not None:
+        checks.positive_number("weight", weight, "rad/(N m)")
+    if threads is not None:
+        threads = checks.positive_integer("threads", threads, most=1024)
+    if checkpoint is not None:
+        checkpoint = checks.file_to_write("checkpoint", checkpoint)
+    return _Options(
+        max_boxes=checks.positive_integer("max_boxes", max_boxes, most=10**15),
+        threads=threads,
+        progress=checks.boolean("progress", progress, optional=True),
+        checkpoint=checkpoint,
+        runs=checks.positive_integer("runs", runs, least=0, most=PARENTS),
+        seed=checks.seed(seed),
+    )
 
 
 def problem_of(
@@ -257,7 +268,7 @@ def weights_of(scenario: Scenario, weight: float | None) -> list[float]:
         return [float(weight)]
     if scenario.loop.plant.uncertain_levels:
         return _grid(LEAST_CHAIN_WEIGHT, GREATEST_CHAIN_WEIGHT)
-    law: Any = scenario.controller
+    law: Any = unwrapped(scenario.controller)
     observer: Any = scenario.observer
     scale = 1.0 / float(np.min(np.asarray(law.K2)) * np.min(np.asarray(observer.kf)))
     return _grid(LEAST_RATIO * scale, GREATEST_RATIO * scale)
@@ -269,112 +280,153 @@ def _grid(low: float, high: float) -> list[float]:
     return np.geomspace(low, high, count).tolist()
 
 
-# --- points of the level set ---------------------------------------------------------------------
+# --- the decision --------------------------------------------------------------------------------
 
 
-def sample_weights(
-    problem: LevelSetProblem, level: float, weights: Sequence[float], seed: int
-) -> list[_Sampled]:
-    """The largest V_w' that was found at each weight.
+def _decided(
+    problem: LevelSetProblem, level: float, sampled: Sequence[Sampled], options: _Options
+) -> dict[str, Any]:
+    """The fields of a `Proof` with the verdict and what it rests on."""
+    decreasing = [each for each in sampled if each.largest <= 0.0]
+    admitted = [each for each in decreasing if _excess(problem, level, each, options) <= 0.0]
+    if admitted:
+        return _searched_at_best(problem, level, admitted, options)
+    best = min(sampled, key=lambda each: each.largest)
+    fields: dict[str, Any] = {}
+    if decreasing:
+        best = min(decreasing, key=lambda each: _excess(problem, level, each, options))
+        fields["torque"] = _torque(problem, level, best, options, to_prove=False)
+    else:
+        fields["growth_points"] = _growth_points(problem, level, sampled)
+    violation = _refuted(problem, level, best, options.runs)
+    verdict = Verdict.NOT_PROVED if violation is None else Verdict.REFUTED
+    return {"verdict": verdict, "weight": best.weight, "violation": violation, **fields}
 
-    The points of one weight are among the first ones of the next, because a point is one of every
-    level set.
+
+def _growth_points(
+    problem: LevelSetProblem, level: float, sampled: Sequence[Sampled]
+) -> tuple[GrowthPoint, ...]:
+    """For each weight the point with the largest V_w'."""
+    points = []
+    for each in sampled:
+        state = problem.state_of(each.points[0], problem.constants(each.weight, level))
+        points.append(GrowthPoint(each.weight, each.largest, state))
+    return tuple(points)
+
+
+def _searched_at_best(
+    problem: LevelSetProblem, level: float, admitted: Sequence[Sampled], options: _Options
+) -> dict[str, Any]:
+    """The fields of a `Proof` at the best of some weights, from a search."""
+    best, result = _search_best_weight(problem, level, admitted, options)
+    fields = _of_search(problem, level, best.weight, result, options.seed)
+    is_within = True
+    if problem.torque is not None:
+        torque = _torque(problem, level, best, options, to_prove=result.proved)
+        fields["torque"] = torque
+        is_within = problem.torque.limits is None or torque.is_proved
+    violation, verdict = None, Verdict.PROVED
+    if not result.proved or not is_within:
+        violation = _refuted(problem, level, best, options.runs)
+        verdict = Verdict.UNDECIDED if violation is None else Verdict.REFUTED
+    return {"verdict": verdict, "weight": best.weight, "violation": violation, **fields}
+
+
+def _torque(
+    problem: LevelSetProblem, level: float, at: Sampled, options: _Options, *, to_prove: bool
+) -> TorqueRange:
+    """The torque at a weight: the extremes that were found, and bounds where they are to be proved
+    and no torque beyond a limit was found.
     """
-    points = problem.sample(seed, POINTS)
-    of_weights = []
-    for weight in weights:
-        sampled = _largest_rates(problem, problem.constants(weight, level), weight, points, seed)
-        points = np.concatenate([sampled.points, points[: POINTS - PARENTS]])
-        of_weights.append(sampled)
-    return of_weights
+    assert problem.torque is not None
+    constants = problem.constants(at.weight, level)
+    found = found_torque(problem, constants, options.seed)
+    limits = problem.torque.limits
+    if not to_prove or (limits is not None and found.excess(limits) > 0.0):
+        return found
+    searched = functools.partial(_searched, problem, options)
+    return proved_torque(problem, constants, found, limits, searched, options.max_boxes)
 
 
-def _largest_rates(
-    problem: LevelSetProblem,
-    constants: Sequence[np.ndarray],
-    weight: float,
-    points: np.ndarray,
-    seed: int,
-) -> _Sampled:
-    """Increases V_w' from the best of some points.
-
-    Each round moves coordinates of the best points a part of the way to those of random points,
-    with which times and parameters stay in their intervals.
+def _excess(problem: LevelSetProblem, level: float, at: Sampled, options: _Options) -> float:
+    """How far the torque that was found at a weight is beyond the limits, in parts of their
+    distance; 0 or less inside, and without limits.
     """
-    best, rates = _best(points, problem.rate(points, constants))
-    generator = np.random.default_rng(seed)
-    part = 1.0
-    for number in range(ROUNDS):
-        part *= SHRINKAGE
-        random = problem.sample(seed + 1 + number, POINTS)
-        parents = np.repeat(best, POINTS // PARENTS, axis=0)
-        # Some steps change only a few coordinates: the largest rates are at corners of the others.
-        changed = generator.uniform(size=random.shape) < 0.5
-        candidates = parents + part * changed * (random - parents)
-        joined = np.concatenate([best, candidates])
-        best, rates = _best(joined, np.concatenate([rates, problem.rate(candidates, constants)]))
-    return _Sampled(weight, best, rates)
-
-
-def _best(points: np.ndarray, rates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The points with the largest rates."""
-    order = np.argsort(-np.nan_to_num(rates, nan=-np.inf), kind="stable")[:PARENTS]
-    return points[order], rates[order]
+    if problem.torque is None or problem.torque.limits is None:
+        return 0.0
+    found = _torque(problem, level, at, options, to_prove=False)
+    return found.excess(problem.torque.limits)
 
 
 # --- branch and bound ----------------------------------------------------------------------------
 
 
 def _search_best_weight(
-    problem: LevelSetProblem,
-    level: float,
-    sampled: Sequence[_Sampled],
-    best: _Sampled,
-    options: _Options,
-) -> tuple[_Sampled, SearchResult]:
-    """The search at the best weight, or at a neighbour with which it advances faster."""
+    problem: LevelSetProblem, level: float, sampled: Sequence[Sampled], options: _Options
+) -> tuple[Sampled, SearchResult]:
+    """The search at the weight with the least largest V_w', or at a neighbour with which it
+    advances faster.
+    """
+    best = min(sampled, key=lambda each: each.largest)
     candidates = [best]
     if len(sampled) > 1:
         neighbours = [factor * best.weight for factor in REFINEMENTS]
         more = sample_weights(problem, level, neighbours, options.seed)
-        candidates += [each for each in more if each.largest < 0.0]
+        candidates += [
+            each
+            for each in more
+            if each.largest < 0.0 and _excess(problem, level, each, options) <= 0.0
+        ]
     trials = min(TRIAL_BOXES, options.max_boxes)
     results = []
     for candidate in candidates:
-        result = _search_at(candidate.weight, problem, level, trials, options, checkpoint=None)
+        result = _rate_searched(candidate.weight, problem, level, trials, options)
         if result.proved:
             return candidate, result
         results.append((candidate, result))
     candidate, result = max(results, key=lambda pair: pair[1].done)
     if trials == options.max_boxes:
         return candidate, result
-    result = _search_at(
-        candidate.weight, problem, level, options.max_boxes, options, options.checkpoint
+    most = options.max_boxes
+    result = _rate_searched(
+        candidate.weight, problem, level, most, options, checkpoint=options.checkpoint
     )
     return candidate, result
 
 
-def _search_at(
+def _rate_searched(
     weight: float,
     problem: LevelSetProblem,
     level: float,
     max_boxes: int,
     options: _Options,
-    checkpoint: str | PathLike | None,
+    **more: Any,
 ) -> SearchResult:
-    """The search at a weight."""
+    """The search for V_w' < 0 at a weight."""
+    return _searched(
+        problem,
+        options,
+        problem.bound,
+        problem.lower,
+        problem.upper,
+        problem.constants(weight, level),
+        scales=problem.scales,
+        max_boxes=max_boxes,
+        **more,
+    )
+
+
+def _searched(
+    problem: LevelSetProblem, options: _Options, *arguments: Any, **more: Any
+) -> SearchResult:
+    """`search` with the patterns of the problem and the options of the caller."""
     try:
         return search(
-            problem.bound,
-            problem.lower,
-            problem.upper,
-            problem.constants(weight, level),
+            *arguments,
             patterns=problem.patterns,
-            scales=problem.scales,
-            max_boxes=max_boxes,
             threads=options.threads,
             progress=options.progress,
-            checkpoint=checkpoint,
+            **more,
         )
     except UnsupportedError as error:
         expected = "operations of the list in docs/how_to/prove.md"
@@ -420,7 +472,7 @@ def _worst_box(problem: LevelSetProblem, level: float, weight: float, box: Searc
 
 
 def _refuted(
-    problem: LevelSetProblem, level: float, sampled: _Sampled, runs: int
+    problem: LevelSetProblem, level: float, sampled: Sampled, runs: int
 ) -> Violation | None:
     """A run that starts in the set and violates the bounds; None if none was found.
 

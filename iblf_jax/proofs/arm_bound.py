@@ -198,6 +198,45 @@ def mismatch(constants: Constants, places: Places, at: Errors, z: jax.Array) -> 
     return Mismatch(constant, [affine_column(*pair) for pair in pairs])
 
 
+class Differences(NamedTuple):
+    """What (U.1) needs: g(p) - g(p0) = sum_k sizes_k times the derivative of g along direction k at
+    `inside`.
+    """
+
+    inside: Any
+    """Plant and disturbance with the hull of the model's parameters and those of the box."""
+    directions: list[Any]
+    """Of the fixed difference of the scenario's plant from its model first, where there is one,
+    then of each coordinate; not of rates."""
+    sizes: list[jax.Array]
+    """1 for the fixed difference, z_k - r_k for the others."""
+
+
+def differences(constants: Constants, places: Places, z: jax.Array) -> Differences:
+    """The differences of the parameters in a box from those of the model."""
+    parts, numbers = constants.parts, constants.coordinates
+    nominal = (parts.plant, parts.disturbance)
+    of_model = (parts.model, parts.disturbance)
+    inside = uncertainty.between(places, numbers, nominal, of_model, z)
+    fixed = uncertainty.fixed_difference(places, numbers, nominal, of_model)
+    directions = uncertainty.directions(places, numbers, of_model)
+    sizes = [z[k] - numbers.reference[k] for k in range(len(directions))]
+    if fixed is None:
+        return Differences(inside, directions, sizes)
+    return Differences(inside, [fixed, *directions], [jnp.ones(()), *sizes])
+
+
+def with_plant(parts: ArmParts, plant_and_disturbance: Any) -> ArmParts:
+    """The parts with another plant and disturbance."""
+    plant, disturbance = plant_and_disturbance
+    return parts._replace(plant=plant, disturbance=disturbance)
+
+
+def mass_along(inside: Any, direction: Any, q: jax.Array) -> jax.Array:
+    """The derivative of the mass matrix along a direction of the parameters, (n, n)."""
+    return along(lambda p: p[0].mass_matrix(q), (inside,), (direction,))
+
+
 class TorqueColumns(NamedTuple):
     """What f' consists of, by coordinate: (I + dM M0^-1) f' = external - sum_k size_k column_k."""
 
@@ -211,39 +250,28 @@ class TorqueColumns(NamedTuple):
 
 def torque_columns(constants: Constants, places: Places, at: Errors, z: jax.Array) -> TorqueColumns:
     """The columns of f' over a box of parameters."""
-    parts, numbers = constants.parts, constants.coordinates
-    n = at.xi.shape[-1]
-    nominal = (parts.plant, parts.disturbance)
+    parts, n = constants.parts, at.xi.shape[-1]
+    inside, directions, _ = differences(constants, places, z)
     of_model = (parts.model, parts.disturbance)
-    inside = uncertainty.between(places, numbers, nominal, of_model, z)
-    fixed = uncertainty.fixed_difference(places, numbers, nominal, of_model)
-    directions = uncertainty.directions(places, numbers, of_model)
     q, M0_inverse = position(parts, at), inverse_mass(parts, at)
-    if fixed is not None:
-        directions = [fixed, *directions]
-
-    def with_plant(plant_and_disturbance: Any) -> ArmParts:
-        plant, disturbance = plant_and_disturbance
-        return parts._replace(plant=plant, disturbance=disturbance)
 
     def rates(f_tilde: jax.Array) -> MismatchRate:
         moved = motion(parts, at, f_tilde)
 
         def torque_rate(p: Any) -> jax.Array:
-            return rate_along_motion(required_torque, with_plant(p), moved.now, moved.alpha_jerk)
+            return rate_along_motion(
+                required_torque, with_plant(parts, p), moved.now, moved.alpha_jerk
+            )
 
         external = rate_along_motion(
-            external_torque, with_plant(of_model), moved.now, moved.alpha_jerk
+            external_torque, with_plant(parts, of_model), moved.now, moved.alpha_jerk
         )
         columns = [along(torque_rate, (inside,), (direction,)) for direction in directions]
         return MismatchRate(external, columns, moved.slow, moved.force)
 
-    def mass_along(direction: Any) -> jax.Array:
-        return along(lambda p: p[0].mass_matrix(q), (inside,), (direction,))
-
     affine = in_f_tilde(rates, n)
     # M_k M0^-1, of which the inverse is a narrow interval where q is one
-    mass_ratios = [matmul(mass_along(direction), M0_inverse) for direction in directions]
+    mass_ratios = [matmul(mass_along(inside, x, q), M0_inverse) for x in directions]
 
     def torque_column(column: Affine, mass_ratio: jax.Array) -> Affine:
         fast = matmul(mass_ratio * parts.law.K2, M0_inverse)
@@ -330,8 +358,13 @@ def arm_bound(places: Places, n: int, x: jax.Array, constants: Constants) -> jax
     direct = coupling - losses - inner(e2, constants.parts.law.K2 * e2)
     directed = jnp.max(jnp.stack([term.directed for term in terms])) - losses
     squares = _squares(constants, norm(e2), b, terms) - losses
-    inside = jnp.max(jnp.abs(point.errors.xi)) < 1.0 - constants.parts.guard
+    inside = is_inside_guard(constants, point)
     return jnp.where(inside, jnp.stack([direct, squares, directed]), jnp.inf)
+
+
+def is_inside_guard(constants: Constants, point: ArmErrors) -> jax.Array:
+    """Whether the barrier's guard is not active, () bool."""
+    return jnp.max(jnp.abs(point.errors.xi)) < 1.0 - constants.parts.guard
 
 
 def _squares(constants: Constants, a: jax.Array, b: jax.Array, terms: list[Corner]) -> jax.Array:

@@ -25,12 +25,14 @@ from iblf_jax.core.pytree import astype
 from iblf_jax.proofs import arm_motion, uncertainty
 from iblf_jax.proofs.arm_bound import Constants, arm_bound
 from iblf_jax.proofs.arm_motion import ArmParts, Errors, position
+from iblf_jax.proofs.arm_torque import torque_excess
 from iblf_jax.proofs.matrices import solve_transposed, upper_factor
 from iblf_jax.proofs.parameters import Uncertain, uncertain_coordinates
 from iblf_jax.proofs.problem import (
     LevelSetProblem,
     LevelSetState,
     OfStructure,
+    TorqueFunctions,
     split_point,
 )
 from iblf_jax.proofs.support import (
@@ -51,6 +53,7 @@ from iblf_jax.proofs.support import (
     unsupported,
     without_guard,
 )
+from iblf_jax.proofs.torque import without_limits
 from iblf_jax.proofs.uncertainty import Places
 from iblf_jax.proofs.users_parts import agreement_of_robot
 from iblf_jax.simulation.initial import Initial
@@ -62,11 +65,10 @@ from iblf_jax.world.disturbances import Disturbance
 from iblf_jax.world.references import WaypointSpline
 from iblf_jax.world.robots import Robot
 
-ASSUMPTIONS = (
-    REAL_NUMBERS,
-    "The torque of the law is applied as it is: without sampling, delay or saturation.",
+APPLIED = "The torque of the law is applied as it is: without {parts} or delay."
+EXACT = (
     "The observer's error and the state are exactly those of the level set; measurements have no"
-    " noise.",
+    " noise."
 )
 VECTORS = ("q", "dq", "f_tilde", "f_hat", "eta")
 """Vectors of a point in physical numbers, as in `LevelSetState`."""
@@ -92,6 +94,28 @@ class ArmRate(OfStructure):
         rate = arm_motion.lyapunov_rate(at.parts, numbers.weight, at.errors, at.f_tilde, at.rate)
         now = arm_motion.motion(at.parts, at.errors, at.f_tilde).now
         return infinite_unless_defined(rate, arm_motion.required_torque(at.parts, now))
+
+
+class ArmTorqueExcess(OfStructure):
+    """The distance of the torque of arms of one structure from an interval."""
+
+    def __call__(self, x: jax.Array, constants: list[jax.Array]) -> tuple[jax.Array, jax.Array]:
+        """Its upper bound over a box, and no region; the last two constants are the ends."""
+        *leaves, lowest, highest = constants
+        numbers: Constants = jax.tree.unflatten(self.structure, leaves)
+        return torque_excess(self.places, x, numbers, lowest, highest), jnp.zeros((0,))
+
+
+class ArmTorque(OfStructure):
+    """The torque at a point of arms of one structure."""
+
+    def __call__(self, point: jax.Array, constants: list[jax.Array]) -> jax.Array:
+        """The torque that the true plant needs, which is that of the law, (n,) [N m]."""
+        at = point_of(
+            self.places, jnp.asarray(point), jax.tree.unflatten(self.structure, constants)
+        )
+        now = arm_motion.motion(at.parts, at.errors, at.f_tilde).now
+        return arm_motion.required_torque(at.parts, now)
 
 
 class ArmPoint(NamedTuple):
@@ -214,10 +238,12 @@ def arm_problem(
     Raises:
       ValueError: a scenario or a parameter that is not supported; the message says why.
     """
-    check_supported(scenario)
+    check_supported(without_limits(scenario)[0])
     with jax.enable_x64(True):
         scenario = canonical(astype(scenario, jnp.float64))
-        parts = _parts_of(scenario)
+        free, limits = without_limits(scenario)
+        _check_rate(disturbance_rate, limits)
+        parts = _parts_of(free)
         uncertain = uncertain_coordinates(scenario, parameters, disturbance_rate)
         varying = {
             "reference": scenario.reference,
@@ -233,16 +259,30 @@ def arm_problem(
         zero = jnp.zeros(())
         structure = jax.tree.structure(Constants(parts, uncertain.numbers, zero, zero))
     of_structure = (structure, uncertain.places, tuple(examination.digests))
-    assumptions = (*ASSUMPTIONS, *claim_sentences([parts.law.barrier]), *examination.assumed)
-    functions = (ArmBound(*of_structure), ArmRate(*of_structure))
-    return ArmProblem(scenario, uncertain, *functions, length, is_period, assumptions, parts)
+    applied = APPLIED.format(parts="sampling, saturation" if limits is None else "sampling")
+    claims = claim_sentences([parts.law.barrier])
+    assumptions = (REAL_NUMBERS, applied, EXACT, *claims, *examination.assumed)
+    torque = TorqueFunctions(ArmTorque(*of_structure), ArmTorqueExcess(*of_structure), limits)
+    return ArmProblem(
+        scenario,
+        uncertain,
+        ArmBound(*of_structure),
+        ArmRate(*of_structure),
+        torque if disturbance_rate is None else None,
+        length,
+        is_period,
+        assumptions,
+        parts,
+    )
 
 
 # --- what is supported -------------------------------------------------------------------------
 
 
 def check_supported(scenario: Scenario) -> None:
-    """Raises ValueError, with the reason, for a scenario whose V_w' is not known here."""
+    """Raises ValueError, with the reason, for a scenario without limits of the torque whose V_w' is
+    not known here.
+    """
     _check_plant(scenario)
     _check_law(scenario.controller)
     observer = scenario.observer
@@ -272,6 +312,17 @@ def check_supported(scenario: Scenario) -> None:
         raise unsupported("reference and bounds", f"{smooth:g}", expected, reason)
 
 
+def _check_rate(disturbance_rate: ArrayLike | None, limits: np.ndarray | None) -> None:
+    """Raises ValueError for limits of the torque and a disturbance without a bound."""
+    if disturbance_rate is None or limits is None:
+        return
+    remedy = (
+        "A disturbance of which only the rate is bounded may need any torque. Add a disturbance"
+        " with an uncertain parameter to the scenario, or leave out the limits of the torque."
+    )
+    raise checks.fail("disturbance_rate", disturbance_rate, "None with torque limits", remedy)
+
+
 def _check_plant(scenario: Scenario) -> None:
     for name in ("plant", "model"):
         part = vars(scenario)[name]
@@ -288,8 +339,6 @@ def _check_plant(scenario: Scenario) -> None:
 def _check_law(law: controllers.TrackingLaw) -> None:
     if type(law) is not controllers.Backstepping:
         reason = "V_w' is known for the paper's law with one of its barriers."
-        if isinstance(law, controllers.Saturated):
-            reason += " Without its limit: with_parts(s, controller=s.controller.law)."
         raise unsupported("controller", type(law).__name__, "controllers.Backstepping", reason)
     if law.variant != "corrected":
         reason = "The printed law leaves 1/2 e2^T M0' e2 in V_w', and its proof fails."

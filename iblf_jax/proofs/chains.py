@@ -256,7 +256,7 @@ def chain_problem(
     of_structure = (structure, uncertain.places, tuple(examination.digests), observed)
     claims = (*claim_sentences(law.barriers), *_without_claim(scenario))
     assumptions = (*ASSUMPTIONS, *claims, *examination.assumed)
-    functions = (ChainBound(*of_structure), ChainRate(*of_structure))
+    functions = (ChainBound(*of_structure), ChainRate(*of_structure), None)
     return ChainProblem(scenario, uncertain, *functions, length, is_period, assumptions, parts)
 
 

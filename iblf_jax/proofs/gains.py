@@ -16,8 +16,9 @@ from numpy.typing import ArrayLike
 
 from iblf_jax.core import checks
 from iblf_jax.core.presentation import Content, Result
-from iblf_jax.proofs._prove import problem_of, prove, sample_weights, weights_of
+from iblf_jax.proofs._prove import problem_of, prove, weights_of
 from iblf_jax.proofs.largest import ends_of
+from iblf_jax.proofs.points import sample_weights
 from iblf_jax.proofs.result import Proof
 from iblf_jax.simulation.paths import get, with_parameters
 from iblf_jax.simulation.scenario import HOW_TO_MAKE, Scenario

@@ -74,6 +74,19 @@ class OfStructure:
     """Of the functions that users wrote, so that a changed one has a program of its own."""
 
 
+class TorqueFunctions(NamedTuple):
+    """Functions of the torque of the law, and its limits."""
+
+    at_point: Callable[[jax.Array, Any], jax.Array]
+    """The torque at a point, (n,) [N m], in plain floating-point numbers."""
+    excess: Callable
+    """A hashable function for `search.search`: the bound of the distance by which the torque leaves
+    an interval, the ends of which are the last two constants.  Behind the parameters it has a
+    coordinate share in [0, 1]: V_w = level share^2."""
+    limits: np.ndarray | None
+    """Least and greatest torque of the loop, (2, n) [N m]; None without limits."""
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class LevelSetProblem(abc.ABC):
     """Is V_w' < 0 at every point of V_w = level, at every time and for all parameters of a box?
@@ -94,6 +107,8 @@ class LevelSetProblem(abc.ABC):
     """A hashable function (x, constants) for `search.search`."""
     point_rate: Callable[[jax.Array, Any], jax.Array]
     """V_w' at a point in plain floating-point numbers, to be compiled and differentiated."""
+    torque: TorqueFunctions | None
+    """None where the torque is not bounded."""
     duration: float
     """Length of the time interval of the proof [s]."""
     is_period: bool
@@ -194,7 +209,23 @@ class LevelSetProblem(abc.ABC):
         """V_w' at points, (count, p) -> (count,), in the unit of V_w per second and in plain
         floating-point numbers.
         """
-        return np.asarray(_rates(self.point_rate, np.asarray(points, float), list(constants)))
+        return np.asarray(_at_points(self.point_rate, np.asarray(points, float), list(constants)))
+
+    @jax.enable_x64(True)
+    def torques(self, points: np.ndarray, constants: Sequence[np.ndarray]) -> np.ndarray:
+        """The torque of the law at points, (count, p) -> (count, n) [N m], in plain floating-point
+        numbers.
+        """
+        assert self.torque is not None
+        function = self.torque.at_point
+        return np.asarray(_at_points(function, np.asarray(points, float), list(constants)))
+
+    @property
+    def torque_search(self) -> tuple[Callable, np.ndarray, np.ndarray, np.ndarray]:
+        """Function, lower and upper ends and scales for a search over the whole set."""
+        assert self.torque is not None
+        lower, upper = np.append(self.lower, 0.0), np.append(self.upper, 1.0)
+        return self.torque.excess, lower, upper, np.append(self.scales, 1.0)
 
     def sample(self, seed: int, count: int) -> np.ndarray:
         """Random points (t, s, z), (count, 1 + terms + m); every second one has its parameters at a
@@ -231,5 +262,5 @@ class LevelSetProblem(abc.ABC):
 
 
 @partial(jax.jit, static_argnums=0)
-def _rates(point_rate: Callable, points: jax.Array, constants: list[jax.Array]) -> jax.Array:
-    return jax.vmap(point_rate, (0, None))(points, constants)
+def _at_points(function: Callable, points: jax.Array, constants: list[jax.Array]) -> jax.Array:
+    return jax.vmap(function, (0, None))(points, constants)

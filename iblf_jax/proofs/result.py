@@ -17,9 +17,11 @@ from iblf_jax.control.controllers._base import position_barrier
 from iblf_jax.core import checks, tables
 from iblf_jax.core.first_use import xarray
 from iblf_jax.core.presentation import Content, Result, present
-from iblf_jax.core.pytree import astype
+from iblf_jax.core.pytree import astype, unwrapped
 from iblf_jax.engine.simulate import simulate
 from iblf_jax.proofs.problem import LevelSetProblem
+from iblf_jax.proofs.proposal import LevelChoice
+from iblf_jax.proofs.torque import TorqueRange, without_limits
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.distributions import Perturbation
@@ -40,9 +42,11 @@ class Verdict(enum.StrEnum):
     """What `ij.prove` found."""
 
     PROVED = "proved"
-    """V_w' < 0 at every point of V_w = level, for all times and parameters."""
+    """V_w' < 0 at every point of V_w = level, for all times and parameters; with limits of the
+    torque, the law's torque is within them on the whole set."""
     NOT_PROVED = "not proved"
-    """Every weight that was tried has a point of the level set with V_w' > 0."""
+    """Every weight that was tried has a point of the level set with V_w' > 0, or with a torque of
+    the law beyond a limit."""
     REFUTED = "refuted"
     """A run that starts in the set violates the bounds."""
     UNDECIDED = "undecided"
@@ -152,14 +156,17 @@ class Proof(Result):
     """Time that the call took [s]."""
     rates: dict[float, float]
     """Weight w that was tried -> the largest V_w' that was found."""
-    growth_points: tuple[GrowthPoint, ...]
-    """For each weight a point with V_w' > 0, if every weight has one; () otherwise."""
     violation: Violation | None
     """None unless the verdict is REFUTED."""
     assumptions: tuple[str, ...]
     """What the statement assumes, in sentences."""
+    growth_points: tuple[GrowthPoint, ...] = ()
+    """For each weight a point with V_w' > 0, if every weight has one; () otherwise."""
+    torque: TorqueRange | None = None
+    """The torque of the law on the set, with bounds if the verdict is PROVED; None for a plant in
+    strict-feedback form, with `disturbance_rate`, and where V_w' > 0 at each weight."""
     boxes: int = 0
-    """Number of boxes that were evaluated."""
+    """Number of boxes that were evaluated for V_w'."""
     done: float = 0.0
     """Part of the volume on which V_w' < 0 is proved."""
     expected_boxes: tuple[float, float] | None = None
@@ -181,6 +188,8 @@ class Proof(Result):
     shown."""
     left_value: float | None = None
     """The largest upper bound of V_w' at the random points."""
+    level_choice: LevelChoice | None = None
+    """Between which levels `prove` chose; None if the caller gave the level."""
     disturbance_rate: Any = None
     """Bound of the rate of a further disturbance, () or (n,) [N m/s]; None without one."""
     history: tuple[Attempt, ...] = ()
@@ -198,6 +207,11 @@ class Proof(Result):
 
         duration = None if self.is_period else self.duration
         return problem_of(self.scenario, self.parameters, duration, self.disturbance_rate)
+
+    @property
+    def torque_limits(self) -> np.ndarray | None:
+        """Least and greatest torque of the loop, (2, n) [N m]; None without limits."""
+        return without_limits(self.scenario)[1]
 
     @property
     def point(self) -> GrowthPoint | None:
@@ -278,14 +292,22 @@ class Proof(Result):
         uncertain = "the plant as given"
         if self.ranges:
             uncertain = "every plant of the box of parameters"
+        within = ""
+        if self.proved and self.torque_limits is not None:
+            within = ", and the torque stays within its limits"
         return (
             f"{self.verdict.upper()}: {{V_w <= {self.level:.4g}}} is"
-            f" {_STATEMENTS[self.verdict]} for {times} and {uncertain}."
+            f" {_STATEMENTS[self.verdict]} for {times} and {uncertain}{within}."
         )
 
     def details(self) -> list[str]:
         """What was found, as lines."""
         lines = list(tables.as_text(_rows(self.ranges), left=(0, 1)))
+        if self.level_choice is not None:
+            lines.append(
+                f"The level was chosen: the start has V_w <= {self.level_choice.start:.4g}, and up"
+                f" to {self.level_choice.largest:.4g} no point with V_w' > 0 was found."
+            )
         if self.proved:
             xi = self.tube.xi.max(axis=0)
             texts = ", ".join(f"{math.ceil(x * 1e4) / 1e4:.4g}" for x in xi)
@@ -293,13 +315,13 @@ class Proof(Result):
             if np.any(np.ptp(self.tube.xi, axis=0) > CONSTANT * xi):
                 names += f", the largest of {INSTANTS} instants"
             lines.append(f"Guaranteed for every start in the set: |xi| <= {texts} ({names}).")
-        if self.verdict == Verdict.NOT_PROVED:
+        lines += self._about_torque()
+        if self.verdict == Verdict.NOT_PROVED and self.point is not None:
             tried = len(self.growth_points)
             lines.append(
                 f"For each of the {tried} weights tried, V_w' > 0 at a point of the level set."
             )
-            if self.point is not None:
-                lines.append(f"  {self.point!r}")
+            lines.append(f"  {self.point!r}")
             lines.append("This refutes the Lyapunov function, not the bounds.")
         if self.violation is not None:
             found = self.violation
@@ -322,6 +344,33 @@ class Proof(Result):
             levels = ", ".join(f"{x.value:.4g} {x.verdict}" for x in self.history)
             lines.append(f"Tried: {levels}.")
         lines += [f"Assumed: {sentence}" for sentence in self.assumptions if self.proved]
+        return lines
+
+    def _about_torque(self) -> list[str]:
+        """The torque on the set, and what it means for limits."""
+        found, limits = self.torque, self.torque_limits
+        if found is None:
+            return []
+        names = plants.component_names(self.scenario.plant)
+        ends = zip(names, found.found_lowest, found.found_highest, strict=True)
+        listed = ", ".join(f"{name} {low:.3g} to {high:.3g}" for name, low, high in ends)
+        lines = [f"Torque that was found on the level set [N m]: {listed}."]
+        if found.is_proved:
+            largest = zip(names, found.largest, strict=True)
+            # rounded up
+            texts = (f"{name} {math.ceil(size * 1e3) / 1e3:.6g}" for name, size in largest)
+            lines.append(f"Guaranteed on the whole set [N m]: |tau| <= {', '.join(texts)}.")
+        if limits is None:
+            return lines
+        if found.excess(limits) > 0.0:
+            lines.append(
+                "That is beyond the limits at this weight, and at every other one with V_w' < 0."
+                " A smaller level, larger limits, or gains with less torque help."
+            )
+        elif self.done == 1.0 and not found.is_proved:
+            lines.append(
+                "It is not proved to stay within its limits: increase max_boxes, or the limits."
+            )
         return lines
 
     def _why_undecided(self) -> list[str]:
@@ -405,7 +454,7 @@ def _numbers(value: np.ndarray | float | Mapping[str, float]) -> str:
 def tube_of_level(scenario: Scenario, level: float, duration: float) -> GuaranteedTube:
     """Positions in {V_w <= level} over time."""
     scenario = canonical(astype(scenario, jnp.float64))
-    barrier, weight = position_barrier(scenario.controller)
+    barrier, weight = position_barrier(unwrapped(scenario.controller))
     times = jnp.linspace(0.0, duration or AT_REST, INSTANTS)
 
     def ends(t):

@@ -451,6 +451,46 @@ def search(
     max_boxes = checks.positive_integer("max_boxes", max_boxes)
     if threads is not None:
         threads = checks.positive_integer("threads", threads)
+    low, high, widths = _corners(lower, upper, patterns, scales)
+    problem = _Problem(interval_kernel(function, low.shape[1], constants), low, high, widths)
+    units, division = problem.divided(max_boxes)
+    expected = None
+    if division.status == PROVED and len(units) > 0:
+        expected = problem.choose_guard(units)
+    results = _Results(checkpoint, problem.digest(units), len(units))
+    ended = division
+    proved = 0
+    with bar(progress, total=100, unit="% of the volume") as shown:
+        shown.update(100 * division.done)
+        shown.set_postfix_str(str(expected or ""))
+        if division.status == PROVED:
+            left = max_boxes - division.boxes
+            for found in _in_order(problem, units, results, left, threads):
+                ended = found._replace(
+                    boxes=ended.boxes + found.boxes, done=ended.done + found.done
+                )
+                shown.update(100 * found.done)
+                shown.set_postfix_str(f"{ended.boxes:.3g} boxes, {expected}", refresh=False)
+                if found.status != PROVED:
+                    break
+                proved += 1
+    corners = units[proved:, : 2 * problem.dimension].reshape(-1, 2, problem.dimension)
+    return SearchResult(
+        status=STATUSES[ended.status],
+        boxes=ended.boxes,
+        seconds=time.monotonic() - start,
+        done=ended.done,
+        worst=_worst_left(problem, ended, units[proved:]),
+        expected=expected,
+        units=len(units),
+        left=corners,
+    )
+
+
+def _corners(
+    lower: ArrayLike, upper: ArrayLike, patterns: ArrayLike | None, scales: ArrayLike | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Lower and upper corner of the box of each pattern, (p, d), and the scales, (d,); checked."""
     low, high = (np.asarray(x, np.float64) for x in (lower, upper))
     if low.shape != high.shape or low.ndim != 1 or not (low <= high).all():
         remedy = f"The upper corner is {high.tolist()}."
@@ -464,43 +504,21 @@ def search(
         if widths.shape != low.shape or not (np.isfinite(widths) & (widths > 0.0)).all():
             raise checks.fail("scales", scales, f"{len(low)} positive numbers")
         widths = np.concatenate([widths, np.zeros(rows.shape[1])])
-    # The corners of the boxes of all patterns, each (p, d).
     low, high = (
         np.concatenate([np.broadcast_to(corner, (len(rows), len(corner))), rows], axis=1)
         for corner in (low, high)
     )
-    problem = _Problem(interval_kernel(function, low.shape[1], constants), low, high, widths)
-    units, division = problem.divided(max_boxes)
-    expected = None
-    if division.status == PROVED and len(units) > 0:
-        expected = problem.choose_guard(units)
-    results = _Results(checkpoint, problem.digest(units), len(units))
-    boxes = division.boxes
-    done = division.done
-    ended = division
-    proved = 0
-    with bar(progress, total=100, unit="% of the volume") as shown:
-        shown.update(100 * done)
-        shown.set_postfix_str(str(expected or ""))
-        if division.status == PROVED:
-            for found in _in_order(problem, units, results, max_boxes - boxes, threads):
-                ended = found
-                boxes += found.boxes
-                done += found.done
-                shown.update(100 * found.done)
-                shown.set_postfix_str(f"{boxes:.3g} boxes, {expected}", refresh=False)
-                if found.status != PROVED:
-                    break
-                proved += 1
-    worst = ended.worst
-    if ended.status == OUT_OF_BOXES:
-        left = [box for box in (worst, problem.worst(units[proved:])) if box is not None]
-        worst = max(left, key=lambda box: box.value, default=None)
-    corners = units[proved:, : 2 * problem.dimension].reshape(-1, 2, problem.dimension)
-    seconds = time.monotonic() - start
-    return SearchResult(
-        STATUSES[ended.status], boxes, seconds, done, worst, expected, len(units), corners
-    )
+    return low, high, widths
+
+
+def _worst_left(problem: _Problem, ended: _Found, left: np.ndarray) -> SearchedBox | None:
+    """The worst box of what ended the search, and of the units that are left where boxes ran
+    out.
+    """
+    if ended.status != OUT_OF_BOXES:
+        return ended.worst
+    boxes = [box for box in (ended.worst, problem.worst(left)) if box is not None]
+    return max(boxes, key=lambda box: box.value, default=None)
 
 
 def _in_order(

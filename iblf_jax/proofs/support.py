@@ -17,6 +17,7 @@ from iblf_jax.control.controllers import TrackingLaw
 from iblf_jax.control.controllers._base import position_barrier
 from iblf_jax.control.decays import Exponential
 from iblf_jax.core import checks
+from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.time import jump_times_of
 from iblf_jax.proofs.examination import Examined, Operations, check_operations
 from iblf_jax.proofs.parameters import Uncertain
@@ -91,6 +92,8 @@ def check_absent(scenario: Scenario, reasons: Mapping[str, str], *, input: str, 
             raise unsupported(name, type(part).__name__, "None", reason)
     if type(scenario.actuator) is not Ideal:
         reason = f"The {input} of the law must be applied as it is."
+        if input == "torque":
+            reason += " Of a Motor, limit and lower_limit alone may be given."
         raise unsupported("actuator", type(scenario.actuator).__name__, "Ideal()", reason)
     if jnp.size(scenario.jump_times()):
         times = np.asarray(scenario.jump_times()).tolist()
@@ -141,7 +144,7 @@ def check_level(level: float, scenario: Scenario, duration: float, of: str) -> N
       duration: length of the time interval [s].
       of: the barrier in words.
     """
-    barrier, weight = position_barrier(scenario.controller)
+    barrier, weight = position_barrier(unwrapped(scenario.controller))
     if isinstance(barrier, Quadratic):
         return
     value = level / weight * jnp.ones(scenario.n)

@@ -209,7 +209,11 @@ def _check_kind(name: str, perturbation: Perturbation, intervals: bool) -> None:
         return
     if intervals:
         expected = "an interval: a proof holds for all values of a set, without probabilities"
-        remedy = f"Write ij.{perturbation.kind}(ij.interval(low, high))."
+        ends = perturbation.distribution.support()
+        listed = "low, high"
+        if np.all(np.isfinite(np.stack(np.broadcast_arrays(*ends)))):
+            listed = ", ".join(str(np.asarray(end).tolist()) for end in ends)
+        remedy = f"Write ij.{perturbation.kind}(ij.interval({listed}))."
     else:
         expected = "a distribution: an interval is a set of values without probabilities"
         remedy = f"Write ij.{perturbation.kind}(ij.uniform(low, high)) for equal probabilities."

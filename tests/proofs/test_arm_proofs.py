@@ -186,10 +186,6 @@ ARM = paper_loop()
 REFUSED = {
     "controller.variant": (lambda: ij.presets.zhang_yan_2024(), MASSES),
     "controller": (with_parts(controller=ij.controllers.PDGravity(Kp=1.0, Kd=1.0)), MASSES),
-    "with_parts(s, controller=s.controller.law)": (
-        with_parts(controller=ij.controllers.Saturated(paper_loop().controller, limit=50.0)),
-        MASSES,
-    ),
     "controller.decays": (
         lambda: ij.with_parts(
             ARM,
@@ -210,7 +206,7 @@ REFUSED = {
     ),
     "observer": (with_parts(observer=ij.observers.NoObserver()), MASSES),
     "actuator": (
-        with_parts(actuator=ij.actuators.Motor(limit=50.0)),
+        with_parts(actuator=ij.actuators.Motor(limit=50.0, stall=60.0, no_load_speed=10.0)),
         MASSES,
     ),
     "sampling": (with_parts(sampling=ij.Sampling(period=1e-3)), MASSES),

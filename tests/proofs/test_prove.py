@@ -223,16 +223,37 @@ def test_bad_input_is_named(options, words):
 
 def test_a_call_without_level_or_parameters_says_how_to_choose_them():
     with pytest.raises(ValueError, match=r"level: got None.*V\[0\].*ij\.largest_level"):
-        ij.prove(pendulum())
+        ij.prove(lever(), parameters={})
     with pytest.raises(ValueError, match=r"parameters: got None.*ij\.interval.*{}"):
         ij.prove(pendulum(), level=LEVEL)
+    of_study = {MASS: ij.factor(ij.uniform(0.9, 1.1))}
+    with pytest.raises(ValueError, match=r"Write ij\.factor\(ij\.interval\(0\.9, 1\.1\)\)"):
+        ij.prove(pendulum(), level=LEVEL, parameters=of_study)
+
+
+@pytest.mark.slow
+def test_without_a_level_the_set_contains_the_start():
+    found = proof(level=None)
+    assert found.proved
+    start, largest = found.level_choice
+    assert start <= found.level <= largest
+    # With f_hat = 0 the start has the error f(0), the largest for the heaviest plant.
+    scenario = ij.with_parameters(pendulum(), {MASS: 2.06})
+    run = ij.simulate(scenario, duration=1e-3, dt=1e-3)
+    f_tilde = float((run.disturbance - run.disturbance_estimate)[0, 0])
+    e2 = float(run.e2[0, 0])
+    M0 = 2.0 * 0.175**2 + 0.06
+    V1 = -math.log1p(-(float(run.xi[0, 0]) ** 2))
+    expected = V1 + 0.5 * M0 * e2**2 + 0.5 * found.weight * f_tilde**2
+    assert start == pytest.approx(expected, rel=1e-6)
+    assert "The level was chosen: the start has V_w <=" in repr(found)
 
 
 @pytest.mark.parametrize(
     "parts",
     [
         {"sampling": ij.Sampling(1e-3)},
-        {"actuator": ij.actuators.Motor(limit=10.0)},
+        {"actuator": ij.actuators.Motor(limit=10.0, bandwidth=1e3)},
         {"observer": ij.observers.NoObserver()},
         {"controller": ij.controllers.Backstepping(k1=2.0, K2=[3.0], o=0.1)},
     ],
