@@ -9,67 +9,64 @@ import sys as _sys
 from importlib.metadata import version as _version
 from typing import TYPE_CHECKING
 
-from iblf_jax.kernels import without_garbage_collection as _without_garbage_collection
-
-with _without_garbage_collection():
-    from iblf_jax import presets as presets
-    from iblf_jax.control import actuators as actuators
-    from iblf_jax.control import barriers as barriers
-    from iblf_jax.control import controllers as controllers
-    from iblf_jax.control import decays as decays
-    from iblf_jax.control import observers as observers
-    from iblf_jax.control import sensors as sensors
-    from iblf_jax.core import linalg as linalg
-    from iblf_jax.core import pytree as pytree
-    from iblf_jax.core import status as status
-    from iblf_jax.core.first_use import on_first_use as _on_first_use
-    from iblf_jax.core.process_end import finish_at_exit as _finish_at_exit
-    from iblf_jax.core.programs import bound_programs as _bound_programs
-    from iblf_jax.core.pytree import Leaf as Leaf
-    from iblf_jax.core.pytree import astype as astype
-    from iblf_jax.core.pytree import component as component
-    from iblf_jax.core.pytree import leaf as leaf
-    from iblf_jax.core.pytree import static as static
-    from iblf_jax.core.status import Status as Status
-    from iblf_jax.engine.explain import explain as explain
-    from iblf_jax.engine.runs import Runs as Runs
-    from iblf_jax.engine.simulate import SimulationError as SimulationError
-    from iblf_jax.engine.simulate import SimulationWarning as SimulationWarning
-    from iblf_jax.engine.simulate import simulate as simulate
-    from iblf_jax.files.rollouts import save_rollouts as save_rollouts
-    from iblf_jax.files.scenario import load_scenario as load_scenario
-    from iblf_jax.files.scenario import save_scenario as save_scenario
-    from iblf_jax.simulation import metrics as metrics
-    from iblf_jax.simulation import paths as paths
-    from iblf_jax.simulation.initial import Initial as Initial
-    from iblf_jax.simulation.paths import parameters as parameters
-    from iblf_jax.simulation.paths import with_parameters as with_parameters
-    from iblf_jax.simulation.results import Metrics as Metrics
-    from iblf_jax.simulation.results import Rollout as Rollout
-    from iblf_jax.simulation.sampling import EventTrigger as EventTrigger
-    from iblf_jax.simulation.sampling import Sampling as Sampling
-    from iblf_jax.simulation.scenario import Scenario as Scenario
-    from iblf_jax.simulation.scenario import with_parts as with_parts
-    from iblf_jax.simulation.vector_field import VectorField as VectorField
-    from iblf_jax.simulation.vector_field import vector_field as vector_field
-    from iblf_jax.studies.distributions import choice as choice
-    from iblf_jax.studies.distributions import factor as factor
-    from iblf_jax.studies.distributions import interval as interval
-    from iblf_jax.studies.distributions import joint_normal as joint_normal
-    from iblf_jax.studies.distributions import joint_samples as joint_samples
-    from iblf_jax.studies.distributions import log_uniform as log_uniform
-    from iblf_jax.studies.distributions import normal as normal
-    from iblf_jax.studies.distributions import offset as offset
-    from iblf_jax.studies.distributions import uniform as uniform
-    from iblf_jax.studies.distributions import value as value
-    from iblf_jax.world import bounds as bounds
-    from iblf_jax.world import disturbances as disturbances
-    from iblf_jax.world import plants as plants
-    from iblf_jax.world import process_noise as process_noise
-    from iblf_jax.world import references as references
-    from iblf_jax.world import regions as regions
-    from iblf_jax.world import robots as robots
-    from iblf_jax.world.bounds import Bounds as Bounds
+from iblf_jax import presets as presets
+from iblf_jax.control import actuators as actuators
+from iblf_jax.control import barriers as barriers
+from iblf_jax.control import controllers as controllers
+from iblf_jax.control import decays as decays
+from iblf_jax.control import observers as observers
+from iblf_jax.control import sensors as sensors
+from iblf_jax.core import linalg as linalg
+from iblf_jax.core import pytree as pytree
+from iblf_jax.core import status as status
+from iblf_jax.core.first_use import on_first_use as _on_first_use
+from iblf_jax.core.process_end import finish_at_exit as _finish_at_exit
+from iblf_jax.core.programs import bound_programs as _bound_programs
+from iblf_jax.core.pytree import Leaf as Leaf
+from iblf_jax.core.pytree import astype as astype
+from iblf_jax.core.pytree import component as component
+from iblf_jax.core.pytree import leaf as leaf
+from iblf_jax.core.pytree import static as static
+from iblf_jax.core.status import Status as Status
+from iblf_jax.engine.explain import explain as explain
+from iblf_jax.engine.runs import Runs as Runs
+from iblf_jax.engine.simulate import SimulationError as SimulationError
+from iblf_jax.engine.simulate import SimulationWarning as SimulationWarning
+from iblf_jax.engine.simulate import simulate as simulate
+from iblf_jax.files.rollouts import save_rollouts as save_rollouts
+from iblf_jax.files.scenario import load_scenario as load_scenario
+from iblf_jax.files.scenario import save_scenario as save_scenario
+from iblf_jax.simulation import metrics as metrics
+from iblf_jax.simulation import paths as paths
+from iblf_jax.simulation.initial import Initial as Initial
+from iblf_jax.simulation.paths import parameters as parameters
+from iblf_jax.simulation.paths import with_parameters as with_parameters
+from iblf_jax.simulation.results import Metrics as Metrics
+from iblf_jax.simulation.results import Rollout as Rollout
+from iblf_jax.simulation.sampling import EventTrigger as EventTrigger
+from iblf_jax.simulation.sampling import Sampling as Sampling
+from iblf_jax.simulation.scenario import Scenario as Scenario
+from iblf_jax.simulation.scenario import with_parts as with_parts
+from iblf_jax.simulation.vector_field import VectorField as VectorField
+from iblf_jax.simulation.vector_field import vector_field as vector_field
+from iblf_jax.studies.distributions import choice as choice
+from iblf_jax.studies.distributions import factor as factor
+from iblf_jax.studies.distributions import interval as interval
+from iblf_jax.studies.distributions import joint_normal as joint_normal
+from iblf_jax.studies.distributions import joint_samples as joint_samples
+from iblf_jax.studies.distributions import log_uniform as log_uniform
+from iblf_jax.studies.distributions import normal as normal
+from iblf_jax.studies.distributions import offset as offset
+from iblf_jax.studies.distributions import uniform as uniform
+from iblf_jax.studies.distributions import value as value
+from iblf_jax.world import bounds as bounds
+from iblf_jax.world import disturbances as disturbances
+from iblf_jax.world import plants as plants
+from iblf_jax.world import process_noise as process_noise
+from iblf_jax.world import references as references
+from iblf_jax.world import regions as regions
+from iblf_jax.world import robots as robots
+from iblf_jax.world.bounds import Bounds as Bounds
 
 __version__ = _version("iblf_jax")
 _bound_programs()
