@@ -22,7 +22,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
     add_scenario_arguments(parser)
     parser.add_argument(
-        "--level", type=float, required=True, metavar="C", help="level of V_w, in its unit"
+        "--level",
+        type=float,
+        metavar="C",
+        help="level of V_w, in its unit (default: one whose set contains the start of a robot)",
     )
     parser.add_argument(
         "--parameter",

@@ -5,9 +5,10 @@ The level set of a weight w contains the start if
     V1 + e2^T M0 e2 / 2 + w |f_tilde|^2 / 2 <= level   at t = 0,
 
 for the plants at the corners of the box, because f_tilde depends on the plant.  Up to which level
-V_w' < 0 holds at the points that are found, for a weight of these, is searched by bisection.  Near
-that level a proof needs many boxes, so that half of it is taken, or the least level that contains
-the start if that is more.  The proof decides; nothing here is part of it.
+V_w' < 0 holds at the points that are found, for a weight of these, is searched by bisection.  The
+least levels that contain the start may leave weights only that are too small.  Near the largest
+level a proof needs many boxes, so that half of it is taken, or the least one that was found if that
+is more.  The proof decides; nothing here is part of it.
 """
 
 from __future__ import annotations
@@ -19,7 +20,6 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from iblf_jax.core.linalg import inner, matvec
 from iblf_jax.core.pytree import unwrapped
@@ -114,19 +114,22 @@ def proposed_level(
         return [w for w in weights if start.level(ROOM * w) <= level]
 
     low = max(least, LEAST)
-    largest = 0.0
-    high = low
-    for _ in range(DOUBLINGS):
-        if not decreases(high, containing(high)):
+    succeeded: list[float] = []
+    for doubling in range(DOUBLINGS):
+        high = low * 2.0**doubling
+        if decreases(high, containing(high)):
+            succeeded.append(high)
+        elif succeeded:
             break
-        largest, high = high, 2.0 * high
-    if largest == 0.0:
-        return Proposal(low, containing(low), largest)
+    if not succeeded:
+        return Proposal(low, containing(low), 0.0)
+    largest = succeeded[-1]
+    high = 2.0 * largest
     while high > RATIO * largest:
         middle = math.sqrt(largest * high)
         if decreases(middle, containing(middle)):
             largest = middle
         else:
             high = middle
-    level = float(np.maximum(SHARE * largest, low))
+    level = max(SHARE * largest, succeeded[0])
     return Proposal(level, containing(level), largest)
