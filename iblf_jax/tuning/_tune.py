@@ -61,13 +61,6 @@ from iblf_jax.tuning.step_check import excess_at_half_step
 STARTS_TOGETHER = 8
 """Largest number of starts that are evaluated with derivatives in one batch.  In larger ones more
 rows are those of starts that take no step."""
-SECOND_SHARE = 1 / 3
-"""Share of the points and of the starts that the second search has, around the best gains, in
-problems of SECOND_FROM coordinates or more."""
-SECOND_FROM = 12
-"""Number of coordinates from which the starts are divided.  Of an arm with 14 gains the first
-search ended in the best valley once in six times, with 32 starts too; on problems of 6 to 10 gains
-it does so nearly always, but not with two thirds of the starts."""
 POLISH_STEPS = 15
 """Largest number of steps of the short search at half the time step."""
 
@@ -104,7 +97,6 @@ def tune(
     With the default solver and effort, the tuning evaluates 1,024 points besides the scenario's
     gains without derivatives.  It begins searches at up to 32 of these points, of which those that
     differ continue after five steps, and the better third of these after every five further ones.
-    With twelve gains or more, a third of points and starts is used around the result of the others.
     This takes about 350 evaluations with derivatives, and more if the search finds no gains that
     keep the requirements, or if it does not converge.
 
@@ -138,8 +130,8 @@ def tune(
         with their options, or the name of one in `ij.tuning.SOLVERS`.  If not given, SQP for up to
         32 numbers, and L-BFGS with reverse mode for more.
       effort: "quick" (a search from the scenario's gains only), "normal", "thorough" (8,192 points
-        without derivatives and 96 starts, about 1,300 evaluations with derivatives), or
-        `ij.tuning.Effort(values=..., starts=..., iterations=...)`.
+        without derivatives and 96 starts, about 2,000 evaluations with derivatives, and a second
+        search around the best gains), or `ij.tuning.Effort(values=..., starts=..., around=...)`.
       report: options of the report on fresh runs, `ij.tuning.Report(runs=..., seed=...,
         confidence=...)`.
       confirm: the probability that a run fails is to be below this number, with the confidence of
@@ -212,13 +204,13 @@ def search_of(
     strategy = None
     if solver.starts is None:
         count = min(effort.values, MAX_SCREENED_RUNS // problem.runs)
-        later = SECOND_SHARE if problem.size >= SECOND_FROM else 0.0
-        later_points, later_starts = int(later * count), int(later * starts)
-        with bar(show, count - later_points + 1, unit="points") as shown:
+        with bar(show, count + 1, unit="points") as shown:
             shown.set_description(_cost_in_words(problem, count + 1, starts, effort))
-            screening = screen(problem, count - later_points, seed, shown.update)
-        z = _chosen_starts(problem, screening, starts - later_starts)
-        strategy = Strategy(screening, effort.selection, len(z), later_points, later_starts)
+            screening = screen(problem, count, seed, shown.update)
+        z = _chosen_starts(problem, screening, starts)
+        around = min(effort.around, starts)
+        second_points = count // 3 if around else 0
+        strategy = Strategy(screening, effort.selection, len(z), second_points, around)
     else:
         z = starting_points(problem.box, starts, seed)
         z = usable_starts(problem, seed, z, values(problem, problem.box.z[None]))

@@ -92,8 +92,7 @@ class Effort:
     All starts take `selection` steps, those that have not come near a better one take as many
     again, the better third of these takes as many again, and so on until the best one is left.
     Until then a search takes at most 405 evaluations with derivatives with the defaults: five steps
-    each of 32, 32, 11, 4 and 2 starts.  In problems of twelve gains or more, two thirds of points
-    and starts are those of a first search, and one third those of a second one around its result.
+    each of 32, 32, 11, 4 and 2 starts.
 
     Args:
       values: number of points that are evaluated without derivatives to find the starts.  With many
@@ -105,15 +104,19 @@ class Effort:
         evaluates every start that is still active.
       selection: number of steps after which starts near better ones end, and from the second time
         on all but the better third.
+      around: number of starts of a second search around the best gains of the first one, chosen
+        from a third as many points; none if not given.  In problems of many gains the best optimum
+        is often near a good one.
     """
 
     values: int = 1024
     starts: int = 32
     iterations: int = 60
     selection: int = 5
+    around: int = 0
 
     def __post_init__(self) -> None:
-        limits = {"values": (0, MAX_RUNS), "starts": (1, 1000)}
+        limits = {"values": (0, MAX_RUNS), "starts": (1, 1000), "around": (0, 1000)}
         for field in dataclasses.fields(self):
             least, most = limits.get(field.name, (1, checks.MAX_STEPS))
             number = getattr(self, field.name)
@@ -125,7 +128,7 @@ class Effort:
 EFFORTS = {
     "quick": Effort(values=0, starts=1),
     "normal": Effort(),
-    "thorough": Effort(values=8192, starts=96, iterations=120, selection=8),
+    "thorough": Effort(values=8192, starts=96, iterations=120, selection=8, around=32),
 }
 """Name -> effort."""
 
