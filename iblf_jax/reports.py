@@ -26,11 +26,13 @@ from iblf_jax.core.attributes import has_members
 from iblf_jax.core.presentation import Content, Result
 from iblf_jax.core.progress import announced
 from iblf_jax.core.pytree import wrapped_field
+from iblf_jax.core.status import FAILED, describe, has_flag
 from iblf_jax.core.tables import Table, number
 from iblf_jax.core.units import as_text
 from iblf_jax.simulation.paths import get, parameters, unit_at
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import PER_REGION
+from iblf_jax.simulation.units import status_words
 from iblf_jax.studies.statistics import worst_joint
 from iblf_jax.world import plants
 
@@ -53,6 +55,7 @@ h2 { font-size: 1.2rem; margin-top: 2rem; border-bottom: 1px solid #ddd; }
 table { border-collapse: collapse; font-size: 0.85rem; }
 td, th { padding: 0.15rem 0.6rem; border-bottom: 1px solid #eee; text-align: left; }
 img { max-width: 100%; }
+ul.words { padding-left: 1.2rem; overflow-wrap: anywhere; }
 pre { background: #f6f6f6; padding: 0.8rem; overflow-x: auto; font-size: 0.8rem; }
 .wide { overflow-x: auto; }
 footer { margin-top: 3rem; color: #777; font-size: 0.8rem; }"""
@@ -200,7 +203,36 @@ def _rollout(run: Rollout) -> Shown:
         "Uncertain terms": lambda: plotting.uncertain_terms(run),
     }
     contents = {"Metrics": metrics_table({"": run}).html(), "Peaks with their signs": _peaks(run)}
-    return Shown("Run", _described(run), contents, figures, run.scenario)
+    words = [*_described(run), *_worst_of_run(run)]
+    return Shown(f"Run: {_verdict_of_run(run)}", words, contents, figures, run.scenario)
+
+
+def _verdict_of_run(run: Rollout) -> str:
+    """Whether a run kept its bounds, and what else its status says."""
+    status = int(run.status)
+    words = describe(status, status_words(run.scenario))
+    if has_flag(status, FAILED):
+        return f"FAILED: {words}"
+    verdict = "the bounds are kept"
+    return verdict if run.ok else f"{verdict}; {words}"
+
+
+def _worst_of_run(run: Rollout) -> list[str]:
+    """The smallest margin, the largest error and the largest input of a run, with their joints."""
+    names = plants.component_names(run.scenario.plant)
+    lines = []
+    for name, text, choose in (
+        ("margin", "smallest margin", np.argmin),
+        ("peak_error", "largest error", np.argmax),
+        ("peak_torque", f"largest {plants.input_name(run.scenario.plant)}", np.argmax),
+    ):
+        if name not in run.metrics:
+            continue
+        values = np.ravel(run.metrics[name])
+        i = int(choose(values))
+        unit = run.metrics.units[name].split("; ")[0]
+        lines.append(f"{text}: {number(values[i])} {unit}, {names[i % len(names)]}")
+    return lines
 
 
 def _peaks(run: Rollout) -> str:
@@ -227,6 +259,8 @@ def quantiles_table(study: Study) -> Table:
     for name in study.metrics if study.made.any() else ():
         numbers = worst_joint(study.metrics, name)[study.made]
         levels = np.quantile(numbers, (0.05, 0.5, 0.95), method="inverted_cdf")
+        if name.endswith(NUMBERED):
+            levels = np.where(levels < 0, np.nan, levels)  # -1: no violation
         rows.append((name, study.metrics.units.get(name, ""), *map(number, levels)))
     return Table(("metric, worst joint", "unit", "5 %", "50 %", "95 %"), rows, left=(0,))
 
@@ -250,7 +284,9 @@ def _study(study: Study) -> Shown:
         figures["Overview"] = lambda: plotting.study_overview(study)
     figures["Every metric"] = lambda: plotting.histograms(study)
     words = [*_described(study), *start_notes(study, list(study.metrics))]
-    return Shown("Monte-Carlo study", words, content, figures, study.scenario)
+    left = study.violation_probability
+    title = f"Monte-Carlo study: {left.runs - left.count} of {left.runs} runs keep the bounds"
+    return Shown(title, words, content, figures, study.scenario)
 
 
 def _certificate(found: Certificate) -> Shown:
@@ -259,15 +295,32 @@ def _certificate(found: Certificate) -> Shown:
 
 
 def _tuning(found: TuneResult) -> Shown:
-    rows = [
-        (path, unit_at(found.start, path), _short(get(found.start, path)), _short(value))
-        for path, value in found.values.items()
-    ]
-    gains = tables.as_html(("tuned", "unit", "before", "after"), rows)
-    words = [*str(found.report).splitlines(), f"Search: {_described(found)[0]}"]
-    figures = {"The search, and runs before and after": found.plot}
-    title = f"Tuning: {found.report.headline}"
-    return Shown(title, words, {"Gains": gains}, figures, found.scenario)
+    heading, *lines = str(found.report).splitlines()
+    words = [heading, *lines, f"Search: {_described(found)[0]}"]
+    figures = {"Before and after, and the search": found.plot}
+    title = f"Tuning: {found.report.title}"
+    return Shown(title, words, {"Gains": _gains(found)}, figures, found.scenario)
+
+
+def _gains(found: TuneResult) -> str:
+    """The tuned numbers before and after, those at an end of their range first; a row a joint where
+    a parameter has one number for each.
+    """
+    ends = found.at_limits
+    joints = plants.component_names(found.scenario.plant)
+    rows = []
+    for path, value in found.values.items():
+        before, after = np.asarray(get(found.start, path)), np.asarray(value)
+        for index in np.ndindex(after.shape):
+            name = path + "".join(f"[{i}]" for i in index)
+            end = ends.get(name) or ends.get(path)
+            joint = joints[index[0]] if after.shape == (len(joints),) else ""
+            note = f"at its {end.side} limit" if end else ""
+            cells = (joint, path, unit_at(found.start, path), number(before[index]))
+            rows.append((*cells, number(after[index]), note))
+    rows.sort(key=lambda row: not row[-1])
+    heading = ("joint", "parameter", "unit", "before", "after", "range")
+    return tables.as_html(heading, rows, [i for i, row in enumerate(rows) if row[-1]])
 
 
 def _proof(found: Proof) -> Shown:
@@ -323,10 +376,13 @@ def _image(figure: Figure, dpi: int, words: str) -> str:
 
 
 def _lines(words: Sequence[str]) -> str:
-    text = html.escape("\n".join(words))
-    if len(words) > 1:
-        return f"<pre>{text}</pre>"
-    return f"<p>{text}</p>" if words else ""
+    """Lines of text as a list, whose long lines are broken; those that are indented belong to the
+    line before them.
+    """
+    if len(words) == 1:
+        return f"<p>{html.escape(words[0])}</p>"
+    items = "".join(f"<li>{html.escape(line.strip())}</li>" for line in words if line.strip())
+    return f'<ul class="words">{items}</ul>' if items else ""
 
 
 def card(result: object) -> str:

@@ -8,6 +8,9 @@
 Functions for runs take one run or a dict of runs by name (`overview`: one run) and return a
 matplotlib Figure, which a notebook shows if it is the value of a cell.  Runs may differ in length;
 select one run of a batch first.
+
+Every function also takes `style="paper"` (one column of IEEE), or a `Paper` with another publisher
+or two columns, and `figure=`, a matplotlib Figure or SubFigure to draw into, which it returns.
 """
 
 from iblf_jax.plotting._failures import failure_probability as failure_probability
@@ -34,6 +37,7 @@ from iblf_jax.plotting._studies import first_exit as first_exit
 from iblf_jax.plotting._studies import histograms as histograms
 from iblf_jax.plotting._studies import scatter as scatter
 from iblf_jax.plotting._studies import study_overview as study_overview
+from iblf_jax.plotting._style import Paper as Paper
 from iblf_jax.plotting._sweeps import heat_map as heat_map
 from iblf_jax.plotting._sweeps import parallel as parallel
 from iblf_jax.plotting._tuning import pareto as pareto

@@ -17,7 +17,7 @@ MAX_NUMBERS = 10
 """Largest number of bars for the most likely failure."""
 
 
-@_style.styled()
+@_style.figure_function
 def failure_probability(found: FailureProbability, *, numbers: int = MAX_NUMBERS) -> Figure:
     """The probability that the margin of a run is below a number, and the most likely failure.
 

@@ -157,6 +157,8 @@ def _rows_with_zoom(
         lines = [range_after(curves, row.quantity, row.joint, start[1])]
         if inset is table[0, 1]:
             lines.insert(0, zoom_reason(curves, rows, start[1]))
+        if _style.in_paper():
+            continue
         inset.set_title(",\n".join(filter(None, lines)), fontsize=_style.size(8.0))
     for axes in table[-1]:
         _style.time_axis(axes)
@@ -198,7 +200,7 @@ def _named_rows(
     return _rows_with_zoom(title, curves, rows, zoom, height)
 
 
-@_style.styled()
+@_style.figure_function
 def tube(scenario: Scenario, *, duration: float = 20.0) -> Figure:
     """Bounds, reference and initial position of every joint of a scenario.
 
@@ -236,6 +238,7 @@ def tube(scenario: Scenario, *, duration: float = 20.0) -> Figure:
     return figure
 
 
+@_style.figure_function
 def joint(runs: Runs, joint: int = 0, *, zoom: float | None = None) -> Figure:
     """Position of one joint between its bounds, and its error e1 between -k_l and k_u: the paper's
     figures 1 and 2.
@@ -262,6 +265,7 @@ def joint(runs: Runs, joint: int = 0, *, zoom: float | None = None) -> Figure:
     return _rows_with_zoom(title, curves, rows, zoom, 2.1)
 
 
+@_style.figure_function
 def positions(runs: Runs, *, zoom: float | None = None) -> Figure:
     """Position q [rad] of every joint between its bounds.
 
@@ -278,6 +282,7 @@ def positions(runs: Runs, *, zoom: float | None = None) -> Figure:
     return _every_joint(_title_of(runs, "q"), runs, "q", zoom)
 
 
+@_style.figure_function
 def errors(runs: Runs, *, zoom: float | None = None) -> Figure:
     """Relative error xi [1] of every joint between its bounds -1 and 1.
 
@@ -294,6 +299,7 @@ def errors(runs: Runs, *, zoom: float | None = None) -> Figure:
     return _every_joint("Error relative to the bounds", runs, "xi", zoom)
 
 
+@_style.figure_function
 def velocity_errors(runs: Runs, *, zoom: float | None = None) -> Figure:
     """Velocity error e2 = q' - alpha [rad/s] of every joint: the paper's figure 3.
 
@@ -310,6 +316,7 @@ def velocity_errors(runs: Runs, *, zoom: float | None = None) -> Figure:
     return _every_joint(f"{_title_of(runs, 'dq')} error", runs, "e2", zoom)
 
 
+@_style.figure_function
 def velocities(runs: Runs, *, zoom: float | None = None) -> Figure:
     """Velocity q' [rad/s] of every joint, with its bounds if the scenario has them.
 
@@ -326,6 +333,7 @@ def velocities(runs: Runs, *, zoom: float | None = None) -> Figure:
     return _every_joint(_title_of(runs, "dq"), runs, "dq", zoom)
 
 
+@_style.figure_function
 def region_margins(runs: Runs, *, zoom: float | None = None) -> Figure:
     """Distance [m] of every region's point to the region's boundary, for scenarios with `regions`.
 
@@ -352,6 +360,7 @@ def region_margins(runs: Runs, *, zoom: float | None = None) -> Figure:
     return _named_rows("Distance to the boundaries", curves, quantities, names, zoom)
 
 
+@_style.figure_function
 def adaptation(runs: Runs, *, zoom: float | None = None) -> Figure:
     """Every parameter that the law adapts (`controllers.AdaptiveParameters`), between its bounds,
     and the value of the plant.
@@ -377,6 +386,7 @@ def adaptation(runs: Runs, *, zoom: float | None = None) -> Figure:
     return _named_rows("Adapting parameters", curves, quantities, laws[0].parameters, zoom)
 
 
+@_style.figure_function
 def uncertain_terms(runs: Runs, *, zoom: float | None = None) -> Figure:
     """The uncertain term f [N m] of every joint and its estimate f_hat: the paper's figure 4; of a
     model in strict-feedback form the disturbance of every level and component.
@@ -415,6 +425,7 @@ def _disturbances(curves: Sequence[Curve], zoom: float | None) -> Figure:
     return _named_rows(title, curves, quantities, names, zoom, joints)
 
 
+@_style.figure_function
 def levels(runs: Runs, joint: int | str = 0, *, zoom: float | None = None) -> Figure:
     """Every level of one component between its bounds, with the virtual control that it follows,
     and the input.
@@ -451,6 +462,7 @@ def _title_of(runs: Runs, field: str) -> str:
     return quantity_of(curves_of(runs)[0].run.scenario, field).name.capitalize()
 
 
+@_style.figure_function
 def torques(runs: Runs, *, zoom: float | None = None) -> Figure:
     """Torque [N m] of every joint: the paper's figure 5.
 
@@ -505,6 +517,7 @@ def draw_phase_portrait(axes: Axes, curves: Sequence[Curve], joints: tuple[int, 
     axes.set_aspect("equal")
 
 
+@_style.figure_function
 def phase_portrait(runs: Runs, joints: tuple[int | str, int | str] = (0, 1)) -> Figure:
     """Position of one joint against another's, with the reference: the paper's figure 6.
 
@@ -556,7 +569,7 @@ def _portrait(
     return figure
 
 
-@_style.styled()
+@_style.figure_function
 def velocity_portrait(runs: Runs, joint: int = 0) -> Figure:
     """Velocity [rad/s] of one joint against its position [rad], with the reference and the box of
     its bounds.

@@ -16,7 +16,7 @@ MAX_ROWS = 40
 """Largest number of identified numbers in the figure."""
 
 
-@_style.styled()
+@_style.figure_function
 def identification(known: Identification) -> Figure:
     """The overview of an identification: each number against its start, the standard error of each
     combination, the residuals and their correlations.

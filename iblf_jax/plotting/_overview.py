@@ -40,7 +40,7 @@ COLUMNS = 4
 """Largest number of panels in a row."""
 
 
-@_style.styled()
+@_style.figure_function
 def overview(run: Rollout, *, title: str = "Overview of the run") -> Figure:
     """The overview of one run, its status in the title: what `run.plot()` shows.
 
@@ -73,7 +73,7 @@ def overview(run: Rollout, *, title: str = "Overview of the run") -> Figure:
         if follows_alpha or curve.has_bounds(level) or curve.is_measured:
             levels.append(level)
     disturbed = curve.disturbed_levels()
-    heights = [2.0 * rows] * len(levels) + [4.4]
+    heights = [2.0 * rows] * len(levels) + [6.6 if _style.is_narrow() else 4.4]
     if disturbed:
         heights.append(2.2)
     if curve.has_regions:
@@ -129,22 +129,23 @@ def _disturbances(
 
 def _together(figure: Figure, where: SubplotSpec, curve: Curve, window: Window) -> None:
     """The panels that show all joints together."""
-    grid = where.subgridspec(2, 3)
+    columns = 2 if _style.is_narrow() else 3
+    cells = list(where.subgridspec(6 // columns, columns))  # type: ignore[call-overload]
     scenario = curve.run.scenario
-    places = {(0, 0): "e1", (0, 1): "xi", (1, 0): "tau", (1, 1): "disturbance_estimate"}
+    fields = {0: "e1", 1: "xi", 3: "tau", 4: "disturbance_estimate"}
     if scenario.loop.model.uncertain_levels:
-        places[1, 1] = "e2"
-    for place, field in places.items():
-        _joints(figure.add_subplot(grid[place]), curve, quantity_of(scenario, field), window)
+        fields[4] = "e2"
+    for place, field in fields.items():
+        _joints(figure.add_subplot(cells[place]), curve, quantity_of(scenario, field), window)
     if curve.run.n > 1:
-        axes = figure.add_subplot(grid[0, 2])
+        axes = figure.add_subplot(cells[2])
         draw_phase_portrait(axes, [curve], (0, 1))
         symbol = quantity_of(scenario, "q").symbol
         for line in axes.get_lines():
             if line.get_label() == symbol:
                 line.set(color=_style.blend(0.396), linewidth=2.4)
             line.set_label("_")
-    axes = figure.add_subplot(grid[1, 2])
+    axes = figure.add_subplot(cells[5])
     V = curve["V"]
     positive = np.where(np.isfinite(V) & (V > 0), V, np.nan)
     axes.plot(*thinned(curve.t[: len(V)], positive), color=_style.blend(0.733))

@@ -45,6 +45,13 @@ OUTLIER_RATIO = 40.0
 """The axis excludes the outliers of a failed run whose range is wider than this many times its
 median deviation."""
 
+NOISE_BLOCKS = 80
+"""Number of blocks in which a noise is drawn as a band."""
+NOISE_REVERSALS = 0.3
+"""Share of the steps of a noise that change their sign, at least; white noise has 2/3."""
+NOISE_SIZE = 0.03
+"""Typical range of a noise in a block, as a share of the range of the signal, at least."""
+
 SPIKE_FREE_SHARE = 0.98
 SPIKE_RATIO = 5.0
 """The axis excludes the spikes of a signal whose full range is wider than SPIKE_RATIO times the
@@ -240,8 +247,44 @@ def draw(
         options.setdefault("marker", ".")
     if curve.is_sampled(field):
         options.setdefault("drawstyle", "steps-post")
+    band = noise_band(t[in_window], y[in_window])
+    if band is not None:
+        shown_t, low, high, shown_y = band
+        _draw_band(axes, shown_t, low, high, options)
+        options["drawstyle"] = "default"
     axes.plot(shown_t, shown_y, **options)
     return y[in_window]
+
+
+def _draw_band(
+    axes: Axes, t: np.ndarray, low: np.ndarray, high: np.ndarray, options: dict[str, Any]
+) -> None:
+    """Draws the range of a noise in the colour of its line."""
+    colour = options.get("color", _style.colour(0))
+    alpha = 0.3 * (options.get("alpha") or 1.0)
+    axes.fill_between(t, low, high, color=colour, alpha=alpha, linewidth=0, zorder=1.7)
+
+
+def noise_band(t: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...] | None:
+    """Times, lowest and highest values and means of the blocks of a noise, which a line would fill;
+    None for a signal without noise.
+
+    A signal is a noise if at least NOISE_REVERSALS of its steps change their sign, its blocks have
+    several samples each, and its typical range in a block is visible.
+    """
+    if len(y) < 4 * NOISE_BLOCKS or not np.all(np.isfinite(y)):
+        return None
+    steps = np.diff(y)
+    steps = steps[steps != 0.0]  # A held sample changes nothing.
+    if len(steps) < 2 * NOISE_BLOCKS or np.mean(steps[1:] * steps[:-1] < 0.0) < NOISE_REVERSALS:
+        return None
+    starts = np.linspace(0, len(y), NOISE_BLOCKS + 1).astype(int)
+    low, high = (f.reduceat(y, starts[:-1]) for f in (np.minimum, np.maximum))
+    if np.median(high - low) < NOISE_SIZE * np.ptp(y):
+        return None
+    sizes = np.diff(starts)
+    middle, mean = (np.add.reduceat(x, starts[:-1]) / sizes for x in (t, y))
+    return middle, low, high, mean
 
 
 def draw_bounds(
@@ -397,7 +440,11 @@ def annotate_clipped_peak(
 
 
 def peak_in_words(curve: Curve, peak: Peak, quantity: PanelQuantity) -> str:
-    """A peak with its sign, its joint, its time and the name of its run, for a figure."""
+    """A peak with its sign, its joint, its time and the name of its run, for a figure; of a paper
+    the value only.
+    """
+    if _style.in_paper():
+        return f"peak {signed(float(f'{peak.value:.3g}'))} {quantity.unit}"
     parts = [f"peak {signed(peak.value)} {quantity.unit}"]
     if curve.name:
         parts.append(escaped(curve.name))

@@ -22,7 +22,7 @@ RUNS = 6
 """Runs with adversarial parameters that the figure shows."""
 
 
-@_style.styled()
+@_style.figure_function
 def guaranteed_tube(found: Proof, *, runs: int = RUNS) -> Figure:
     """The positions of {V_w <= level} over time, with the bounds, the reference and runs.
 

@@ -61,7 +61,7 @@ def _grid(count: int, height: float) -> tuple[Figure, list[Axes]]:
 # --- bands
 
 
-@_style.styled()
+@_style.figure_function
 def bands(
     study: Study,
     *,
@@ -133,7 +133,7 @@ def _draw_bands(axes: Axes, data: xarray.Dataset, joint: int, study: Study) -> N
 # --- histograms and scatters
 
 
-@_style.styled()
+@_style.figure_function
 def histograms(study: Study, metrics: Sequence[str] | None = None, *, bins: int = 40) -> Figure:
     """Histograms of metrics, with failed and successful runs in different colours.
 
@@ -240,7 +240,7 @@ def start_notes(study: Study, metrics: Sequence[str]) -> list[str]:
     ]
 
 
-@_style.styled()
+@_style.figure_function
 def scatter(study: Study, metric: str = "margin") -> Figure:
     """A metric (of the worst joint) of every run against each drawn parameter, with the rank
     correlation.
@@ -289,7 +289,7 @@ def _draw_scatter(axes: Axes, study: Study, metric: str, path: str, x: np.ndarra
     axes.set_ylabel(f"worst {_metric_label(study, metric)}")
 
 
-@_style.styled()
+@_style.figure_function
 def study_overview(study: Study, *, runs: int = 512) -> Figure:
     """The overview of a study: quantile bands, a histogram of the margin, and the margin against
     each parameter.
@@ -324,7 +324,7 @@ def study_overview(study: Study, *, runs: int = 512) -> Figure:
 # --- first exit
 
 
-@_style.styled()
+@_style.figure_function
 def first_exit(found: FirstExit | Mapping[str, FirstExit]) -> Figure:
     """The distribution of the first exit from the bounds along time, with its intervals.
 
@@ -342,8 +342,8 @@ def first_exit(found: FirstExit | Mapping[str, FirstExit]) -> Figure:
         raise checks.fail("found", found, "at least one FirstExit")
     for name, one in named.items():
         check_class(f"found[{name!r}]", one, FirstExit, "study.first_exit() returns one.")
-    figure, (axes,) = _grid(1, 3.0)
-    figure.set_size_inches(6.0, 3.8)
+    figure = _style.new_figure(6.0, 3.8)
+    axes = figure.subplots()
     for k, (name, one) in enumerate(named.items()):
         colour = _style.colour(k)
         label = escaped(name) or "share of runs"

@@ -7,29 +7,40 @@ default colours are those of Okabe and Ito, which readers with any colour vision
 Each colour has its own line style, so that a figure is readable in black-and-white print.  A
 context manager applies the style and leaves matplotlib's global parameters unchanged.  Figures are
 not registered with pyplot, so none stays open.
+
+`style="paper"` replaces this by what IEEE and Elsevier ask for: the width of a column or of two, a
+serif font of 8 pt, and no titles, which the caption of a paper has.  `figure_function` adds this
+choice, and that of a figure to draw into, to every public function.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import functools
+import inspect
 import io
 import math
 import re
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from contextvars import ContextVar
+from typing import Any, TypeVar, cast
 
 import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.backend_bases import RendererBase
 from matplotlib.colors import to_hex, to_rgb, to_rgba
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, SubFigure
 from matplotlib.gridspec import SubplotSpec
 from matplotlib.rcsetup import cycler
 from matplotlib.text import Text
 from matplotlib.typing import ColorType
 
+from iblf_jax.core import checks
 from iblf_jax.plotting._curves import Curve
+
+F = TypeVar("F", bound=Callable)
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#6F4E37")
 DASHES: tuple[Any, ...] = (
@@ -95,9 +106,113 @@ STYLE_GROUPS = (
 when it draws."""
 
 
+@dataclasses.dataclass(frozen=True)
+class Paper:
+    """The style of a figure for print; style="paper" is one column of IEEE.
+
+    Args:
+      publisher: "ieee" or "elsevier", which have columns of 3.5 and 3.543 in (90 mm).
+      columns: 1, or 2 for the width of the page, 7.16 and 7.48 in (190 mm).
+
+    Source: IEEE Author Center, Resolution and size; Elsevier, Artwork and media instructions.
+    """
+
+    publisher: str = "ieee"
+    columns: int = 1
+
+    def __post_init__(self) -> None:
+        checks.one_of("publisher", self.publisher, ("ieee", "elsevier"))
+        checks.positive_integer("columns", self.columns, most=2)
+
+    @property
+    def width(self) -> float:
+        """[in]."""
+        return PAPER_WIDTHS[self.publisher, self.columns]
+
+
+PAPER_WIDTHS = {
+    ("ieee", 1): 3.5,
+    ("ieee", 2): 7.16,
+    ("elsevier", 1): 90 / 25.4,
+    ("elsevier", 2): 190 / 25.4,
+}
+"""Publisher and number of columns -> width [in]."""
+PAPER_HEIGHT = 9.0
+"""Largest height, that of a page with a caption [in]."""
+PAPER_FONT = 8.0
+"""[pt]."""
+PAPER_DEFAULTS: dict[str, Any] = DEFAULTS | {
+    "font.family": ["STIXGeneral"],
+    "font.size": PAPER_FONT,
+    "mathtext.fontset": "stix",
+    "lines.linewidth": 1.0,
+    "svg.fonttype": "none",
+    **dict.fromkeys(SIZES, PAPER_FONT),
+}
+"""Parameters of the style of a paper.  The font, a Times, comes with matplotlib, so that a figure
+is the same everywhere; text of an SVG stays text."""
+
+_PAPER: ContextVar[Paper | None] = ContextVar("paper", default=None)
+"""The style of the paper in which figures are made now."""
+_GIVEN: ContextVar[Figure | SubFigure | None] = ContextVar("figure", default=None)
+"""The figure of the user that the next figure is drawn into."""
+
+
+def figure_function(function: F) -> F:
+    """Decorator of a public function that returns a figure: adds the arguments style and figure.
+
+    style: "paper" or a `Paper` for print; "screen" (the default) otherwise.
+    figure: a matplotlib Figure or SubFigure to draw into, which is returned.
+    """
+
+    @functools.wraps(function)
+    def styled_function(*args: Any, style: Any = "screen", figure: Any = None, **options: Any):
+        paper = _checked_style(style)
+        if figure is not None and not isinstance(figure, Figure | SubFigure):
+            remedy = "Such as plt.figure() or one of figure.subfigures(1, 2)."
+            raise checks.fail("figure", figure, "a matplotlib Figure or SubFigure", remedy)
+        tokens = _PAPER.set(paper), _GIVEN.set(figure)
+        try:
+            with styled():
+                return function(*args, **options)
+        finally:
+            _PAPER.reset(tokens[0])
+            _GIVEN.reset(tokens[1])
+
+    signature = inspect.signature(function)
+    keyword = inspect.Parameter.KEYWORD_ONLY
+    added = [
+        inspect.Parameter("style", keyword, default="screen", annotation="str | Paper"),
+        inspect.Parameter("figure", keyword, default=None, annotation="Figure | SubFigure | None"),
+    ]
+    parameters = [*signature.parameters.values(), *added]
+    styled_function.__signature__ = signature.replace(  # type: ignore[attr-defined]
+        parameters=sorted(parameters, key=lambda x: x.kind)
+    )
+    return cast(F, styled_function)
+
+
+def _checked_style(style: object) -> Paper | None:
+    if isinstance(style, Paper):
+        return style
+    checks.one_of("style", style, ("screen", "paper"))
+    if style == "paper":
+        return Paper()
+    return None
+
+
 @contextmanager
-def styled() -> Iterator[None]:
-    """The context in which figures are made and saved; also a decorator, `@styled()`."""
+def styled(paper: Paper | None = None) -> Iterator[None]:
+    """The context in which figures are made and saved; also a decorator, `@styled()`.
+
+    Args:
+      paper: the style of a paper; that in which figures are made now if not given.
+    """
+    if paper is not None or in_paper():
+        parameters: dict[Any, Any] = PAPER_DEFAULTS | {"grid.color": blend(0.114)}
+        with matplotlib.rc_context(parameters):
+            yield
+        return
     user_sets_grid = _set_by_user("axes.grid")
     with matplotlib.rc_context(_unset(DEFAULTS | {"font.size": FONT})):
         panes = {f"axes3d.{axis}axis.panecolor": to_rgba(blend(0.05), 0.5) for axis in "xyz"}
@@ -120,7 +235,11 @@ def _set_by_user(name: Any) -> bool:
 
 
 def size(points: float) -> float:
-    """A text size [pt] that is `points` for a font of size FONT, scaled to the user's font."""
+    """A text size [pt] that is `points` for a font of size FONT, scaled to the user's font; in a
+    paper all text has one size.
+    """
+    if in_paper():
+        return PAPER_FONT
     return points * matplotlib.rcParams["font.size"] / FONT
 
 
@@ -132,6 +251,7 @@ class StyledFigure(Figure):
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self._fitted = False
+        self._paper = _PAPER.get()
         self._style_of_creation = {
             name: matplotlib.rcParams[name]
             for name in matplotlib.rcParams
@@ -188,7 +308,7 @@ class StyledFigure(Figure):
 
     def savefig(self, *args: Any, **kwargs: Any) -> None:
         """Saves the figure in this package's style."""
-        with styled():
+        with styled(self._paper):
             super().savefig(*args, **kwargs)
 
     def _repr_png_(self) -> bytes:
@@ -197,14 +317,42 @@ class StyledFigure(Figure):
         return picture.getvalue()
 
 
-def new_figure(width: float, height: float) -> StyledFigure:
-    """An empty figure with a constrained layout.
+def new_figure(width: float, height: float) -> Any:
+    """An empty figure with a constrained layout, or the figure that the user has given.
 
     Args:
-      width, height: size for a font of size FONT [in]; larger fonts enlarge the figure.
+      width, height: size for a font of size FONT [in]; larger fonts enlarge the figure, and a paper
+        has a width of its own.
     """
+    given = _GIVEN.get()
+    if given is not None:
+        whole: Any = given if isinstance(given, Figure) else given.figure
+        if whole.get_layout_engine() is None:
+            whole.set_layout_engine("constrained")
+        return given
+    paper = _PAPER.get()
+    if paper is not None:
+        share = min(1.0, max(paper.width / width, 0.8))
+        size_in_paper = (paper.width, min(share * height, PAPER_HEIGHT))
+        return StyledFigure(figsize=size_in_paper, layout="constrained")
     growth = max(1.0, size(1.0)) ** SIZE_EXPONENT
     return StyledFigure(figsize=(width * growth, height * growth), layout="constrained")
+
+
+def in_paper() -> bool:
+    """Whether the figure that is made now is one of a paper: its caption has what titles say."""
+    return _PAPER.get() is not None
+
+
+def is_narrow() -> bool:
+    """Whether the figure that is made now has the width of one column of a paper."""
+    paper = _PAPER.get()
+    return paper is not None and paper.columns == 1
+
+
+def width_of(figure: Figure | SubFigure) -> float:
+    """The width of a figure, or of a part of one [in]."""
+    return float(figure.bbox.width / figure.dpi)
 
 
 # --- colours
@@ -354,8 +502,12 @@ def set_title(
 
 
 def set_heading(figure: Figure, lines: Sequence[str], **options: Any) -> None:
-    """Sets the title of a figure from its lines; lines that are too long are broken."""
-    room = int(12 * figure.get_figwidth() * 9.0 / size(9.0))
+    """Sets the title of a figure from its lines; lines that are too long are broken.  In a paper
+    the caption says it.
+    """
+    if in_paper():
+        return
+    room = int(12 * width_of(figure) * 9.0 / size(9.0))
     figure.suptitle("\n".join(textwrap.fill(line, room) for line in lines), **options)
 
 
@@ -374,7 +526,7 @@ def legend_below(figure: Figure, columns: int = 5, of: Sequence[Axes] | None = N
     if not entries:
         return
     characters = 4.5 + 0.56 * max(map(len, entries))  # line and label, in units of the text size
-    room = int(figure.get_figwidth() * 72 / (size(8.5) * characters))
+    room = int(width_of(figure) * 72 / (size(8.5) * characters))
     rows = math.ceil(len(entries) / max(1, min(columns, room)))
     columns = math.ceil(len(entries) / rows)
     handles, labels = list(entries.values()), list(entries)
@@ -417,7 +569,11 @@ def panel_rows(
 
 
 def row_sizes(count: int, most: int) -> list[int]:
-    """Number of panels in each row, at most `most`; the fuller rows first."""
+    """Number of panels in each row, at most `most`, in one column of a paper one; the fuller rows
+    first.
+    """
+    if is_narrow():
+        most = 1
     rows = math.ceil(count / most)
     size, remainder = divmod(count, rows)
     return [size + 1] * remainder + [size] * (rows - remainder)

@@ -71,7 +71,7 @@ def _axis_label(data: xarray.Dataset, name: str) -> str:
     return escaped(name)
 
 
-@_style.styled()
+@_style.figure_function
 def heat_map(
     data: xarray.Dataset,
     metric: str | Sequence[str] = "failed",
@@ -164,7 +164,7 @@ def _draw_heat_map(
         axes.text(column, row, f"{number:.3g}", color=colour, **centred)
 
 
-@_style.styled()
+@_style.figure_function
 def parallel(data: xarray.Dataset, metric: str = "margin") -> Figure:
     """Parallel coordinates: one line per point through the values of all swept parameters, coloured
     by a metric.

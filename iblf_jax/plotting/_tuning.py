@@ -11,8 +11,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from iblf_jax.control.actuators import Motor
+from iblf_jax.control.controllers import Saturated
 from iblf_jax.core import checks
 from iblf_jax.core.first_use import ModuleOnFirstUse
+from iblf_jax.core.pytree import layers
 from iblf_jax.plotting import _scales, _style
 from iblf_jax.plotting._curves import ROUNDING, Curve, check_class, curves_of, escaped, peak_of
 from iblf_jax.plotting._panels import (
@@ -24,6 +27,7 @@ from iblf_jax.plotting._panels import (
     show,
     signed,
 )
+from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies.summaries import LEVELS, initial_margins
 
 if TYPE_CHECKING:
@@ -35,7 +39,7 @@ MAX_NAMED = 28
 """Largest number of gains in the legend."""
 
 
-@_style.styled()
+@_style.figure_function
 def tuning(
     result: results.TuneResult, *, landscape: tuple[str, str] | None = None, points: int = 13
 ) -> Figure:
@@ -61,43 +65,63 @@ def tuning(
         remedy = f"They are {', '.join(result.names)}."
         raise checks.fail("landscape", landscape, "the names of two tuned numbers", remedy)
     n = result.scenario.n
-    columns = 1
-    if n > 3:
-        columns = 2
-    rows = len(_style.row_sizes(n, columns))
-    heights = [1.9, 2.5, 2.0, 1.7 * rows]
+    columns = 1 if n <= 3 else 2
+    heights = [1.7 * len(_style.row_sizes(n, columns)), 1.9, 1.9, 2.4]
     if len(result.names) <= MAX_NAMED:
-        heights[1] += 0.17 * len(result.names)
-    figure = _style.new_figure(_style.WIDTH, 1.0 + sum(heights))
+        heights[3] += 0.17 * len(result.names)
+    figure = _style.new_figure(_style.WIDTH, 1.2 + sum(heights))
     grid = figure.add_gridspec(4, 2, height_ratios=heights)
-    _progress(figure.add_subplot(grid[0, 0]), result)
-    _margin(figure.add_subplot(grid[0, 1]), result)
-    _gains(figure.add_subplot(grid[1, 0]), result)
-    if landscape is None and len(result.names) > 1:
-        landscape = (result.names[0], result.names[1])
-    if landscape is not None:
-        _landscape(figure.add_subplot(grid[1, 1]), result, landscape, points)
     curves = curves_of(dict(zip(("before", "tuned"), result.nominal, strict=True)))
     window = (0.0, result.setup.duration)
-    _peaks(figure.add_subplot(grid[2, 0]), curves)
-    _torque(figure.add_subplot(grid[2, 1]), curves, window)
-    tubes = _style.panel_rows(figure, n, columns, grid[3, :])
+    tubes = _style.panel_rows(figure, n, columns, grid[0, :])
     for i, axes in enumerate(axes for row in tubes for axes in row):
         quantity = quantity_of(result.scenario, "q", i)
         show(axes, curves, quantity, i, window)
         axes.set_ylabel(_style.label(curves[0].joint_label(i), quantity.unit))
     for axes in tubes[-1]:
         _style.time_axis(axes)
+    limits = torque_limits(result.scenario)
+    _torque(figure.add_subplot(grid[1, 0]), curves, window, limits)
+    _peaks(figure.add_subplot(grid[1, 1]), curves, limits)
+    search = figure.add_subplot(grid[2, 0])
+    _progress(search, result)
+    _margin(figure.add_subplot(grid[2, 1]), result)
+    _gains(figure.add_subplot(grid[3, 0]), result)
+    if landscape is None and len(result.names) > 1:
+        landscape = (result.names[0], result.names[1])
+    if landscape is not None:
+        _landscape(figure.add_subplot(grid[3, 1]), result, landscape, points)
+    if not _style.in_paper():
+        tubes[0][0].set_title("Before and after", loc="left")
+        search.set_title("The search", loc="left")
     heading = ["Gain tuning"]
     if result.at_limits:
         heading.append("at the end of their range: " + ", ".join(map(escaped, result.at_limits)))
     _style.set_heading(figure, heading)
-    _style.legend_below(figure, of=tubes[0])
+    above: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0)}
+    tubes[0][-1].legend(ncols=4, borderaxespad=0.0, **above)
     return figure
 
 
-def _peaks(axes: Axes, curves: list[Curve]) -> None:
-    """The torque of every joint that is farthest from zero, with its sign, before and after."""
+def torque_limits(scenario: Scenario) -> np.ndarray | None:
+    """The largest torque of each joint that the law or its actuator lets through, (n,) [N m]; None
+    without limits.
+    """
+    limits = [law.limit for law in layers(scenario.controller) if isinstance(law, Saturated)]
+    if isinstance(scenario.actuator, Motor):
+        limits.append(scenario.actuator.limit)
+    if not limits:
+        return None
+    smallest = np.min([np.broadcast_to(x, scenario.n) for x in limits], axis=0)
+    if not np.all(np.isfinite(smallest)):
+        return None
+    return smallest
+
+
+def _peaks(axes: Axes, curves: list[Curve], limits: np.ndarray | None) -> None:
+    """The torque of every joint that is farthest from zero, with its sign, before and after, and
+    its limits.
+    """
     n = curves[0].run.n
     style: dict[str, Any] = {"textcoords": "offset points", "ha": "center"}
     style["fontsize"] = _style.size(6.5)
@@ -114,8 +138,14 @@ def _peaks(axes: Axes, curves: list[Curve]) -> None:
             beyond: dict[str, Any] = {"xytext": (0, 2), "va": "bottom"}
             if y < 0.0:
                 beyond = {"xytext": (0, -2), "va": "top"}
-            axes.annotate(signed(y), (x, y), **style, **beyond)
+            axes.annotate(signed(float(f"{y:.3g}")), (x, y), **style, **beyond)
         values += peaks
+    if limits is not None:
+        for joint, limit in enumerate(limits):
+            ends = [joint - 0.45, joint + 0.45]
+            for side in (-limit, limit):
+                axes.plot(ends, [side, side], color=_style.failure(), linewidth=1.0)
+        values += limits.tolist()
     sizes = np.abs(values)
     if np.all(np.isfinite(sizes)) and sizes.min() > 0 and sizes.max() > 10 * sizes.min():
         axes.set_yscale("symlog", linthresh=float(sizes.min()))
@@ -127,15 +157,27 @@ def _peaks(axes: Axes, curves: list[Curve]) -> None:
     axes.set_ylabel(_style.label(f"peak {quantity.name}", quantity.unit))
 
 
-def _torque(axes: Axes, curves: list[Curve], window: Window) -> None:
-    """The torque of the joint that has the largest one."""
-    joint = int(np.argmax(np.nan_to_num(np.abs(curves[-1]["tau"])).max(axis=0)))
+def _torque(axes: Axes, curves: list[Curve], window: Window, limits: np.ndarray | None) -> None:
+    """The torque of the joint that is nearest to its limit, or has the largest torque without
+    limits.
+    """
+    share = np.nan_to_num(np.abs(curves[-1]["tau"])).max(axis=0)
+    if limits is not None:
+        share = share / limits
+    joint = int(np.argmax(share))
     drawn = []
     for i, curve in enumerate(curves):
         drawn.append(draw(axes, curve, "tau", joint, window, **_style.series(i)))
     quantity = quantity_of(curves[0].run.scenario, "tau", joint)
     set_limits(axes, curves, drawn, [], quantity, spikes=True)
     annotate_clipped_peak(axes, curves, drawn, quantity, [joint] * len(drawn))
+    low, high = axes.get_ylim()
+    if limits is not None:
+        for side in (-limits[joint], limits[joint]):
+            axes.axhline(side, color=_style.failure(), linewidth=1.0)
+        if limits[joint] > 2.0 * max(-low, high):  # Far limits would flatten the curves.
+            axes.set_ylim(low, high)
+            axes.set_title(f"limit {limits[joint]:.4g} {quantity.unit}", loc="right")
     name = f"{quantity.name} of {curves[0].joint_label(joint)}"
     axes.set_ylabel(_style.label(name, quantity.unit))
     _style.time_axis(axes, window)
@@ -227,7 +269,7 @@ def _landscape(axes: Axes, result: results.TuneResult, names: tuple[str, str], p
     axes.set_ylabel(escaped(names[1]))
 
 
-@_style.styled()
+@_style.figure_function
 def paths(
     result: results.TuneResult,
     others: Mapping[str, Any] | None = None,
@@ -316,7 +358,7 @@ def _draw_iterates(axes: Axes, iterates: Mapping[str, np.ndarray], tuned: np.nda
     axes.plot(*tuned, marker="*", markersize=13, label="tuned", **outlined)
 
 
-@_style.styled()
+@_style.figure_function
 def pareto(front: results.ParetoFront) -> Figure:
     """A front of two objectives, with all trials.
 

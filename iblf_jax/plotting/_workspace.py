@@ -178,7 +178,7 @@ def _plane_in_box(normal: np.ndarray, offset: float, limits: np.ndarray) -> np.n
     return np.array(found)[np.argsort(angles)]
 
 
-@_style.styled()
+@_style.figure_function
 def workspace(runs: Runs) -> Figure:
     """The paths of the tip and of other confined points [m], the boundaries of the regions, and the
     arm at the end of the run; of a plant with an outline its path, and the outline at some times.

@@ -25,7 +25,7 @@ COLUMNS = 3
 LEGEND: dict[str, Any] = {"frameon": True, "framealpha": 0.85, "edgecolor": "none"}
 
 
-@_style.styled()
+@_style.figure_function
 def certificate(
     shown: Certificate, *, title: str | None = None, until: float | None = None
 ) -> Figure:
@@ -295,7 +295,6 @@ def _verdicts(axes: Axes, shown: Certificate) -> None:
         if line.enters_verdict
         and (line.name.startswith(tuple(names)) or (only_weighted and line.has_weights))
     ]
-    growth = axes.get_figure().get_figwidth() / WIDTH  # type: ignore[union-attr]
     style: dict[str, Any] = {"transform": axes.transAxes, "va": "center"}
     if not lines:
         axes.text(0.5, 0.5, "no claim applies", ha="center", **style)
@@ -305,7 +304,7 @@ def _verdicts(axes: Axes, shown: Certificate) -> None:
         colour = _verdict_colour(line.verdict)
         cells = (line.name, line.equation, line.verdict, _margin(line))
         for x, text in zip(columns, cells, strict=True):
-            axes.text(x, height, text, color=colour, fontsize=7 * growth, **style)
+            axes.text(x, height, text, color=colour, fontsize=_style.size(7), **style)
 
 
 def _margin(line: Line) -> str:

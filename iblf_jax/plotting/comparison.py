@@ -36,7 +36,7 @@ TORQUE_SHARE = 0.1
 differ most there."""
 
 
-@_style.styled()
+@_style.figure_function
 def comparison(result: Comparison, joint: int = 0, *, zoom: float | None = None) -> Figure:
     """Error |e1| and torque of one joint during the transient, and the settling time of every law
     (worst joint).

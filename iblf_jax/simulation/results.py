@@ -66,7 +66,9 @@ class Metrics(Mapping):
 
     def __repr__(self) -> str:
         rows = []
-        for name, value in self.values_by_name.items():
+        order = [*self.units, *self.values_by_name]  # as the metrics were given, then further ones
+        for name in dict.fromkeys(name for name in order if name in self.values_by_name):
+            value = self.values_by_name[name]
             shown = str(value)
             if checks.is_concrete(value):
                 shown = np.array2string(np.asarray(value), precision=4, threshold=8)

@@ -137,7 +137,9 @@ class EffortSearch:
     def remark(self) -> str:
         """Why the factor is missing, or says little about the law, in one line; "" if neither."""
         if not self.crossings and self.smaller_dt is not None:
-            return f"{self._nothing_found()}; failed trials may be valid with dt={self.smaller_dt:g}"
+            return (
+                f"{self._nothing_found()}; failed trials may be valid with dt={self.smaller_dt:g}"
+            )
         if not self.crossings:
             return self._nothing_found()
         if self.influence < INFLUENCE:

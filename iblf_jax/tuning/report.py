@@ -135,14 +135,21 @@ class Verdict:
             f"{self.name} (broken by at most {self.allowed:g} of the runs):"
             f" {self.before.estimate:.4g} -> {self.after}: {self.verdict}"
         )
-        if self.verdict != "undecided" or self.after.count or not self.allowed > 0:
+        if self.runs_needed is None:
             return text
-        confidence = self.after.confidence
-        needed = runs_without_event(self.allowed, confidence)
         return (
-            f"{text}; no run broke it, but {needed} such runs are needed to conclude that with"
-            f" {confidence:.0%} confidence"
+            f"{text}; no run broke it, but {self.runs_needed} such runs are needed to conclude that"
+            f" with {self.after.confidence:.0%} confidence"
         )
+
+    @property
+    def runs_needed(self) -> int | None:
+        """The number of runs, none of which breaks the requirement, that would decide it; None
+        where it is decided or a run broke it.
+        """
+        if self.verdict != "undecided" or self.after.count or not self.allowed > 0:
+            return None
+        return runs_without_event(self.allowed, self.after.confidence)
 
     def _value_in_words(self) -> str:
         """The value; where each joint has a limit of its own, that of the worst joint relative to
@@ -260,6 +267,35 @@ class TuningReport(Result):
             words.append("a requirement is BROKEN at dt / 2")
         if self.unstable[1]:
             words.append(f"the sampled loop is UNSTABLE in {self._unstable_in_words()}")
+        return "; ".join(words)
+
+    @property
+    def title(self) -> str:
+        """The verdict in a sentence, what failed first: how many fresh runs keep the bounds, and
+        how many are needed to claim more.
+        """
+        words = []
+        failed = sum(v.verdict == "fail" for v in self.verdicts)
+        if failed:
+            words.append(f"{failed} of {len(self.verdicts)} requirements FAILED")
+        left = self.violation[1]
+        if not self.bounds_kept and not left.count:
+            words.append("the runs of the tuning leave their bounds")
+        elif self.seed is None:
+            verb = "leaves" if left.count else "keeps"
+            words.append(f"the nominal run {verb} its bounds")
+        else:
+            kept = left.runs - left.count
+            words.append(f"{kept} of {left.runs} fresh runs keep the bounds")
+        if self.step_check is not None and self.step_check.newly_broken:
+            words.append("a requirement is BROKEN at dt / 2")
+        if self.unstable[1]:
+            words.append(f"the sampled loop is UNSTABLE in {self._unstable_in_words()}")
+        open_ones = [v for v in self.verdicts if v.runs_needed is not None]
+        if open_ones:
+            strictest = max(open_ones, key=lambda v: v.runs_needed or 0)
+            share = 100 * (1 - strictest.allowed)
+            words.append(f"{strictest.runs_needed} runs are needed to claim {share:g} %")
         return "; ".join(words)
 
     def _content(self) -> Content:

@@ -5,6 +5,7 @@ joint left its bounds, that a quantity is zero, that a margin is that of the sta
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import re
 import types
 import warnings
@@ -16,6 +17,8 @@ import study_cases as cases
 from made_up_runs import chain, made_up, runaway, with_signals
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
+from matplotlib.font_manager import findfont
+from matplotlib.text import Text
 
 import iblf_jax as ij
 from iblf_jax import Status, plotting
@@ -69,13 +72,15 @@ def test_a_peak_of_a_region_names_no_joint():
 def test_the_bars_of_a_tuning_have_the_signs_of_the_torques():
     run = made_up(chain(2))
     (axes,) = [Figure().subplots()]
-    _tuning._peaks(axes, curves_of({"before": run, "tuned": run}))
+    _tuning._peaks(axes, curves_of({"before": run, "tuned": run}), np.array([40.0, 20.0]))
     heights = [bar.get_height() for bar in axes.patches]
     tau = np.asarray(run.tau)
     expected = [column[np.argmax(np.abs(column))] for column in tau.T]
     assert np.all(np.sign(expected) == -1.0)
     np.testing.assert_allclose(heights, expected * 2)
-    assert texts_of(axes) == [f"{x:.5g}".replace("-", "\N{MINUS SIGN}") for x in expected] * 2
+    assert texts_of(axes) == [f"{x:.3g}".replace("-", "\N{MINUS SIGN}") for x in expected] * 2
+    limits = [line.get_ydata()[0] for line in axes.get_lines()[:4]]
+    assert limits == [-40.0, 40.0, -20.0, 20.0]
 
 
 def test_a_report_lists_the_peaks_with_their_signs():
@@ -423,3 +428,79 @@ def test_a_tuning_says_when_the_start_sets_its_margin(paper):
         axes = Figure().subplots()
         _tuning._margin(axes, result)
         assert ("that of the start" in axes.get_title()) == is_start
+
+
+# ---- figures for print, and figures of the user
+
+
+PUBLIC = sorted(
+    name
+    for name in dir(plotting)
+    if inspect.isfunction(getattr(plotting, name))
+    and name not in ("animate", "paper_figures", "save")
+)
+
+
+def test_every_figure_function_takes_a_style_and_a_figure():
+    for name in PUBLIC:
+        parameters = inspect.signature(getattr(plotting, name)).parameters
+        assert {"style", "figure"} <= set(parameters), name
+    for options, message in (
+        ({"style": "print"}, "style: got 'print'"),
+        ({"figure": 3}, "figure: got 3, expected a matplotlib Figure"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            plotting.positions(made_up(chain(1)), **options)
+    with pytest.raises(ValueError, match="publisher: got 'acm'"):
+        plotting.Paper("acm")
+
+
+@pytest.mark.parametrize(
+    ("style", "width"),
+    [("paper", 3.5), (plotting.Paper("elsevier", 2), 190 / 25.4)],
+    ids=["IEEE, one column", "Elsevier, two columns"],
+)
+def test_a_figure_for_print_has_the_size_and_the_font_of_the_journal(style, width, tmp_path):
+    run = made_up(chain(2))
+    for number, make in enumerate((plotting.torques, plotting.overview, plotting.phase_portrait)):
+        figure = drawn(make(run, style=style))
+        assert figure.get_figwidth() == pytest.approx(width)
+        assert figure.get_figheight() <= 9.0
+        assert figure._suptitle is None
+        texts = [text for text in figure.findobj(Text) if text.get_text() and text.get_visible()]
+        assert {text.get_fontsize() for text in texts} == {8.0}
+        files = {findfont(text.get_fontproperties()) for text in texts}
+        assert all("STIXGeneral" in file for file in files), files
+        plotting.save({str(number): figure}, tmp_path, formats=("pdf", "svg"))
+        document = (tmp_path / f"{number}.pdf").read_bytes()
+        box = re.search(rb"/MediaBox \[ ?0 0 ([\d.]+) ", document)
+        assert box is not None and float(box[1]) == pytest.approx(72 * width, abs=0.1)
+        assert b"/Type3" not in document  # Publishers ask for TrueType.
+        assert "<text" in (tmp_path / f"{number}.svg").read_text()
+    assert plotting.torques(run).get_figwidth() == pytest.approx(_style.WIDTH)
+
+
+def test_a_figure_of_the_user_is_drawn_into_and_returned():
+    run = made_up(chain(2))
+    whole = Figure(figsize=(9.0, 4.0))
+    left, right = whole.subfigures(1, 2)
+    assert plotting.positions(run, figure=left) is left
+    assert plotting.phase_portrait(run, figure=right) is right
+    assert len(left.axes) == 4 and len(right.axes) == 1
+    assert plotting.errors(run).figure is not whole
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        whole.canvas.draw()
+
+
+def test_a_noise_is_a_band_and_a_motion_is_a_line():
+    t = np.linspace(0.0, 1.0, 2001)
+    noise = np.random.default_rng(0).normal(0.0, 0.2, t.size)
+    assert _panels.noise_band(t, np.sin(9.0 * t)) is None
+    assert _panels.noise_band(t, np.sin(9.0 * t) + 1e-3 * noise) is None
+    times, low, high, mean = _panels.noise_band(t, np.sin(9.0 * t) + noise)
+    assert times[0] < 0.02 and times[-1] > 0.98
+    assert np.all((low < mean) & (mean < high))
+    np.testing.assert_allclose(mean, np.sin(9.0 * times), atol=0.2)
+    held = np.repeat(noise[:1001], 2)[: t.size]  # a noise that a sampled law holds
+    assert _panels.noise_band(t, held) is not None

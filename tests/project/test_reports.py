@@ -49,7 +49,11 @@ SAYS = {
     "Study": ["16 runs", "xi_margin"],
     "Certificate": ["inequality, case 2", "Backstepping"],
     "Comparison": ["rmse [rad]", "Held equal"],
-    "TuneResult": ["controller.K2", "before", "[20., 20.]"],
+    "TuneResult": [
+        "controller.K2",
+        "before",
+        '<td style="text-align:left">joint 0</td><td style="text-align:left">controller.K2</td>',
+    ],
 }
 
 
@@ -101,7 +105,10 @@ def test_a_title_does_not_repeat_the_name_of_the_class(results):
         assert f"{kind}(" not in " ".join(parts.words), kind
         assert not parts.words[0].startswith(parts.title), kind
     study = reports.shown(results["Study"])
-    assert study.title == "Monte-Carlo study"
+    assert study.title == "Monte-Carlo study: 16 of 16 runs keep the bounds"
+    run = reports.shown(results["Rollout"])
+    assert run.title == "Run: the bounds are kept"
+    assert run.words[1].startswith("smallest margin: ") and ", joint " in run.words[1]
     assert study.words[0].startswith("16 runs of 0.16 s, dt = 0.002 s, seed 0")
     assert reports.shown(results["Comparison"]).words == [
         "2 laws, 0.16 s, dt = 0.002 s, rk4; worst joint"

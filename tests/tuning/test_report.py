@@ -383,6 +383,22 @@ def test_bounds_and_requirements_decide_headline_and_exit_code(report, headline,
     assert report.failed is failed and _has_failed(report) is failed
 
 
+def test_the_title_is_the_verdict_with_what_failed_first():
+    assert made_up_report(0, {}).title == "100 of 100 fresh runs keep the bounds"
+    assert made_up_report(1, {}, seed=None).title == "the nominal run leaves its bounds"
+    failed = made_up_report(5, {"a": "pass", "b": "fail"}).title
+    assert failed == "1 of 2 requirements FAILED; 95 of 100 fresh runs keep the bounds"
+    undecided = made_up_report(0, {"a": "undecided"})
+    [verdict] = undecided.verdicts
+    assert undecided.title == (
+        f"100 of 100 fresh runs keep the bounds; {verdict.runs_needed} runs are needed to claim"
+        f" {100 * (1 - verdict.allowed):g} %"
+    )
+    assert f"but {verdict.runs_needed} such runs are needed" in str(verdict)
+    check = made_up_check(violated=(0, 1))
+    assert made_up_report(0, {}, check).title == "the runs of the tuning leave their bounds"
+
+
 def test_a_sampled_loop_that_is_unstable_in_some_runs_is_in_headline_and_text():
     stable = dataclasses.replace(made_up_report(0, {}), sampling_radius=(0.998, 0.995))
     assert "largest sampling_radius: 0.998 -> 0.995; stable below 1\n" in str(stable)
@@ -564,7 +580,7 @@ def test_failed_fresh_runs_are_those_of_a_study_with_the_seed_of_the_report(pape
 @pytest.mark.slow
 def test_text_card_and_file_begin_with_what_failed(loose, tmp_path):
     card = loose._repr_html_()
-    assert "Tuning: bounds kept; 1 of 2 requirements FAILED" in card
+    assert "Tuning: 1 of 2 requirements FAILED; 200 of 200 fresh runs keep the bounds" in card
     assert reports.shown(loose).words[1].strip().startswith("bounds violated")
     text = repr(loose)
     assert text.index("200 fresh runs: bounds kept; 1 of 2") < text.index("controller.K2: ")
@@ -584,7 +600,7 @@ def test_a_violated_bound_is_in_every_presentation(paper):
     assert repr(result).splitlines()[1].strip() == words
     assert words in str(result.report)
     assert result.report.headline.startswith("bounds VIOLATED")
-    assert "Tuning: bounds VIOLATED" in result._repr_html_()
+    assert "Tuning: the nominal run leaves its bounds" in result._repr_html_()
     assert _has_failed(result.report)
 
 

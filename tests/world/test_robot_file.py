@@ -86,7 +86,7 @@ def test_joints_have_one_name_in_paths_and_messages(folder):
     with pytest.raises(ValueError, match=r"^initial\.q\[elbow_joint\]: got 4"):
         ij.simulate(outside, duration=0.01)
     high = ij.with_parameters(scenario, {"bounds.lower.value[elbow_joint]": 5.0})
-    with pytest.raises(ValueError, match="^bounds of joint elbow_joint: got"):
+    with pytest.raises(ValueError, match=r"^bounds of joint elbow_joint: got"):
         ij.simulate(high, duration=0.01)
     with pytest.raises(ValueError, match=r"controller\.K2\[elbow\]"):
         ij.with_parameters(scenario, {"controller.K2[elbow]": 9.0})
