@@ -181,7 +181,9 @@ class StructuredFunction:
             traced = any(isinstance(x, jax.core.Tracer) for x in (jax.device_put(ZERO), *leaves))
             options = None if traced else self._options
         shapes = tuple([getattr(x, "shape", ()) for x in leaves])
-        key = (self._function, options is None, tuple(static), structure, shapes)
+        # The options are a part of the key: two programs may be made of one function.
+        of_compiler = tuple((options or {}).items())
+        key = (self._function, of_compiler, tuple(static), structure, shapes)
         return self._programs.get(key, partial(self._copy, options))
 
     def _copy(self, options: dict[str, Any] | None) -> Any:

@@ -37,6 +37,7 @@ from iblf_jax.engine.runs import takes_runs as takes_runs
 from iblf_jax.engine.simulate import run_rollout as run_rollout
 from iblf_jax.engine.sizes import STUDY_MEMORY as STUDY_MEMORY
 from iblf_jax.engine.sizes import block_size as block_size
+from iblf_jax.engine.sizes import block_size_in_memory as block_size_in_memory
 from iblf_jax.engine.sizes import blocks_in_flight as blocks_in_flight
 from iblf_jax.engine.sizes import cases_per_unit as cases_per_unit
 from iblf_jax.engine.sizes import points_per_batch as points_per_batch

@@ -1,9 +1,14 @@
-"""Blocks: the one compiled shape in which studies run, whatever their size.
+"""Blocks: the compiled shape in which studies run.
 
-XLA rounds differently at different batch sizes, so every device always runs a block of the same
-number of runs: run i is in block i // B at place i % B, whether a study has ten runs or a million,
-one device or eight, one process or many, and however many blocks are in flight.  The last block is
-filled with repetitions of the last run, which are cut off.
+Every device always runs a block of the same number of runs: run i is in block i // B at place
+i % B, with one device or eight, one process or many, and however many blocks are in flight.  The
+last block is filled with repetitions of the last run, which are cut off.
+
+B is the same for all stored studies.  A large study in memory has larger blocks.  XLA may round
+differently at another batch size where it chooses the order of a sum, so what is computed before
+and after the steps has no sums whose order is free (`core.linalg.matmul_in_order`); the steps are
+made by kernels, run by run.  A test compares the bits of runs in blocks of both sizes, and
+`Study.replay` tells if a run has other numbers.
 
 The devices of this process take the blocks in turn, each with its own copy of the same program:
 runs are independent, so devices never communicate.  (`shard_map` would use one program for all
@@ -105,6 +110,7 @@ def run_blocks(
     here: LocalExecutor | None = None,
     *,
     record_every: int | None = None,
+    size: int | None = None,
 ) -> Iterator[tuple[int, Any]]:
     """Runs blocks in this process and yields (block, its results on the host), in their order.
 
@@ -114,8 +120,10 @@ def run_blocks(
       here: devices and limits; all devices and the default memory if not given.
       record_every: steps between two records; if given, trajectories are returned instead of
         metrics.
+      size: runs of a block; `block_size()` if not given.
     """
     here = here or LocalExecutor()
+    size = size or block_size()
     remaining = iter(blocks)
     devices = here.devices or default_devices()
     # No more devices are used than there are blocks.
@@ -126,12 +134,12 @@ def run_blocks(
     execute = partial(_execute, program=prepared.program, record_every=record_every)
     copies = [jax.device_put(prepared.shared, device) for device in devices]
     if len(devices) > 1:
-        inputs = prepared.inputs_of(np.arange(block_size()))
+        inputs = prepared.inputs_of(np.arange(size))
         _compile(execute, copies, [jax.device_put(inputs, device) for device in devices])
 
     def compute(block: int, device: int) -> tuple[Any, int]:
         """The results of a block on the device of this number, and the bytes that it took."""
-        cases = np.arange(block * block_size(), (block + 1) * block_size())
+        cases = np.arange(block * size, (block + 1) * size)
         inputs = jax.device_put(prepared.inputs_of(cases), devices[device])
         out = execute(copies[device], inputs)
         wait_until_ready(out)
@@ -176,11 +184,12 @@ def run_spans_here(
     spans: Iterable[slice],
     here: LocalExecutor,
     advance: Callable[[int], None] = lambda cases: None,
+    size: int | None = None,
 ) -> Iterator[tuple[slice, BlockResults]]:
     """Computes spans of consecutive cases in this process, in their order, and yields each with its
-    results; arguments as `execution.run_spans`.
+    results; arguments as `execution.run_spans` and `run_blocks`.
     """
-    size = block_size()
+    size = size or block_size()
     started: deque[slice] = deque()
 
     def blocks() -> Iterator[int]:
@@ -189,7 +198,7 @@ def run_spans_here(
             yield from range(span.start // size, checks.ceil_div(span.stop, size))
 
     parts: list[BlockResults] = []
-    for block, results in run_blocks(prepared, blocks(), here):
+    for block, results in run_blocks(prepared, blocks(), here, size=size):
         span = started[0]
         first = block * size
         count = min(size, span.stop - first)

@@ -51,6 +51,11 @@ class LocalExecutor:
     chunk: int | None = None
     """Number of runs in flight; None to derive it from `memory`."""
 
+    @property
+    def is_limited(self) -> bool:
+        """Whether fewer runs may be in flight than by default."""
+        return self.chunk is not None or self.memory < STUDY_MEMORY
+
     def checked(self) -> LocalExecutor:
         """The same options with valid values; ValueError names an invalid one."""
         chunk = self.chunk

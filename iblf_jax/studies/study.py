@@ -27,7 +27,7 @@ from iblf_jax.core.presentation import Content, Result, present
 from iblf_jax.core.progress import announced
 from iblf_jax.core.status import FAILED, Status, describe, has_flag
 from iblf_jax.core.status import VIOLATED as CONSTRAINT_VIOLATED
-from iblf_jax.engine import RunRequest, block_size, run_rollout
+from iblf_jax.engine import RunRequest, block_size_in_memory, run_rollout
 from iblf_jax.engine.simulate import SimulationWarning
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.metrics import metric_units
@@ -435,8 +435,10 @@ class Study(Result):
 
     def _recompute(self, i: int) -> BlockResults:
         """The results of run i, from its block; warns if they differ from those of the study."""
-        block, place = divmod(i, block_size())
-        ((_, results),) = run_blocks(self.setup, [block])
+        # Of the size that the study had, whose program is compiled already.
+        size = block_size_in_memory(self.setup.cases, self.setup.options.steps)
+        block, place = divmod(i, size)
+        ((_, results),) = run_blocks(self.setup, [block], size=size)
         again = jax.tree.map(lambda x: x[place], results)
         if not all(
             np.array_equal(x, self.metrics[name][i], equal_nan=True)

@@ -58,6 +58,16 @@ def test_it_may_be_transformed_and_called_in_another_program():
     np.testing.assert_allclose(by_rows, np.sin(2.0 * x))
 
 
+def test_programs_of_one_function_with_different_options_are_kept_apart():
+    def doubled(x):
+        return 2 * x
+
+    for level in (0, 1):
+        options = {"xla_backend_optimization_level": level}
+        assert float(programs.jit(doubled, options=options)(3.0)) == 6.0
+    assert len(programs.PROGRAMS.of(doubled)) == 2
+
+
 def test_a_program_that_is_not_optimised_may_be_a_part_of_another():
     """JAX accepts options of the compiler for a whole program only."""
     doubled = programs.jit(lambda x: 2 * x, options=programs.SHORTEST_TO_COMPILE)

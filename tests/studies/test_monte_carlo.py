@@ -23,7 +23,7 @@ from scipy import stats
 import iblf_jax as ij
 from iblf_jax.core.status import FAILED, Status
 from iblf_jax.engine import execute, sizes
-from iblf_jax.studies import blocks, statistics, time_step
+from iblf_jax.studies import blocks, execution, statistics, time_step
 
 SCENARIO = ij.presets.zhang_yan_2024()
 
@@ -84,6 +84,46 @@ def test_as_many_blocks_are_made_beside_each_other_as_are_in_flight(
 def test_number_of_runs_changes_no_run(study, runs):
     fewer = results(cases.study(runs=runs))
     assert cases.same({name: x[:runs] for name, x in results(study).items()}, fewer)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("loop", ["continuous", "sampled"])
+def test_the_size_of_a_block_changes_no_bit(loop, monkeypatch):
+    """Also not of a run that is made again, with its block."""
+    scenario = SCENARIO
+    if loop == "sampled":
+        sensor = ij.sensors.Encoder(
+            counts=2.0**16, velocity=ij.sensors.FilteredDifference(cutoff=300.0)
+        )
+        sampling = ij.Sampling(period=2e-3, delay=1e-3)
+        motor = ij.actuators.Motor(bandwidth=200.0)
+        scenario = ij.with_parts(scenario, sampling=sampling, sensor=sensor, actuator=motor)
+
+    def made():
+        return ij.monte_carlo(scenario, cases.perturbations(), runs=600, **cases.options())
+
+    usual = made()
+    found, run_spans = [], execution.run_spans_here
+    monkeypatch.setattr(sizes, "LARGE_STUDY", 600)
+    monkeypatch.setattr(
+        execution, "run_spans_here", lambda *args: found.append(args[-1]) or run_spans(*args)
+    )
+    large = made()
+    assert found == [sizes.LARGE_BLOCK] != [sizes.block_size()]
+    assert cases.same(results(usual), results(large))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert large.replay(599).status == usual.status[599]
+
+
+def test_only_large_studies_of_short_runs_without_limits_have_large_blocks():
+    many, steps = sizes.LARGE_STUDY, sizes.STEPS_OF_LARGE_BLOCK
+    assert sizes.block_size_in_memory(many, steps) == sizes.LARGE_BLOCK
+    assert sizes.block_size_in_memory(many - 1, steps) == sizes.block_size()
+    assert sizes.block_size_in_memory(many, steps + 1) == sizes.block_size()
+    assert ij.studies.LocalExecutor(chunk=10_000).is_limited
+    assert ij.studies.LocalExecutor(memory=1e6).is_limited
+    assert not ij.studies.LocalExecutor(memory=4e9).is_limited
 
 
 def test_seed_changes_every_draw(study):
