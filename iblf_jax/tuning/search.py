@@ -445,9 +445,9 @@ class Search:
             objective = float(state.incumbent_key[1])
             size = max(1e-3, abs(objective))
             points = np.concatenate([z[None], points_around(box, z, reach, rng)])
-            here, *around = self._points_at(points)
+            here, *nearby = self._points_at(points)
             valid = [
-                (x, point) for x, point in zip(points[1:], around, strict=True) if point.is_finite
+                (x, point) for x, point in zip(points[1:], nearby, strict=True) if point.is_finite
             ]
             step = step_between_kinks(self.evaluate.space, z, here, valid, reach)
             line = z + FRACTIONS[:, None] * step.step
