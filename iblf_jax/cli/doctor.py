@@ -149,8 +149,8 @@ def _is_here(condition: str) -> bool:
         "sys_platform": sys.platform,
         "platform_machine": platform.machine(),
     }
-    asked = re.findall(r"(\w+)\s*==\s*['\"]([^'\"]+)['\"]", condition)
-    return all(here[name] == value for name, value in asked if name in here)
+    conditions = re.findall(r"(\w+)\s*==\s*['\"]([^'\"]+)['\"]", condition)
+    return all(here[name] == value for name, value in conditions if name in here)
 
 
 def _version_of(package: str) -> str:

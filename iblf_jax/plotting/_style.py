@@ -326,9 +326,9 @@ def new_figure(width: float, height: float) -> Any:
     """
     given = _GIVEN.get()
     if given is not None:
-        whole: Any = given if isinstance(given, Figure) else given.figure
-        if whole.get_layout_engine() is None:
-            whole.set_layout_engine("constrained")
+        parent: Any = given if isinstance(given, Figure) else given.figure
+        if parent.get_layout_engine() is None:
+            parent.set_layout_engine("constrained")
         return given
     paper = _PAPER.get()
     if paper is not None:
