@@ -13,6 +13,7 @@ import argparse
 import json
 import re
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,6 +24,10 @@ import withdrawn
 
 RESULTS = ROOT / "benchmarks" / "results"
 FILES = (ROOT / "README.md", ROOT / "paper" / "paper.md")
+LANDING = ROOT / "docs" / "index.md"
+"""The first page of the site, which has three of the numbers."""
+ON_LANDING = ("throughput", "latency", "arm")
+"""The benchmarks of these numbers."""
 BEGIN, END = "<!-- comparison -->\n", "<!-- end of comparison -->"
 
 Conditions = dict[str, Any]
@@ -209,18 +214,38 @@ def table() -> str:
     return "\n".join(lines) + "\n"
 
 
-def replaced(text: str) -> str:
-    """A text with the table between its marks."""
+def three_numbers() -> str:
+    """The numbers of the landing page as a list, each with a link."""
+    lines = []
+    for benchmark in ON_LANDING:
+        chosen = next(x for x in COMPARISONS if x.benchmark == benchmark)
+        name, conditions = next(iter(chosen.others.items()))
+        lines.append(
+            f"- [**{words(value_of(chosen, chosen.ours))} {chosen.unit}**](benchmarks.md):"
+            f" {chosen.task}; {name}: {words(value_of(chosen, conditions))} {chosen.unit}"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def replaced(text: str, made: Callable[[], str] = table) -> str:
+    """A text with the table, or what else is made, between its marks."""
     pattern = re.escape(BEGIN) + ".*?" + re.escape(END)
     if not re.search(pattern, text, re.DOTALL):
         raise LookupError(f"the text has no place for the table, from {BEGIN!r} to {END!r}")
-    new = f"{BEGIN}{table()}{END}"
+    new = f"{BEGIN}{made()}{END}"
     return re.sub(pattern, lambda _: new, text, flags=re.DOTALL)
 
 
 def outdated() -> list[Path]:
-    """The files whose table is not that of the results."""
-    return [path for path in FILES if replaced(path.read_text()) != path.read_text()]
+    """The files whose numbers are not those of the results."""
+    return [path for path, text in current().items() if text != path.read_text(encoding="utf-8")]
+
+
+def current() -> dict[Path, str]:
+    """Every file with the numbers of the results."""
+    texts = {path: path.read_text(encoding="utf-8") for path in (*FILES, LANDING)}
+    made = {path: three_numbers if path == LANDING else table for path in texts}
+    return {path: replaced(text, made[path]) for path, text in texts.items()}
 
 
 def main() -> int:
@@ -231,8 +256,8 @@ def main() -> int:
     action.add_argument("--check", action="store_true")
     options = parser.parse_args()
     if options.write:
-        for path in FILES:
-            path.write_text(replaced(path.read_text(encoding="utf-8")), encoding="utf-8")
+        for path, text in current().items():
+            path.write_text(text, encoding="utf-8")
         return 0
     if options.check:
         names = [str(path.relative_to(ROOT)) for path in outdated()]

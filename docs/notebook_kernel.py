@@ -1,15 +1,18 @@
 """What the kernel runs before the first cell of a notebook that the site shows: figures get a text
-for readers who do not see them, and warnings are shown without the path of a temporary file.
+for readers who do not see them, warnings are shown without the path of a temporary file, and lines
+of progress are not stored.
 """
 
 
 def _prepare() -> None:
+    import os
     import sys
     import warnings
     from pathlib import Path
 
     from matplotlib.figure import Figure
 
+    os.environ["IBLF_JAX_PROGRESS"] = "0"
     sys.path.append(str(Path(__file__).parent))
     from alt_text import describe
 

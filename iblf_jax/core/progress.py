@@ -6,13 +6,12 @@ from __future__ import annotations
 
 import functools
 import threading
-import warnings
 from collections.abc import Callable
 from contextvars import ContextVar
 from typing import Any, TypeVar, cast
 
 from iblf_jax.core import checks
-from iblf_jax.kernels import announce_if_slow, has_reader
+from iblf_jax.kernels import announce_if_slow, has_reader, in_notebook
 
 F = TypeVar("F", bound=Callable)
 
@@ -65,10 +64,8 @@ def bar(progress: bool | None, total: int, done: int = 0, unit: str = "runs") ->
     line = _LINE.get()
     if line is not None:
         line.cancel()
-    with warnings.catch_warnings():
-        # tqdm warns where a notebook lacks ipywidgets, and falls back to text.
-        warnings.simplefilter("ignore")
-        from tqdm.auto import tqdm
+    from tqdm import tqdm  # a line of text that is replaced, in notebooks too
+
     shown, delay = progress, 0.0
     if progress is None:
         shown, delay = has_reader(), DELAY
@@ -80,4 +77,5 @@ def bar(progress: bool | None, total: int, done: int = 0, unit: str = "runs") ->
         disable=not shown,
         delay=delay,
         dynamic_ncols=True,
+        leave=not in_notebook(),
     )

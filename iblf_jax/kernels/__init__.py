@@ -90,6 +90,7 @@ from iblf_jax.kernels.interval_primitives import upper as upper
 from iblf_jax.kernels.interval_primitives import with_sign as with_sign
 from iblf_jax.kernels.messages import announce_if_slow as announce_if_slow
 from iblf_jax.kernels.messages import has_reader as has_reader
+from iblf_jax.kernels.messages import in_notebook as in_notebook
 from iblf_jax.kernels.operations import OPERATIONS as OPERATIONS
 from iblf_jax.kernels.packed import EMPTY as EMPTY
 from iblf_jax.kernels.packed import Packed as Packed

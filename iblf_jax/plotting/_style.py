@@ -326,9 +326,9 @@ def new_figure(width: float, height: float) -> Any:
     """
     given = _GIVEN.get()
     if given is not None:
-        figure_of_user: Any = given if isinstance(given, Figure) else given.figure
-        if figure_of_user.get_layout_engine() is None:
-            figure_of_user.set_layout_engine("constrained")
+        parent: Any = given if isinstance(given, Figure) else given.figure
+        if parent.get_layout_engine() is None:
+            parent.set_layout_engine("constrained")
         return given
     paper = _PAPER.get()
     if paper is not None:

@@ -4,7 +4,9 @@ over, progress."""
 from __future__ import annotations
 
 import dataclasses
+import sys
 import time
+import types
 import warnings
 
 import numpy as np
@@ -105,6 +107,32 @@ def test_a_slow_operation_is_announced_in_a_terminal(monkeypatch, capsys, watche
         time.sleep(seconds)
     time.sleep(0.2)
     assert capsys.readouterr().err == line
+
+
+def test_the_line_of_a_notebook_is_replaced_and_not_in_stored_outputs(monkeypatch, capsys):
+    shown = []
+
+    class Handle:
+        def update(self, content, raw):
+            shown.append(content["text/plain"])
+
+    def display(content, raw, display_id):
+        shown.append(content["text/plain"])
+        return Handle()
+
+    shell = types.SimpleNamespace(kernel=None)
+    of_display = types.SimpleNamespace(display=display)
+    ipython = types.SimpleNamespace(get_ipython=lambda: shell, display=of_display)
+    monkeypatch.setitem(sys.modules, "IPython", ipython)
+    monkeypatch.setitem(sys.modules, "ipykernel", types.SimpleNamespace())
+    monkeypatch.setattr(messages, "SLOW", 0.05)
+    with messages.announce_if_slow("tuning"):
+        time.sleep(0.2)
+    assert shown == ["iblf_jax: tuning", ""]
+    monkeypatch.setenv("IBLF_JAX_PROGRESS", "0")
+    with messages.announce_if_slow("tuning"):
+        time.sleep(0.2)
+    assert len(shown) == 2 and capsys.readouterr().err == ""
 
 
 @pytest.mark.parametrize(
