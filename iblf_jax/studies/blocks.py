@@ -8,7 +8,7 @@ B is the same for all stored studies.  A large study in memory has larger blocks
 differently at another batch size where it chooses the order of a sum, so what is computed before
 and after the steps has no sums whose order is free (`core.linalg.matmul_in_order`); the steps are
 made by kernels, run by run.  A test compares the bits of runs in blocks of both sizes, and
-`Study.replay` states whether a run has other numbers.
+`Study.replay` warns if a run has other numbers.
 
 The devices of this process take the blocks in turn, each with its own copy of the same program:
 runs are independent, so devices never communicate.  (`shard_map` would use one program for all
