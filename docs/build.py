@@ -201,6 +201,7 @@ def assemble() -> None:
     measured.write(SOURCE / "benchmarks.md")
     shutil.copy(ROOT / "benchmarks" / "README.md", SOURCE / "lab_notes.md")
     shutil.copy(ROOT / "benchmarks" / "field" / "README.md", SOURCE / "add_an_entry.md")
+    shutil.copy(ROOT / "benchmarks" / "field" / "tasks" / "README.md", SOURCE / "tasks.md")
     for name, page in (("CONTRIBUTING", "contributing"), ("CHANGELOG", "changelog")):
         text = (ROOT / f"{name}.md").read_text(encoding="utf-8")
         text = text.replace("(benchmarks/field/README.md)", "(add_an_entry.md)")

@@ -13,8 +13,10 @@ import sys
 from pathlib import Path
 from typing import Any, NamedTuple
 
-sys.path.append(str(Path(__file__).resolve().parents[1] / "benchmarks"))
+BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
+sys.path += [str(BENCHMARKS), str(BENCHMARKS / "field")]
 
+import external
 import gallery
 import withdrawn
 from entry import (
@@ -77,6 +79,8 @@ class Part(NamedTuple):
     """Of `gallery.page`."""
     result: dict[str, Any] | None
     """Of `measure.py`; None where there is no table."""
+    external: tuple[dict[str, Any], ...] = ()
+    """Rows of other programs on the task of the entry."""
 
     @property
     def is_withdrawn(self) -> bool:
@@ -145,7 +149,8 @@ def parts(results: Path = RESULTS, made: Path = gallery.MADE) -> list[Part]:
         computed = json.loads((made / f"{folder.name}.json").read_text(encoding="utf-8"))
         file = results / f"{folder.name}.json"
         result = json.loads(file.read_text(encoding="utf-8")) if file.exists() else None
-        found.append(Part(folder.name, load(folder), computed, result))
+        others = tuple(external.rows_of(folder.name))
+        found.append(Part(folder.name, load(folder), computed, result, others))
     return found
 
 
@@ -175,7 +180,8 @@ def benchmark_page(found: list[Part]) -> str:
         " reached within the accuracy to which they can be read, and"
         f" {sum(holds)} of {len(holds)} published statements hold."
         f" [A page of its own](literature_corrected.md) lists {corrected} corrections."
-        " [Adding an entry](add_an_entry.md) describes the steps." + checked(),
+        " [Adding an entry](add_an_entry.md) describes the steps, and [the tasks](tasks.md) are"
+        " files that programs in any language can run." + checked(),
         "## Entries",
         summary(found),
         "The last three columns name the law of the package that has the smallest error among"
@@ -205,6 +211,7 @@ def benchmark_page(found: list[Part]) -> str:
         " of the entry is too large.",
         *(section(part) for part in measured),
         *without_table(found),
+        *(of_other_programs(part) for part in found if part.external and not part.result),
     ]
     return "\n\n".join(sections) + "\n"
 
@@ -379,7 +386,30 @@ def section(part: Part) -> str:
         f"`{result['command']}`; {machine['processor']}, {machine['cores']} cores, Python"
         f" {machine['python']}, jax {machine['jax']}, {machine['date']}."
     )
-    return "\n\n".join([heading, " ".join(words), markdown_table(columns, rows), where])
+    parts = [heading, " ".join(words), markdown_table(columns, rows), where]
+    if part.external:
+        parts.append(of_other_programs(part))
+    return "\n\n".join(parts)
+
+
+def of_other_programs(part: Part) -> str:
+    """The table of results that other programs reached on the task of an entry."""
+    task = external.digest(external.TASKS / f"{part.name}.json")
+    numbers = ("RMS error", "error", "effort", "peak input", "margin")
+    rows = []
+    for row in part.external:
+        law, left = escaped(row["law"]), "; ".join(row["left"])
+        cells = [_cell(row[name]) for name in numbers]
+        if row["sha256 of the task"] != task:
+            cells, left = ["another task"] * len(numbers), "the task has changed since"
+        rows.append([law, *cells, escaped(left), f"`{row['sha256'][:12]}`", row["date"]])
+    words = (
+        f"Results of other programs on {part.link}, files that `check.py --result` accepted. They"
+        " are no part of the other tables: their numbers are those at the rows of the files, and"
+        " the effort is a share of that of the published law."
+    )
+    headings = ["law (external)", *numbers, "left", "SHA-256 of the file", "date"]
+    return f"{words}\n\n{markdown_table(headings, rows)}"
 
 
 def without_table(found: list[Part]) -> list[str]:

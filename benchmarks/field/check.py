@@ -25,8 +25,10 @@ from typing import Any, NamedTuple
 
 sys.path += [str(Path(__file__).resolve().parent), str(Path(__file__).resolve().parents[1])]
 
+import external
 import matplotlib
 import numpy as np
+import tasks
 from _timing import machine
 from entry import (
     ENTRIES,
@@ -416,14 +418,34 @@ def result_of(folder: Path, found: list[str]) -> dict[str, Any]:
     return result
 
 
+def add_result(name: str, file: Path, law: str) -> int:
+    """Puts a result of another program into the table of an entry; 1 if it is refused."""
+    try:
+        row = external.add(name, file, law)
+    except (OSError, ValueError) as error:
+        print(f"{name}: {file} is refused: {error}")
+        return 1
+    print(f"{name}: {file} is accepted")
+    for key, value in row.items():
+        print(f"  - {key}: {value}")
+    return 0
+
+
 def main() -> int:
-    """Checks the named entries."""
+    """Checks the named entries, or adds a result."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("names", nargs="*", metavar="NAME", help="entries; all if none is given")
     parser.add_argument("--json", type=Path, metavar="FILE", help="where the results go")
+    parser.add_argument("--result", nargs=2, metavar=("NAME", "FILE"), help="of another program")
+    parser.add_argument("--law", metavar="TEXT", help="the law of this result, and its program")
     args = parser.parse_args()
+    if args.result and not args.law:
+        parser.error("--result needs --law, the law and its program in words")
+    if args.result:
+        name, file = args.result
+        return add_result(name, Path(file), args.law)
     import jax
 
     jax.config.update("jax_enable_x64", True)
@@ -433,7 +455,7 @@ def main() -> int:
     results: dict[str, Any] = {"command": command, "machine": machine(), "entries": {}}
     faulty = 0
     for folder in chosen:
-        found = faults_of(folder)
+        found = faults_of(folder) or tasks.faults_of(folder)
         faulty += bool(found)
         print(f"{folder.name}: {'correct' if not found else f'{len(found)} to repair'}", flush=True)
         for line in found or computed_numbers(folder):

@@ -5,8 +5,10 @@ An entry is a folder of `entries/`. README.md in this folder describes its files
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import dataclasses
+import functools
 import io
 import math
 import re
@@ -173,6 +175,15 @@ class EqualRows:
 
 
 @dataclasses.dataclass(frozen=True)
+class InputLimit:
+    """Limits of the input that every law of the task keeps."""
+
+    lower: float
+    upper: float
+    where: str
+
+
+@dataclasses.dataclass(frozen=True)
 class Run:
     """Duration and time step."""
 
@@ -196,6 +207,8 @@ class Entry:
     missing: tuple[Missing, ...] = ()
     published: tuple[Published, ...] = ()
     claims: tuple[Claim, ...] = ()
+    input_limits: tuple[InputLimit, ...] = ()
+    """One for each component, or one for all."""
     not_measured: str = ""
     """Why `measure.py` has no results of this entry, if that is intended."""
     equal_rows: tuple[EqualRows, ...] = ()
@@ -218,6 +231,8 @@ class Reproduction(NamedTuple):
     """Law -> why `measure.py` leaves it out."""
     uncertain: tuple[str, ...] | None
     """Paths of the plant parameters that `measure.py` varies."""
+    constraints: dict[str, Callable[..., Any]]
+    """Name with unit -> function (t, x) whose numbers must not become negative; x is (r, n)."""
 
 
 REQUIRED_NAMES = ("scenario", "runs", "figure")
@@ -228,6 +243,7 @@ DEFAULTS: dict[str, Any] = {
     "details": {},
     "not_applicable": {},
     "uncertain": None,
+    "constraints": {},
 }
 """Names that an `example.py` may leave out -> their value."""
 
@@ -311,6 +327,38 @@ def _value(kind: Any, value: Any, field: dataclasses.Field, place: str, faults: 
     if kind is str and value == "" and field.default is dataclasses.MISSING:
         faults.append(f"{place}: {name} is empty")
     return value
+
+
+class Definition(NamedTuple):
+    """What an `example.py` defines before it simulates."""
+
+    scenario: Any
+    constraints: dict[str, Callable[..., Any]]
+
+
+@functools.cache
+def definition(folder: Path) -> Definition:
+    """Runs the `example.py` of a folder up to the last statement that defines `scenario` or
+    `constraints`, once a process.
+    """
+    script = folder / "example.py"
+    statements = ast.parse(script.read_text(encoding="utf-8")).body
+    wanted = set(Definition._fields)
+    last = max(i for i, one in enumerate(statements) if wanted & _assigned(one))
+    module = ast.Module(statements[: last + 1], type_ignores=[])
+    names: dict[str, Any] = {"__name__": "__main__", "__file__": str(script)}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        exec(compile(module, str(script), "exec", dont_inherit=True), names)
+    return Definition(names["scenario"], names.get("constraints", {}))
+
+
+def _assigned(statement: ast.stmt) -> set[str]:
+    """The names that a statement assigns."""
+    if not isinstance(statement, ast.Assign):
+        return set()
+    names = (node for target in statement.targets for node in ast.walk(target))
+    return {node.id for node in names if isinstance(node, ast.Name)}
 
 
 REPRODUCTIONS: dict[Path, Reproduction] = {}

@@ -66,6 +66,7 @@ from iblf_jax.kernels import nvrtc as nvrtc
 from iblf_jax.kernels.caches import CACHES as CACHES
 from iblf_jax.kernels.compilation import CompiledStep as CompiledStep
 from iblf_jax.kernels.compilation import compile_step as compile_step
+from iblf_jax.kernels.compilation import scalar_program as scalar_program
 from iblf_jax.kernels.compilation import (
     without_garbage_collection as without_garbage_collection,
 )
@@ -78,7 +79,6 @@ from iblf_jax.kernels.enclosure import ENCLOSURE_FLAGS as ENCLOSURE_FLAGS
 from iblf_jax.kernels.enclosure import IntervalKernel as IntervalKernel
 from iblf_jax.kernels.enclosure import enclose as enclose
 from iblf_jax.kernels.enclosure import interval_kernel as interval_kernel
-from iblf_jax.kernels.enclosure import interval_program as interval_program
 from iblf_jax.kernels.enclosure import pointer as pointer
 from iblf_jax.kernels.folder import cpuinfo as cpuinfo
 from iblf_jax.kernels.folder import directory as directory

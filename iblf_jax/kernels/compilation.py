@@ -1,4 +1,6 @@
-"""`compile_step`: from a step as a JAX function to its scalar program."""
+"""From a JAX function to its scalar program: `compile_step` for a step of a run, `scalar_program`
+for a function of one point.
+"""
 
 from __future__ import annotations
 
@@ -146,6 +148,54 @@ def _lowered(
         tuple(ids.size for ids in recorded),
     )
     return with_reciprocals(program)
+
+
+class Lowered(NamedTuple):
+    """A function as a scalar program."""
+
+    program: Program
+    sizes: tuple[int, ...]
+    """Number of entries of each output array."""
+    shapes: tuple[tuple[int, ...], ...]
+    """Shape of each output array."""
+
+
+def scalar_program(
+    function: Callable,
+    dimension: int,
+    shapes: tuple[tuple[int, ...], ...] = (),
+    *,
+    exact: bool = False,
+) -> Lowered:
+    """The scalar program of a function of one point, in float64.
+
+    Its inputs are "carry" for the coordinates and "shared" for the numbers of the constants.
+
+    Args:
+      function: function (x, constants) -> arrays, of one point, (dimension,), and of a list of
+        constants.
+      dimension: number of coordinates.
+      shapes: shapes of the constants.
+      exact: whether it must be equal to the function in real arithmetic (`program.Builder`).
+
+    Raises:
+      UnsupportedError: an operation cannot be expressed.
+    """
+    structs = [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in shapes]
+    with jax.enable_x64(True):
+        jaxpr, out = jax.make_jaxpr(
+            lambda x, c: jax.tree.leaves(function(x, c)), return_shape=True
+        )(jax.ShapeDtypeStruct((dimension,), jnp.float64), structs)
+    b = Builder(np.dtype(np.float64), sparse=True, exact=exact)
+    x = np.asarray([b.input("carry", i, "f") for i in range(dimension)], np.int64)
+    constants = Shapes.of(structs)
+    shared = _inputs(b, constants, lambda i, kind: b.input("shared", i, kind))
+    results = closed(b, jaxpr, [x, *shared])
+    program = finished(b, [], [], _numbers(results))
+    for output in program.outputs:
+        if program.nodes[output].kind != "f":
+            raise UnsupportedError("an output that is no floating-point number")
+    return Lowered(program, tuple(ids.size for ids in results), tuple(x.shape for x in out))
 
 
 def _numbers(arrays: Sequence[Ids]) -> list[int]:

@@ -16,20 +16,16 @@ from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.kernels.caches import CACHES
+from iblf_jax.kernels.compilation import scalar_program
 from iblf_jax.kernels.emit_c import header
-from iblf_jax.kernels.from_jaxpr import closed
 from iblf_jax.kernels.program import (
     SHARED,
-    Builder,
     Node,
     Program,
     UnsupportedError,
-    finished,
     needed,
 )
 from iblf_jax.kernels.toolchain import ToolchainError, built, loaded
@@ -85,29 +81,19 @@ class Compiled(NamedTuple):
     source: str
 
 
-class Lowered(NamedTuple):
-    """A function as a scalar program."""
-
-    program: Program
-    sizes: tuple[int, ...]
-    """Number of entries of each output array."""
-    shapes: tuple[tuple[int, ...], ...]
-    """Shape of each output array."""
-
-
 @CACHES.function(maxsize=64)
 def compiled(function: Callable, dimension: int, shapes: tuple[tuple[int, ...], ...]) -> Compiled:
     """The program of a function on intervals, and its C++ source.
 
     Args:
-      function: as `interval_program`; the function object is the key of a cache.
+      function: as `scalar_program`; the function object is the key of a cache.
       dimension: number of coordinates.
       shapes: shapes of the constants.
 
     Raises:
       UnsupportedError: an operation is not available on intervals.
     """
-    lowered = interval_program(function, dimension, shapes)
+    lowered = scalar_program(function, dimension, shapes, exact=True)
     constants = sum(map(math.prod, shapes))
     # By their digits: 0.0 and -0.0 are equal, and each has its place.
     nodes = lowered.program.nodes
@@ -131,43 +117,6 @@ def compiled(function: Callable, dimension: int, shapes: tuple[tuple[int, ...], 
     ]
     source = "\n".join(parts)
     return Compiled(*lowered, literals, source)
-
-
-def interval_program(
-    function: Callable, dimension: int, shapes: tuple[tuple[int, ...], ...] = ()
-) -> Lowered:
-    """The scalar program of a function on intervals.
-
-    Args:
-      function: function (x, constants) -> arrays, of one point, (dimension,), and of a list of
-        constants.
-      dimension: number of coordinates.
-      shapes: shapes of the constants.
-
-    Raises:
-      UnsupportedError: an operation cannot be expressed.
-    """
-    structs = [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in shapes]
-    with jax.enable_x64(True):
-        jaxpr, out = jax.make_jaxpr(
-            lambda x, c: jax.tree.leaves(function(x, c)), return_shape=True
-        )(jax.ShapeDtypeStruct((dimension,), jnp.float64), structs)
-    b = Builder(np.float64, sparse=True, exact=True)
-    x = np.asarray([b.input("carry", i, "f") for i in range(dimension)], np.int64)
-    operands = [x]
-    first = 0
-    for shape in shapes:
-        size = math.prod(shape)
-        ids = [b.input("shared", first + i, "f") for i in range(size)]
-        operands.append(np.asarray(ids, np.int64).reshape(shape))
-        first += size
-    results = closed(b, jaxpr, operands)
-    outputs = [int(i) for ids in results for i in ids.ravel()]
-    program = finished(b, [], [], outputs)
-    for output in program.outputs:
-        if program.nodes[output].kind != "f":
-            raise UnsupportedError("an output that is no floating-point number")
-    return Lowered(program, tuple(ids.size for ids in results), tuple(x.shape for x in out))
 
 
 class _Emitter:

@@ -2,7 +2,8 @@
 
 Primitives that only rearrange numbers (reshape, slice, gather) are applied to the node numbers at
 once, and primitives that compute add one node per number. Nested functions are inlined, and short
-scans are unrolled. A primitive without a rule raises `UnsupportedError`.
+scans are unrolled. A primitive without a rule is computed where its operands are constants, and
+raises `UnsupportedError` elsewhere.
 """
 
 from __future__ import annotations
@@ -10,6 +11,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.kernels import jaxprs
@@ -63,7 +66,7 @@ def interpret(b: Builder, jaxpr: Any, consts: Sequence[Ids], inputs: Sequence[Id
             found = RULES[name](b, eqn, *operands)
             results = found if isinstance(found, list | tuple) else [found]
         else:
-            raise UnsupportedError(f"the primitive {name!r} is not lowered")
+            results = folded(b, eqn, operands)
         for v, ids in zip(eqn.outvars, results, strict=True):
             if ids is None:
                 continue
@@ -73,6 +76,24 @@ def interpret(b: Builder, jaxpr: Any, consts: Sequence[Ids], inputs: Sequence[Id
                 )
             known[v] = ids
     return [read(v) for v in jaxpr.outvars]
+
+
+def folded(b: Builder, eqn, operands: Sequence[Ids]) -> list[Ids]:
+    """The results of a primitive without a rule whose operands are constants, as JAX computes them:
+    such as the inverse of a matrix of numbers.
+    """
+    known = [[b.value(int(i)) for i in x.ravel()] for x in operands]
+    if b.exact or eqn.effects or any(value is None for row in known for value in row):
+        raise UnsupportedError(f"the primitive {eqn.primitive.name!r} is not lowered")
+    arrays = [
+        np.array(row, v.aval.dtype).reshape(v.aval.shape)
+        for row, v in zip(known, eqn.invars, strict=True)
+    ]
+    with jax.ensure_compile_time_eval():
+        results = eqn.primitive.bind(*map(jnp.asarray, arrays), **eqn.params)
+    if not eqn.primitive.multiple_results:
+        results = [results]
+    return [constants(b, result) for result in results]
 
 
 def _check_float(b: Builder, dtype, eqn) -> None:

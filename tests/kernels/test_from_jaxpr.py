@@ -21,6 +21,7 @@ from iblf_jax.engine.carry import Inputs, StepOptions, initial_carry
 from iblf_jax.engine.loops import program_of
 from iblf_jax.engine.time_step import TimeStep
 from iblf_jax.kernels import passes, program
+from iblf_jax.kernels.compilation import scalar_program
 from iblf_jax.kernels.from_jaxpr import closed
 from iblf_jax.kernels.layout import Layout
 from iblf_jax.kernels.operations import OPERATIONS
@@ -316,6 +317,23 @@ def test_what_does_not_lower_says_why_in_one_line(name):
         lowered_function(REFUSED[name], X)
     assert str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_a_primitive_without_a_rule_is_computed_on_constants():
+    """Not where the program must be exact in real arithmetic, nor on what is no constant."""
+
+    def inverse(x, matrices):
+        matrix = jnp.array([[2.0, 1.0], [0.5, 3.0]]) if not matrices else matrices[0]
+        return jnp.linalg.inv(matrix) @ x
+
+    lowered = scalar_program(inverse, 2)
+    assert {node.op for node in lowered.program.nodes} == {"carry", "const", "mul", "add"}
+    constants = [node.value for node in lowered.program.nodes if node.op == "const"]
+    np.testing.assert_allclose(sorted(constants), np.sort([3, -1, -0.5, 2]) / 5.5, rtol=1e-14)
+    with pytest.raises(program.UnsupportedError, match="the primitive 'lu' is not lowered"):
+        scalar_program(inverse, 2, exact=True)
+    with pytest.raises(program.UnsupportedError, match="the primitive 'lu' is not lowered"):
+        scalar_program(inverse, 2, ((2, 2),))
 
 
 def test_identities_keep_nan_and_infinity():

@@ -88,6 +88,7 @@ class CruiseProgramme:
         ), ()
 
 
+constraints = {"distance less 1.8 v [m]": lambda t, x: barrier(x, t, jnp.inf)}
 reach = HEADWAY * LEAD
 scenario = ij.Scenario(
     plant=Car(),

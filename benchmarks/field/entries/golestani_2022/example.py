@@ -25,7 +25,7 @@ class Spacecraft:
         """The gyroscopic term and the disturbance."""
         d = self.d * jnp.sin(jnp.array([1.0, 1.2, 1.5]) * t)
         torque = d - jnp.cross(x[1], self.inertia @ x[1])
-        return jnp.stack([jnp.zeros(3), jnp.linalg.solve(self.inertia, torque)])
+        return jnp.stack([jnp.zeros(3), jnp.linalg.inv(self.inertia) @ torque])
 
     def gain(self, t, x):
         """The matrix of the kinematics, and J^-1."""

@@ -47,7 +47,7 @@ class RigidBody:
 
     def drift(self, t, x):
         """0 and -J^-1 (w x J w)."""
-        turning = jnp.linalg.solve(self.inertia, jnp.cross(x[1], self.inertia @ x[1]))
+        turning = jnp.linalg.inv(self.inertia) @ jnp.cross(x[1], self.inertia @ x[1])
         return jnp.stack([jnp.zeros_like(x[0]), -turning])
 
     def gain(self, t, x):

@@ -110,6 +110,7 @@ def case(A, B, filtered, forward=True):
     )
 
 
+constraints = {"h [m/s]": lambda t, x: (leader(t)[0] - x[0] - SAFE) / HEADWAY - x[1]}
 scenario = case(0.4, 0.3, True)
 chart = abs(1.0 / HEADWAY - 0.3) * V_MAX / KAPPA / (STANDSTILL - SAFE)
 cases = {

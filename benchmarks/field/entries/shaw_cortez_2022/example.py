@@ -13,6 +13,7 @@ from iblf_jax.files.scenario import load_scenario_file
 
 here = Path(__file__)
 scenario, options = load_scenario_file(here.with_name("scenario.toml"))
+constraints = {"1.5 rad/s less |q'| [rad/s]": lambda t, x: 1.5 - abs(x[1])}
 run = ij.simulate(scenario, **options)
 wide = ij.Bounds(lower=ij.bounds.Constant(-9.0), upper=ij.bounds.Constant(9.0))
 unfiltered = ij.simulate(

@@ -72,6 +72,9 @@ class CruiseProgramme:
         return ij.controllers.Command(u, context.tube(t).dq_d, zero, inside, cut), ()
 
 
+constraints = {
+    "distance less 1.8 v [m]": lambda t, x: START + LEAD * t - x[0] - HEADWAY * x[1],
+}
 reach = HEADWAY * LEAD
 scenario = ij.Scenario(
     plant=Car(),
