@@ -57,7 +57,7 @@ def step_between_kinks(
     space: SearchSpace,
     z: np.ndarray,
     here: Point,
-    nearby: list[tuple[np.ndarray, Point]],
+    further: list[tuple[np.ndarray, Point]],
     reach: float,
 ) -> Step:
     """The step of the subproblem with the pieces of all points.
@@ -66,12 +66,12 @@ def step_between_kinks(
       space: ranges and requirements.
       z: the gains, (p,).
       here: loss and pieces at z.
-      nearby: further points with their coordinates, (p,).
+      further: points near z, with their coordinates, (p,).
       reach: largest step in each coordinate.
     """
     nearby = [
         point._replace(pieces=point.pieces + point.linear_change(z - other))
-        for other, point in nearby
+        for other, point in further
     ]
     space, here = with_nearby_pieces(space, here, nearby)
     task = subproblem(
