@@ -38,7 +38,7 @@ TASKS = HERE / "tasks"
 EXTERNAL = HERE / "external"
 DIGITS = 1e-8
 """Rounding of the numbers of a file, as a share of the largest of their column."""
-COARSEST = 0.02
+COARSEST = 0.05
 """Largest tolerance of a state between two rows, as a share of its range."""
 STEPS = 4
 """Of the integration between two rows."""
@@ -201,7 +201,7 @@ def _faults_of_rates(
         k, i = np.argwhere(wrong)[0]
         return [
             f"{names[i]} at t = {t[k + 1]:.6g} s is {difference[k, i]:.3g} from the motion of the"
-            f" plant under the stated input from t = {t[k]:.6g} s, where {allowed[k, i]:.2g} is"
+            f" plant under the stated input from t = {t[k]:.6g} s, where {allowed[k, i]:.3g} is"
             " allowed"
         ]
     return []
