@@ -131,7 +131,7 @@ def tune(
         32 numbers, and L-BFGS with reverse mode for more.
       effort: "quick" (a search from the scenario's gains only), "normal", "thorough" (8,192 points
         without derivatives and 96 starts, about 2,000 evaluations with derivatives, and a second
-        search around the best gains), or `ij.tuning.Effort(values=..., starts=..., around=...)`.
+        search around the best gains), or `ij.tuning.Effort(values=..., starts=...)`.
       report: options of the report on fresh runs, `ij.tuning.Report(runs=..., seed=...,
         confidence=...)`.
       confirm: the probability that a run fails is to be below this number, with the confidence of
@@ -208,9 +208,9 @@ def search_of(
             shown.set_description(_cost_in_words(problem, count + 1, starts, effort))
             screening = screen(problem, count, seed, shown.update)
         z = _chosen_starts(problem, screening, starts)
-        around = min(effort.around, starts)
-        second_points = count // 3 if around else 0
-        strategy = Strategy(screening, effort.selection, len(z), second_points, around)
+        second_starts = min(effort.second_starts, starts)
+        second_points = count // 3 if second_starts else 0
+        strategy = Strategy(screening, effort.selection, len(z), second_points, second_starts)
     else:
         z = starting_points(problem.box, starts, seed)
         z = usable_starts(problem, seed, z, values(problem, problem.box.z[None]))

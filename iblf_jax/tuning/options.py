@@ -104,19 +104,19 @@ class Effort:
         evaluates every start that is still active.
       selection: number of steps after which starts near better ones end, and from the second time
         on all but the better third.
-      around: number of starts of a second search around the best gains of the first one, chosen
-        from a third as many points; none if not given.  In problems of many gains the best optimum
-        is often near a good one.
+      second_starts: number of starts of a second search around the best gains of the first one,
+        chosen from a third as many points; none if not given.  In problems of many gains the best
+        optimum is often near a good one.
     """
 
     values: int = 1024
     starts: int = 32
     iterations: int = 60
     selection: int = 5
-    around: int = 0
+    second_starts: int = 0
 
     def __post_init__(self) -> None:
-        limits = {"values": (0, MAX_RUNS), "starts": (1, 1000), "around": (0, 1000)}
+        limits = {"values": (0, MAX_RUNS), "starts": (1, 1000), "second_starts": (0, 1000)}
         for field in dataclasses.fields(self):
             least, most = limits.get(field.name, (1, checks.MAX_STEPS))
             number = getattr(self, field.name)
@@ -128,7 +128,7 @@ class Effort:
 EFFORTS = {
     "quick": Effort(values=0, starts=1),
     "normal": Effort(),
-    "thorough": Effort(values=8192, starts=96, iterations=120, selection=8, around=32),
+    "thorough": Effort(values=8192, starts=96, iterations=120, selection=8, second_starts=32),
 }
 """Name -> effort."""
 
