@@ -131,8 +131,7 @@ def tune(
         32 numbers, and L-BFGS with reverse mode for more.
       effort: "quick" (a search from the scenario's gains only), "normal", "thorough" (8,192 points
         without derivatives and 96 starts, about 2,000 evaluations with derivatives, and a second
-        search around the best gains), or `ij.tuning.Effort(values=..., starts=...,
-        second_starts=...)`.
+        search around the best gains), or `ij.tuning.Effort(values=..., starts=...)`.
       report: options of the report on fresh runs, `ij.tuning.Report(runs=..., seed=...,
         confidence=...)`.
       confirm: the probability that a run fails is to be below this number, with the confidence of

@@ -47,7 +47,7 @@ FRACTIONS = np.geomspace(1.0, 1e-3, 16)
 """Multiples of the step that are evaluated."""
 
 
-def points_around(box: Box, z: np.ndarray, reach: float, rng: np.random.Generator) -> np.ndarray:
+def points_near(box: Box, z: np.ndarray, reach: float, rng: np.random.Generator) -> np.ndarray:
     """Random points within a reach of z, (p,), and within the ranges, (p + 1, p)."""
     moved = z + reach * rng.uniform(-1.0, 1.0, (len(z) + 1, len(z)))
     return np.clip(moved, box.low, box.high)
@@ -57,7 +57,7 @@ def step_between_kinks(
     space: SearchSpace,
     z: np.ndarray,
     here: Point,
-    further: list[tuple[np.ndarray, Point]],
+    nearby: list[tuple[np.ndarray, Point]],
     reach: float,
 ) -> Step:
     """The step of the subproblem with the pieces of all points.
@@ -66,14 +66,14 @@ def step_between_kinks(
       space: ranges and requirements.
       z: the gains, (p,).
       here: loss and pieces at z.
-      further: points near z, with their coordinates, (p,).
+      nearby: further points with their coordinates, (p,).
       reach: largest step in each coordinate.
     """
-    nearby = [
+    moved = [
         point._replace(pieces=point.pieces + point.linear_change(z - other))
-        for other, point in further
+        for other, point in nearby
     ]
-    space, here = with_nearby_pieces(space, here, nearby)
+    space, here = with_nearby_pieces(space, here, moved)
     task = subproblem(
         here.gradient,
         positive_definite(here.matrix, float(np.max(np.abs(here.matrix)))),

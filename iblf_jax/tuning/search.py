@@ -64,7 +64,7 @@ from iblf_jax.tuning.kinks import (
     LEAST_REACH,
     MOST_ROUNDS,
     SHRINK_FACTOR,
-    points_around,
+    points_near,
     step_between_kinks,
 )
 from iblf_jax.tuning.objectives import is_smoothed, sharper
@@ -444,7 +444,7 @@ class Search:
             z = state.incumbent_z
             objective = float(state.incumbent_key[1])
             size = max(1e-3, abs(objective))
-            points = np.concatenate([z[None], points_around(box, z, reach, rng)])
+            points = np.concatenate([z[None], points_near(box, z, reach, rng)])
             here, *nearby = self._points_at(points)
             valid = [
                 (x, point) for x, point in zip(points[1:], nearby, strict=True) if point.is_finite
