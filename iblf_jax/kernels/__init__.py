@@ -67,9 +67,7 @@ from iblf_jax.kernels.caches import CACHES as CACHES
 from iblf_jax.kernels.compilation import CompiledStep as CompiledStep
 from iblf_jax.kernels.compilation import compile_step as compile_step
 from iblf_jax.kernels.compilation import scalar_program as scalar_program
-from iblf_jax.kernels.compilation import (
-    without_garbage_collection as without_garbage_collection,
-)
+from iblf_jax.kernels.compilation import without_garbage_collection as without_garbage_collection
 from iblf_jax.kernels.cpu import Build as Build
 from iblf_jax.kernels.cpu import c_source as c_source
 from iblf_jax.kernels.drafts import draft as draft
