@@ -49,8 +49,8 @@ COLUMNS = {
     "RMS error, error": "RMS and largest absolute value of $e_1$ over all components, in the second"
     " half of the run",
     "peak input": "largest input of the entire run",
-    "margin": "least distance to any bound of the task over the entire run, for the first level as a"
-    " share of the distance between the reference and that bound, for others of half the distance"
+    "margin": "least distance to any bound of the task over the entire run, for the first level as"
+    " a share of the distance between the reference and that bound, for others of half the distance"
     " between the bounds; many runs have their least distance at the start",
     "..., parameters": "the worse of two plants whose uncertain parameters are 0.8 and 1.2 times"
     " those of the entry; the model of the law is the one of the entry",

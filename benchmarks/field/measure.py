@@ -184,8 +184,9 @@ def error_and_margin(run: ij.Rollout, task: Task) -> list[Any]:
 
 
 def margin(run: ij.Rollout, task: Task) -> float:
-    """The least distance to a bound of the task: for level 1 as a share of the distance of that bound
-    from the reference, 1 - max |xi|, and for other levels of half the distance of the bounds."""
+    """The least distance to a bound of the task: for level 1 as a share of the distance between
+    the reference and that bound, 1 - max |xi|, for other levels of half the distance of the bounds.
+    """
     found = [float(np.min(np.asarray(run.metrics.xi_margin)))]
     if any(task.scenario.bounds[1:]):
         lower, upper = run.level_lower[:, 1:], run.level_upper[:, 1:]
