@@ -116,7 +116,7 @@ def _devices() -> Finding:
 
 
 def _compiler() -> Finding:
-    from iblf_jax.kernels.toolchain import ToolchainError, built_for
+    from iblf_jax.kernels import ToolchainError, built_for
 
     try:
         return Finding("compiler", built_for()["compiler"])
