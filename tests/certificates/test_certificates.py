@@ -545,6 +545,7 @@ def test_batch_with_an_invalid_run_does_not_hold(corrected_run):
     assert "not applicable in 1 of 2 runs" in certificate["inequality, case 2"].note
 
 
+@pytest.mark.slow
 def test_run_that_its_scenario_does_not_reproduce_is_refused(shaken):
     run = decimated(shaken, 100)
     near = jax.tree.map(lambda x: x * (1 + 1e-13), run.observer_state)

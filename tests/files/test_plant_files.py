@@ -10,6 +10,7 @@ import pytest
 import iblf_jax as ij
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", ["flexible joint", "electric drive", "rigid law"])
 def test_a_file_gives_the_same_scenario(tmp_path, case):
     scenario = (loops_of_plants.CASES | {"rigid law": loops_of_plants.rigid_law})[case]()

@@ -455,6 +455,7 @@ def test_every_figure_function_takes_a_style_and_a_figure():
         plotting.Paper("acm")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("style", "width"),
     [("paper", 3.5), (plotting.Paper("elsevier", 2), 190 / 25.4)],

@@ -239,6 +239,7 @@ def test_barriers_of_users_are_without_a_length_and_their_claims_are_assumed():
     assert not any("claims of" in x for x in arm_problem(pendulum(), {}).assumptions)
 
 
+@pytest.mark.slow
 def test_an_uncertain_wave_does_not_end_with_the_period_of_the_others():
     """An amplitude that is 0 in the scenario, and a frequency, may be any number of the box."""
     rest = {

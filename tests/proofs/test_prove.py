@@ -152,6 +152,7 @@ WIDE = 5.0
 """Percent: V_w' < 0 at all points that are sampled, and more boxes are needed than in the test."""
 
 
+@pytest.mark.slow
 def test_a_time_interval_that_is_no_period():
     found = proof(weight=2e-3, duration=2.0)
     assert found.proved and not found.is_period
@@ -170,6 +171,7 @@ def test_constant_reference_and_bounds():
     assert contradictions(found, 4) == 0
 
 
+@pytest.mark.slow
 def test_a_given_weight_is_the_only_one():
     found = proof(weight=2e-3)
     assert found.proved and list(found.rates) == [2e-3]

@@ -155,6 +155,7 @@ def by_table(x):
     return jax.jit(lambda y: y + jnp.sum(jnp.asarray(TABLE["array"])))(x)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "function",
     [

@@ -203,6 +203,7 @@ PARTS = {
 """Plants with their models, and the class of the model that a torque receives."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("parts", PARTS)
 def test_every_user_of_a_disturbance_passes_it_the_same_plant_and_model(parts):
     """Those without a robot as they are, and of others the robot inside them."""

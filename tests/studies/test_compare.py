@@ -224,6 +224,7 @@ def test_wrong_laws_are_value_errors(laws):
 # ----------------------------------------------------------------------- figure and command line
 
 
+@pytest.mark.slow
 def test_the_figure_shows_every_law_in_the_same_colour_on_both_sides(comparison):
     figure = comparison.plot(joint=1)
     assert len(figure.axes) == 6

@@ -151,6 +151,7 @@ def test_store_opens_with_xarray_and_load(written, table):
     assert ij.load_sweep(written).identical(table)
 
 
+@pytest.mark.slow
 def test_a_finished_store_is_not_computed_again(finished, table, monkeypatch):
     monkeypatch.setattr(blocks, "run_blocks", lambda *_, **__: iter(()))
     monkeypatch.setattr(sweep.Store, "write", lambda *_: pytest.fail("computed again"))

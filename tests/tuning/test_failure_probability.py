@@ -135,6 +135,7 @@ def test_draws_that_cannot_be_run_are_counted(scenario):
     assert "could not be run and are excluded" in repr(found)
 
 
+@pytest.mark.slow
 def test_a_nominal_run_that_fails_is_said(scenario):
     start = ij.normal(1.2 * distances(scenario)[1, 1], 0.01)
     moved = perturbed(start, ij.uniform(0.9, 1.1))
@@ -507,6 +508,7 @@ def test_the_draws_near_failure_are_perturbations(scenario, rare):
     assert {tuple(x) for x in drawn} <= {tuple(x) for x in known}
 
 
+@pytest.mark.slow
 def test_the_requirement_of_a_probability(rare):
     found, _, _ = rare
     requirement = ij.objectives.failure_probability_below(1e-7, found)

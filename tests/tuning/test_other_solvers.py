@@ -226,6 +226,7 @@ def test_other_random_numbers_are_left_alone(arm, goal):
     assert not np.array_equal(first, other)
 
 
+@pytest.mark.slow
 def test_points_stay_within_the_ranges_and_near_the_start(arm, goal):
     needs_its_package("optuna")
     once = ij.tuning.Effort(iterations=2)

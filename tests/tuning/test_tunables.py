@@ -160,6 +160,7 @@ def test_the_period_is_a_multiple_of_the_step_within_what_loop_and_queue_allow(l
     assert ends(no_delay, "sampling.period")[2][0] == ranges.BY_ONE_STEP
 
 
+@pytest.mark.slow
 def test_a_delay_needs_a_queue_that_holds_its_commands(lab):
     low, high, (below, _) = ends(lab, "sampling.delay")
     assert (low, below) == (0.0, ranges.BY_SIGN)

@@ -678,6 +678,7 @@ def test_repair_mends_and_lists(name, file):
     assert jax.tree.structure(jax.tree.map(lambda x: x, arm)) == jax.tree.structure(arm)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("inertia", ["0.02 0.09 0.01", "0.02 -0.03 0.01", "-1 -2 -3"])
 @pytest.mark.parametrize("also", ["0 0 0", "0.01 -0.02 0.03"])
 def test_the_change_is_the_smallest(inertia, also, file):

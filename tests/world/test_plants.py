@@ -182,6 +182,7 @@ def test_a_gain_that_depends_on_later_levels_is_refused():
         canonical(scenario_of(plant))
 
 
+@pytest.mark.slow
 def test_a_drift_of_strict_feedback_form_is_accepted():
     plant = with_drift(lambda t, x: jnp.stack([jnp.cos(x[0]), x[0] * x[1], x[0] * x[1] * x[2]]))
     dependence = plants.dependence_on_levels(plant, jnp.zeros(()), jnp.asarray([[0.3], [1.0], [2]]))
