@@ -133,8 +133,8 @@ def test_a_metric_is_tuned_for_and_its_result_saved(paper, tmp_path):
         effort=ij.tuning.Effort(iterations=3),
         **TUNING,
     )
-    losses = best.history["loss"]
-    assert np.min(losses) < losses[0].min()
+    # The objective of the scenario's own gains is 1.
+    assert best.objective < 0.5
     assert "swing" in str(best.report)
     with pytest.raises(ValueError, match="Swing"):
         best.save(tmp_path / "mine")

@@ -600,7 +600,8 @@ def test_a_violated_bound_is_in_every_presentation(paper):
     assert repr(result).splitlines()[1].strip() == words
     assert words in str(result.report)
     assert result.report.headline.startswith("bounds VIOLATED")
-    assert "Tuning: the nominal run leaves its bounds" in result._repr_html_()
+    title = "Tuning: 2 of 2 requirements FAILED; the nominal run leaves its bounds"
+    assert title in result._repr_html_()
     assert _has_failed(result.report)
 
 
