@@ -95,6 +95,18 @@ def test_vector_field_of_a_chain_at_random_states(rng):
 # --- trajectories ---------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("lower", [None, -3.0])
+def test_a_motor_delivers_at_most_its_limits_in_both_directions(lower):
+    motor = ij.actuators.Motor(limit=[5.0, 8.0], lower_limit=lower)
+    lowest = np.array([-5.0, -8.0]) if lower is None else np.full(2, lower)
+    highest = np.array([5.0, 8.0])
+    for command in ([-20.0, -20.0], [20.0, 20.0], [-20.0, 20.0], [1.0, -2.0]):
+        delivered = motor.deliver(jnp.asarray(command), jnp.zeros(2), ())
+        np.testing.assert_array_equal(delivered.tau, np.clip(command, lowest, highest))
+        is_beyond = (command < lowest) | (command > highest)
+        np.testing.assert_array_equal(delivered.limited, is_beyond)
+
+
 @pytest.mark.slow
 def test_fault_between_two_instants_against_scipy():
     time = 0.0503
