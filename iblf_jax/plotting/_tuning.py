@@ -99,7 +99,10 @@ def tuning(
         heading.append("at the end of their range: " + ", ".join(map(escaped, result.at_limits)))
     _style.set_heading(figure, heading)
     above: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0)}
-    tubes[0][-1].legend(ncols=4, borderaxespad=0.0, **above)
+    legend = tubes[0][-1].legend(ncols=4, borderaxespad=0.0, **above)
+    # It is wider than its panel, which the layout would make narrower for it; the title beside it
+    # keeps the room above.
+    legend.set_in_layout(_style.in_paper())
     return figure
 
 
