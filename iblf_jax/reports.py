@@ -295,8 +295,7 @@ def _certificate(found: Certificate) -> Shown:
 
 
 def _tuning(found: TuneResult) -> Shown:
-    heading, *lines = str(found.report).splitlines()
-    words = [heading, *lines, f"Search: {_described(found)[0]}"]
+    words = [*str(found.report).splitlines(), f"Search: {_described(found)[0]}"]
     figures = {"Before and after, and the search": found.plot}
     title = f"Tuning: {found.report.title}"
     return Shown(title, words, {"Gains": _gains(found)}, figures, found.scenario)

@@ -38,8 +38,7 @@ import iblf_jax as ij
 from iblf_jax import kernels, sensors
 from iblf_jax.core import taylor
 from iblf_jax.simulation import levels
-from iblf_jax.simulation.closed_loop import LoopState
-from iblf_jax.simulation.closed_loop import _continuous_law as continuous_law
+from iblf_jax.simulation.closed_loop import LoopState, continuous_law
 from iblf_jax.simulation.scenario import canonical
 from iblf_jax.world import plants, regions
 from iblf_jax.world.bounds import bounds_at

@@ -72,7 +72,7 @@ def of_preset(name: str) -> Project:
 
     checks.one_of("--preset", name, tuple(DURATIONS))
     start, duration = PRESETS[name](), DURATIONS[name]
-    scenario = next(filter(None, (_at(start, period, duration) for period in PERIODS)), start)
+    scenario = next(filter(None, (_at(start, period, duration) for period in PERIODS)))
     perturbations = {
         "plant.mass": '{ factor = "uniform", low = 0.9, high = 1.1 }',
         "initial.q": '{ offset = "uniform", low = -0.02, high = 0.02 }',

@@ -6,11 +6,13 @@ import argparse
 import importlib.metadata
 import os
 import platform
-import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
+
+from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
 
 HELP = "show what is installed and what is missing"
 DESCRIPTION = (
@@ -55,8 +57,8 @@ def run(args: argparse.Namespace) -> int:
     return int(any(x.is_needed for x in faults))
 
 
-def _requirements() -> list[str]:
-    return importlib.metadata.requires("iblf_jax") or []
+def _requirements() -> list[Requirement]:
+    return [Requirement(text) for text in importlib.metadata.requires("iblf_jax") or []]
 
 
 def _versions() -> Iterator[Finding]:
@@ -76,7 +78,7 @@ def _versions() -> Iterator[Finding]:
     if not _is_within(version, supported):
         remedy = f"take a Python {supported}"
     yield Finding("Python", f"{version}, {sys.executable}", remedy)
-    allowed = {_name(x): re.sub(r"^[\w-]+", "", x) for x in _requirements() if ";" not in x}
+    allowed = {x.name: str(x.specifier) for x in _requirements() if x.marker is None}
     for name in ("jax", "jaxlib"):
         version = importlib.metadata.version(name)
         remedy = ""
@@ -87,19 +89,7 @@ def _versions() -> Iterator[Finding]:
 
 def _is_within(version: str, specifier: str) -> bool:
     """Whether a version satisfies conditions such as >=0.10.2,<0.13."""
-    for operator, bound in re.findall(r"(>=|<)\s*([\d.]+)", specifier):
-        is_below = _numbers_of(version) < _numbers_of(bound)
-        if is_below == (operator == ">="):
-            return False
-    return True
-
-
-def _numbers_of(version: str) -> tuple[int, ...]:
-    return tuple(int(x) for x in re.findall(r"\d+", version)[:3])
-
-
-def _name(requirement: str) -> str:
-    return re.split(r"[^\w-]", requirement, maxsplit=1)[0].lower()
+    return SpecifierSet(specifier).contains(version, prereleases=True)
 
 
 def _devices() -> Finding:
@@ -112,7 +102,9 @@ def _devices() -> Finding:
         return Finding("devices", str(error).splitlines()[0], remedy)
     kinds = sorted({f"{x.platform} ({x.device_kind})" for x in devices})
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return Finding("devices", f"{len(devices)}: {', '.join(kinds)}; {cores} cores; float64")
+    config: Any = jax.config  # its fields are made when JAX starts
+    precision = "float64" if config.jax_enable_x64 else "float32"
+    return Finding("devices", f"{len(devices)}: {', '.join(kinds)}; {cores} cores; {precision}")
 
 
 def _compiler() -> Finding:
@@ -126,31 +118,18 @@ def _compiler() -> Finding:
 
 def _extras() -> Iterator[Finding]:
     """Every extra for users, with the packages that it lacks."""
-    packages: dict[str, list[str]] = {}
-    for requirement in _requirements():
-        package, _, condition = requirement.partition(";")
-        extra = re.search(r"extra\s*==\s*['\"](\w+)['\"]", condition)
-        if extra and extra[1] not in TOOLS_OF_THE_PROJECT and _is_here(condition):
-            packages.setdefault(extra[1], []).append(_name(package.strip()))
-    for name_of_extra, names in packages.items():
+    requirements = _requirements()
+    for extra in importlib.metadata.metadata("iblf_jax").get_all("Provides-Extra", []):
+        names = [x.name for x in requirements if x.marker and x.marker.evaluate({"extra": extra})]
+        if extra in TOOLS_OF_THE_PROJECT or not names:
+            continue
         lacking = [name for name in names if not _version_of(name)]
         found = ", ".join(f"{name} {_version_of(name)}".strip() for name in names)
         remedy = ""
         if lacking:
             found = f"without {', '.join(lacking)}"
-            remedy = f'pip install "iblf_jax[{name_of_extra}]", or ".[{name_of_extra}]" in a clone'
-        yield Finding(f"extra {name_of_extra}", found, remedy, is_needed=False)
-
-
-def _is_here(condition: str) -> bool:
-    """Whether a requirement with this condition is one of this Python and platform."""
-    here = {
-        "python_version": ".".join(platform.python_version_tuple()[:2]),
-        "sys_platform": sys.platform,
-        "platform_machine": platform.machine(),
-    }
-    conditions = re.findall(r"(\w+)\s*==\s*['\"]([^'\"]+)['\"]", condition)
-    return all(here[name] == value for name, value in conditions if name in here)
+            remedy = f'pip install "iblf_jax[{extra}]", or ".[{extra}]" in a clone'
+        yield Finding(f"extra {extra}", found, remedy, is_needed=False)
 
 
 def _version_of(package: str) -> str:

@@ -288,13 +288,14 @@ def _decided(
 ) -> dict[str, Any]:
     """The fields of a `Proof` with the verdict and what it rests on."""
     decreasing = [each for each in sampled if each.largest <= 0.0]
-    admitted = [each for each in decreasing if _excess(problem, level, each, options) <= 0.0]
+    excesses = [_excess(problem, level, each, options) for each in decreasing]
+    admitted = [each for each, excess in zip(decreasing, excesses, strict=True) if excess <= 0.0]
     if admitted:
         return _searched_at_best(problem, level, admitted, options)
     best = min(sampled, key=lambda each: each.largest)
     fields: dict[str, Any] = {}
     if decreasing:
-        best = min(decreasing, key=lambda each: _excess(problem, level, each, options))
+        best = decreasing[int(np.argmin(excesses))]
         fields["torque"] = _torque(problem, level, best, options, to_prove=False)
     else:
         fields["growth_points"] = _growth_points(problem, level, sampled)

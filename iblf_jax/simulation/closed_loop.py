@@ -249,7 +249,7 @@ def evaluate(
     """
     x = state.x
     if scenario.sampling is None:
-        law = _continuous_law(scenario, t, state)
+        law = continuous_law(scenario, t, state)
     else:
         law = _LawOutput(state.sampled.commands[0], state.sampled.signals)
     applied = law.input if command is None else command
@@ -277,7 +277,7 @@ class _LawOutput(NamedTuple):
     observer_rate: Pytree = ()
 
 
-def _continuous_law(scenario: Scenario, t: jax.Array, state: LoopState) -> _LawOutput:
+def continuous_law(scenario: Scenario, t: jax.Array, state: LoopState) -> _LawOutput:
     """What the law gives for a measurement of the state that the observer completes."""
     loop, x = scenario.loop, state.x
     observer = loop.observer

@@ -363,8 +363,10 @@ def _with_joint_number(scenario: Scenario, full: str) -> str:
     """
     try:
         last = parse(full)[-1]
+        if not isinstance(last, RowName):
+            return full
         joints = component_names(scenario.plant)
-        if not isinstance(last, RowName) or joints.count(last) != 1:
+        if joints.count(last) != 1:
             return full
         field = full.removesuffix(f"[{last}]").removesuffix(f"[{json.dumps(last)}]")
         value = resolve(scenario, field)[1]

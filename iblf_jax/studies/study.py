@@ -435,7 +435,7 @@ class Study(Result):
 
     def _recompute(self, i: int) -> BlockResults:
         """The results of run i, from its block; warns if they differ from those of the study."""
-        # Of the size that the study had, whose program is compiled already.
+        # The size that a study in memory has by default: its program is compiled already.
         size = block_size_in_memory(self.setup.cases, self.setup.options.steps)
         block, place = divmod(i, size)
         ((_, results),) = run_blocks(self.setup, [block], size=size)

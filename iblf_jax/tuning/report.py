@@ -263,11 +263,16 @@ class TuningReport(Result):
             count = sum(v.verdict == kind for v in self.verdicts)
             if count:
                 words.append(f"{count} of {len(self.verdicts)} requirements {text}")
+        return "; ".join([*words, *self._numerical_failures()])
+
+    def _numerical_failures(self) -> list[str]:
+        """What fails at dt / 2, and where the sampled loop is unstable, in words."""
+        words = []
         if self.step_check is not None and self.step_check.newly_broken:
             words.append("a requirement is BROKEN at dt / 2")
         if self.unstable[1]:
             words.append(f"the sampled loop is UNSTABLE in {self._unstable_in_words()}")
-        return "; ".join(words)
+        return words
 
     @property
     def title(self) -> str:
@@ -287,10 +292,7 @@ class TuningReport(Result):
         else:
             kept = left.runs - left.count
             words.append(f"{kept} of {left.runs} fresh runs keep the bounds")
-        if self.step_check is not None and self.step_check.newly_broken:
-            words.append("a requirement is BROKEN at dt / 2")
-        if self.unstable[1]:
-            words.append(f"the sampled loop is UNSTABLE in {self._unstable_in_words()}")
+        words += self._numerical_failures()
         open_ones = [v for v in self.verdicts if v.runs_needed is not None]
         if open_ones:
             strictest = max(open_ones, key=lambda v: v.runs_needed or 0)
