@@ -26,8 +26,12 @@ RESULTS = ROOT / "benchmarks" / "results"
 FILES = (ROOT / "README.md", ROOT / "paper" / "paper.md")
 LANDING = ROOT / "docs" / "index.md"
 """The first page of the site, which has three of the numbers."""
-ON_LANDING = ("throughput", "latency", "arm")
-"""The benchmarks of these numbers."""
+ON_LANDING = {
+    "throughput": "4096 closed loops on a CPU; plain JAX: {other}",
+    "latency": "a run of 20 s by RK4{ours}; SciPy LSODA: {other}",
+    "arm": "iiwa 14 with law and observer; MuJoCo, the plant alone: {other}",
+}
+"""The benchmarks of these numbers, and the words for a narrow column."""
 BEGIN, END = "<!-- comparison -->\n", "<!-- end of comparison -->"
 
 Conditions = dict[str, Any]
@@ -69,13 +73,15 @@ COMPARISONS = (
         {"the same loop in plain JAX": LOOP | {"row": "textbook"}},
     ),
     Comparison(
-        "one run of 20 s, called from Python; both with the compiled right-hand side",
+        "one run of 20 s, called from Python; RK4 at 0.5 ms, and LSODA with steps of its own that"
+        " calls the compiled right-hand side",
         "latency",
-        "ms",
-        "ms",
+        "processor ms",
+        "ms of a processor",
         "less",
-        {"row": "native, user's call"},
+        {"row": "native, user's call, 0.5 ms"},
         {"SciPy LSODA, relative tolerance 1e-6": {"row": "LSODA, compiled field"}},
+        {"largest error [rad]": "largest error {:.1e} rad"},
     ),
     Comparison(
         "65,536 closed loops of the paper's arm, H200",
@@ -87,7 +93,8 @@ COMPARISONS = (
         {"the same loop in plain JAX": ON_GPU | {"row": "textbook"}},
     ),
     Comparison(
-        "iiwa 14 with law and observer; MuJoCo simulates the plant alone, CPU",
+        "iiwa 14 with law and observer; MuJoCo simulates the plant alone; both RK4 at 1 ms in"
+        " float64, CPU",
         "arm",
         "steps/s per core",
         "steps/s per core",
@@ -110,8 +117,8 @@ COMPARISONS = (
     Comparison(
         "tuning of two gains under limits, by rollouts of this package",
         "tuning",
-        "seconds",
-        "s",
+        "processor s",
+        "s of a processor",
         "less",
         {"search": "iblf_jax tune"},
         {
@@ -133,11 +140,16 @@ COMPARISONS = (
 )
 
 
+def result_of(benchmark: str) -> dict[str, Any]:
+    """The result of a benchmark: its rows, and the machine that measured them."""
+    return dict(json.loads((RESULTS / f"{benchmark}.json").read_text()))
+
+
 def value_of(comparison: Comparison, conditions: Conditions, column: str = "") -> float:
     """The number of the only row of a result that meets the conditions, in the compared column or
     in another one.
     """
-    rows = json.loads((RESULTS / f"{comparison.benchmark}.json").read_text())["rows"]
+    rows = result_of(comparison.benchmark)["rows"]
     found = [row for row in rows if all(row[key] == value for key, value in conditions.items())]
     if len(found) != 1:
         raise LookupError(f"{comparison.benchmark}.json has {len(found)} rows with {conditions}")
@@ -162,28 +174,40 @@ def beside(comparison: Comparison, conditions: Conditions) -> str:
     return "".join(f", {value}" for value in values)
 
 
+def measured_by(benchmark: str) -> str:
+    """The program of a row, and when and with which versions it was measured."""
+    machine = result_of(benchmark)["machine"]
+    version, _, _ = machine["iblf_jax"].partition(",")
+    versions = f"iblf_jax {version}, JAX {machine['jax']}, Python {machine['python']}"
+    return f"`benchmarks/{benchmark}.py`, {machine['date']}: {versions}"
+
+
+def ratio(comparison: Comparison, name: str) -> float:
+    """How many times better this package is than other software; below 1 it is worse."""
+    ours = value_of(comparison, comparison.ours)
+    other = value_of(comparison, comparison.others[name])
+    return other / ours if comparison.better == "less" else ours / other
+
+
 def row(comparison: Comparison) -> str:
     """A row of the table."""
-    ours = value_of(comparison, comparison.ours)
     others = []
     for name, conditions in comparison.others.items():
-        other = value_of(comparison, conditions)
-        ratio = ours / other
-        if comparison.better == "less":
-            ratio = other / ours
-        others.append(f"{name}: {words(other)} ({words(ratio)}){beside(comparison, conditions)}")
+        value, times = words(value_of(comparison, conditions)), words(ratio(comparison, name))
+        others.append(f"{name}: {value} ({times}){beside(comparison, conditions)}")
+    ours = words(value_of(comparison, comparison.ours))
     cells = [
         comparison.task,
-        f"{words(ours)} {comparison.unit}{beside(comparison, comparison.ours)}",
+        f"{ours} {comparison.unit}{beside(comparison, comparison.ours)}",
         "; ".join(others),
-        f"`benchmarks/{comparison.benchmark}.py`",
+        measured_by(comparison.benchmark),
     ]
     return "| " + " | ".join(cells) + " |"
 
 
 def left_out() -> str:
     """What has no row, and the reason, in sentences."""
-    rows = json.loads((RESULTS / "constraints.json").read_text())["rows"]
+    rows = result_of("constraints")["rows"]
     effort = {row["law"]: row["effort [N m]"] for row in rows}
     return (
         "diffrax is left out of the first row until it is measured with the four evaluations a step"
@@ -206,6 +230,7 @@ def table() -> str:
         "|---|---|---|---|",
     ]
     lines = [*head, *map(row, shown)]
+    lines += ["", "The versions of the other software were not noted with these numbers."]
     if removed:
         names = " and ".join(f'"{task}"' for task in removed)
         reason = f"because they were {withdrawn.REASON}; they will be measured again."
@@ -215,15 +240,23 @@ def table() -> str:
 
 
 def three_numbers() -> str:
-    """The numbers of the landing page as a list, each with a link."""
+    """The numbers of the landing page as a list, each with a link, and which other software is
+    better in a row that the page does not have.
+    """
     lines = []
-    for benchmark in ON_LANDING:
+    for benchmark, text in ON_LANDING.items():
         chosen = next(x for x in COMPARISONS if x.benchmark == benchmark)
-        name, conditions = next(iter(chosen.others.items()))
-        lines.append(
-            f"- [**{words(value_of(chosen, chosen.ours))} {chosen.unit}**](benchmarks.md):"
-            f" {chosen.task}; {name}: {words(value_of(chosen, conditions))} {chosen.unit}"
-        )
+        (conditions,) = chosen.others.values()
+        number = f"{words(value_of(chosen, chosen.ours))} {chosen.unit}"
+        other = words(value_of(chosen, conditions)) + beside(chosen, conditions)
+        described = text.format(ours=beside(chosen, chosen.ours), other=other)
+        lines.append(f"- [**{number}**](benchmarks.md): {described}")
+    for worse in COMPARISONS:
+        if worse.benchmark in withdrawn.BENCHMARKS:
+            continue
+        names = " and ".join(name for name in worse.others if ratio(worse, name) < 1.0)
+        if names:
+            lines.append(f"- Better are [{names}](benchmarks.md): {worse.task}")
     return "\n".join(lines) + "\n"
 
 

@@ -50,6 +50,12 @@ def two_links() -> ij.Scenario:
     return dataclasses.replace(disturbed(), disturbance=ij.disturbances.Nothing())
 
 
+def sampled(period: float) -> Callable[[], ij.Scenario]:
+    """The same loop with a held torque."""
+    sampling = ij.Sampling(period=period, observer="poles")
+    return lambda: dataclasses.replace(two_links(), sampling=sampling)
+
+
 def disturbed() -> ij.Scenario:
     """The paper's loop, corrected."""
     return ij.presets.zhang_yan_2024(variant="corrected")
@@ -127,6 +133,13 @@ CASES = [
         "two links", 3.0, 100.0, 1.0, "all masses 1 %, payload 0 to 10 g",
         percent(MASSES, 1.0, shared=True) | PAYLOAD, 2e-3, two_links,
     ),
+    *[
+        Case(
+            f"two links, sampled every {1e3 * period:g} ms", 3.0, 100.0, 0.1, "masses 1 %",
+            percent(MASSES, 1.0), 3e-3, sampled(period),
+        )
+        for period in (0.5e-3, 1e-3)
+    ],
     Case(
         "three links", 3.0, 100.0, 0.5, "all masses 1 %",
         percent(MASSES, 1.0, shared=True), 2e-3, three_links,

@@ -1,13 +1,24 @@
 """How many tunings from random starts end at the best known gains, and what a tuning costs.
 
-    python benchmarks/starts.py [BEFORE [AFTER]] [--problem NAME] [--count 8] [--quick]
-    [--json FILE]
+    python benchmarks/starts.py [BEFORE [AFTER]] [--problem NAME] [--count 8] [--seed 0]
+    [--reference POINTS] [--peers] [--quick] [--json FILE]
 
 Each of the problems is tuned `--count` times with the default effort, from gains within a factor e
 of the scenario's in every number.  Every tuning has a seed of its own, also for the points that it
 evaluates to find its starts; scales and limits are the same for all.  The first tuning is from the
-scenario's own gains.  A tuning that breaks a requirement counts as one that does not end at the
-best.
+scenario's own gains.  A tuning that breaks a requirement, or whose objective changes by more than
+LARGEST_CHANGE at an eighth of the time step, counts as one that does not end at the best: such
+gains are good at one time step only.
+
+The best known objective is that of all tunings, and with `--reference` also of a long search from
+the scenario's own gains: so many points without derivatives, and REFERENCE_STARTS starts that are
+taken nearly to their ends.
+
+With `--peers` each problem is tuned once by `tune` from its own gains, and then by other methods
+for as many seconds of a processor, all with programs at hand and with the compiled batches of this
+package: CMA-ES (`cma`, 64 points a generation, restarted where it stops) and Optuna's TPE (16
+points at a time) on the objective + PENALTY times the largest excess, and SciPy's SLSQP with exact
+derivatives from one after another of the best of 256 points.
 
 AFTER is by default the working tree.  With BEFORE the same is done by the package of that commit,
 and the best known objective is that of all tunings of both.  Seconds are those of the processor, in
@@ -17,7 +28,9 @@ a process for each commit whose programs are compiled before.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
+import importlib
 import json
 import os
 import subprocess
@@ -34,15 +47,21 @@ jax.config.update("jax_enable_x64", True)
 import numpy as np
 from _timing import report
 from losses import checked_out
-from tuning import chain, limited_problem
+from tuning import PENALTY, chain, limited_problem, slsqp
 
 import iblf_jax as ij
-from iblf_jax import actuators, barriers, controllers
-from iblf_jax.tuning import TuningProblem, _tune
-from iblf_jax.tuning.options import EFFORTS
+from iblf_jax import actuators, barriers, controllers, references
+from iblf_jax.tuning import TuningProblem, _tune, evaluation, starts
+from iblf_jax.tuning.options import EFFORTS, Effort
+from iblf_jax.tuning.solvers._base import violations
 
 WITHIN = 1.005
 """Largest objective, relative to the best known one, of a tuning that ends at the best gains."""
+LARGEST_CHANGE = 0.02
+"""Largest relative change of the objective at an eighth of the time step.  It is 1.3 % for
+"velocity bounds", and 17 % and more for gains with which a loop chatters or runs away."""
+REFERENCE_STARTS = 96
+"""Number of starts of a long search."""
 o = ij.objectives
 
 
@@ -59,6 +78,11 @@ class Problem(NamedTuple):
     terms: Any = None
     """Further terms and requirements."""
     backend: str = "auto"
+    dt: float = 1e-3
+    goal: Any = None
+    """The objective in place of tracking, effort and rate of the torque."""
+    study: dict[str, Any] = {}  # noqa: RUF012
+    """Perturbations, their number of runs, and the risk."""
 
 
 def two_links(law: str) -> ij.Scenario:
@@ -103,6 +127,47 @@ def adaptive_network() -> Problem:
     return Problem(scenario, ["controller.k1", "controller.K2", "controller.Gamma"], 0.8, 0.9)
 
 
+def with_law(law: Any, gains: list[str], torque: float, **options: Any) -> Problem:
+    """The two links under another law."""
+    return Problem(ij.with_parts(two_links("log"), controller=law), gains, torque, **options)
+
+
+def with_step(scenario: ij.Scenario) -> ij.Scenario:
+    """A preset of two joints that goes from rest to rest."""
+    step = references.SmoothStep(start=[0.65, 0.65], end=[0.45, 0.5], duration=0.5)
+    return ij.with_parts(scenario, reference=step)
+
+
+def settling_chain() -> Problem:
+    """Four joints that are to settle."""
+    goal = o.settle(0.02) + 0.3 * o.effort() + 0.02 * o.torque_rate()
+    gains = ["controller.k1", "controller.K2", "observer.kf"]
+    return Problem(chain(4), gains, 0.95, goal=goal)
+
+
+def perturbed() -> Problem:
+    """The worst tenth of 16 runs."""
+    drawn = {
+        "plant.mass": ij.factor(ij.uniform(0.8, 1.2)),
+        "initial.q": ij.offset(ij.uniform(-0.03, 0.03)),
+    }
+    study = {"perturbations": drawn, "runs": 16, "risk": "cvar"}
+    gains = ["controller.k1", "controller.K2"]
+    return Problem(two_links("integral"), gains, 1.1, study=study)
+
+
+def sampled_surface() -> Problem:
+    """Filtered virtual commands, a sampled law and motors."""
+    law = controllers.DynamicSurface(k1=2.0, K2=20.0, filter=[0.02, 0.02])
+    scenario = ij.with_parts(
+        two_links("log"),
+        controller=law,
+        actuator=actuators.Motor(bandwidth=150.0),
+        sampling=ij.Sampling(period=2e-3),
+    )
+    return Problem(scenario, ["controller.k1", "controller.K2", "controller.filter"], 0.9)
+
+
 PROBLEMS: dict[str, Callable[[], Problem]] = {
     "two links, tan (6)": lambda: Problem(
         two_links("tan"), ["controller.k1", "controller.K2", "observer.kf"], 1.0, 0.9
@@ -142,6 +207,39 @@ PROBLEMS: dict[str, Callable[[], Problem]] = {
         0.3,
         backend="native",
     ),
+    # Written after the choice of starts and before it was measured on them.
+    "vessel on an ellipse (12)": lambda: Problem(
+        ij.presets.vessel(), ["controller.k", "observer.gain"], 0.9, 0.9, duration=20.0, dt=0.02
+    ),
+    "two links with drives, order 3 (8)": lambda: Problem(
+        ij.presets.motor_driven_two_link(), ["controller.k", "observer.kf"], 0.9, 0.9
+    ),
+    "chain of four, settling (12)": settling_chain,
+    "two links, smooth step, tan (6)": lambda: Problem(
+        with_step(two_links("tan")), ["controller.k1", "controller.K2", "observer.kf"], 0.9, 0.9
+    ),
+    "flexible joints, smooth step, order 4 (10)": lambda: Problem(
+        with_step(ij.presets.flexible_joint_two_link()), ["controller.k", "observer.kf"], 0.95
+    ),
+    "dynamic surface, motor, sampled (6)": sampled_surface,
+    "radial basis functions (6)": lambda: with_law(
+        controllers.AdaptiveRBF(k1=2.0, K2=20.0, nodes=16),
+        ["controller.k1", "controller.K2", "controller.Gamma"],
+        0.8,
+        margin=0.9,
+    ),
+    "terminal sliding mode (6)": lambda: with_law(
+        controllers.TerminalSlidingMode(beta=[1.0, 1.0], K=[20.0, 20.0], layer=[0.05, 0.05]),
+        ["controller.beta", "controller.K", "controller.layer"],
+        0.9,
+    ),
+    "two links, worst tenth of 16 runs (4)": perturbed,
+    # Written after the comparison at half the step and before it was measured on it.
+    "two links in a funnel (6)": lambda: Problem(
+        ij.presets.zhang_yan_2024_funnel(),
+        ["controller.k1", "controller.K2", "observer.kf"],
+        0.9,
+    ),
 }
 """Name with the number of gains -> problem."""
 
@@ -152,53 +250,71 @@ def built(name: str) -> TuningProblem:
         scenario, gains, goal, timing, study = limited_problem(name, False)
         return TuningProblem.build(scenario, gains, goal, **timing, **study)
     problem = PROBLEMS[name]()
-    start = ij.simulate(problem.scenario, duration=problem.duration, dt=1e-3).metrics
-    goal = o.tracking() + 0.3 * o.effort() + 0.02 * o.torque_rate()
+    timing = {"duration": problem.duration, "dt": problem.dt}
+    start = ij.simulate(problem.scenario, **timing).metrics
+    goal = problem.goal
+    if goal is None:
+        goal = o.tracking() + 0.3 * o.effort() + 0.02 * o.torque_rate()
     goal += o.peak_torque_below(problem.torque * float(np.max(start.peak_torque)))
     if problem.margin is not None:
         goal += o.margin_above(problem.margin * float(np.min(start.margin)))
     if problem.terms is not None:
         goal += problem.terms
-    timing = {"duration": problem.duration, "dt": 1e-3, "backend": problem.backend}
-    return TuningProblem.build(problem.scenario, problem.gains, goal, **timing)
+    options = timing | problem.study | {"backend": problem.backend}
+    return TuningProblem.build(problem.scenario, problem.gains, goal, **options)
 
 
-def tunings(name: str, count: int) -> list[dict[str, float]]:
-    """The tunings of one problem by the package that is imported."""
+def tunings(name: str, count: int, first: int, points: int) -> list[dict[str, float]]:
+    """The tunings of one problem by the package that is imported, and last the long search of so
+    many points, if it is not 0.
+    """
     problem = built(name)
     box = problem.box
-    effort = EFFORTS["normal"]
-    found = []
-    for seed in range(-1, count):  # the first one compiles and does not count
+    normal = EFFORTS["normal"]
+    # The first one compiles and does not count.
+    found = [tuning(problem, box.z, first, dataclasses.replace(normal, iterations=1))]
+    for seed in range(first, first + count):
         z = box.z
-        if seed > 0:
+        if seed > first:
             z = z + np.random.default_rng(100 + seed).uniform(-1, 1, problem.size)
-        moved = dataclasses.replace(
-            problem,
-            box=dataclasses.replace(box, z=np.clip(z, box.low, box.high)),
-            options=dataclasses.replace(problem.options, seed=max(seed, 0)),
-        )
-        began = time.process_time()
-        search = _tune.search_of(moved, ij.tuning.SQP(), "forward", effort)
-        stopped = search.run(effort.iterations if seed >= 0 else 1)
-        seconds = time.process_time() - began
-        outcome = _tune._outcome(search, stopped)
-        violation, objective = search.state.incumbent_key
-        found.append(
-            {
-                "objective": float(objective) if violation <= 0 else np.inf,
-                "seconds": seconds,
-                "evaluations": search.state.evaluations,
-                "converged": outcome.stopped.startswith("converged"),
-            }
-        )
+        found.append(tuning(problem, np.clip(z, box.low, box.high), seed, normal))
+    if points:
+        long = Effort(values=points, starts=REFERENCE_STARTS, iterations=120, selection=20)
+        found.append(tuning(problem, box.z, first, long))
     return found[1:]
 
 
-def measured(tree: Path, name: str, count: int) -> list[dict[str, float]]:
-    """The tunings of one problem, in a process that imports the package of a tree."""
+def tuning(problem: TuningProblem, z: np.ndarray, seed: int, effort: Effort) -> dict[str, float]:
+    """A tuning of a problem from the coordinates z, (p,)."""
+    moved = dataclasses.replace(
+        problem,
+        box=dataclasses.replace(problem.box, z=z),
+        options=dataclasses.replace(problem.options, seed=seed),
+    )
+    began = time.process_time()
+    search = _tune.search_of(moved, ij.tuning.SQP(), "forward", effort)
+    stopped = search.run(effort.iterations)
+    seconds = time.process_time() - began
+    outcome = _tune._outcome(search, stopped)
+    violation, objective = search.state.incumbent_key
+    fine = problem.at_half_the_step().at_half_the_step().at_half_the_step()
+    at_fine = float(evaluation.values(fine, outcome.z[None]).objective[0])
+    is_resolved = abs(at_fine - objective) <= LARGEST_CHANGE * abs(objective)
+    return {
+        "objective": float(objective) if violation <= 0 and is_resolved else np.inf,
+        "seconds": seconds,
+        "evaluations": search.state.evaluations,
+        "values": search.state.plain_values,
+        "converged": outcome.stopped.startswith("converged"),
+    }
+
+
+def measured(tree: Path, name: str, *numbers: int) -> list[dict[str, float]]:
+    """As `tunings`, in a process that imports the package of a tree."""
     environment = os.environ | {"PYTHONPATH": str(tree)}
-    words = [sys.executable, __file__, "--problem", name, "--count", str(count), "--worker"]
+    words = [sys.executable, __file__, "--problem", name, "--worker"]
+    for option, number in zip(("--count", "--seed", "--reference"), numbers, strict=True):
+        words += [option, str(number)]
     run = subprocess.run(words, capture_output=True, text=True, env=environment)
     if run.returncode:
         raise SystemExit(f"{name}: {run.stderr.strip().splitlines()[-1]}")
@@ -219,6 +335,140 @@ def row(name: str, commit: str, found: list[dict[str, float]], best: float) -> l
     return [name, commit, best, reached, own, gap, false, evaluations, seconds]
 
 
+class TimeUpError(Exception):
+    """A method has used its processor time."""
+
+
+class Judge:
+    """A problem for methods that know nothing of this package, for so many processor seconds."""
+
+    def __init__(self, problem: TuningProblem, seconds: float):
+        self.problem = problem
+        self.best = np.inf
+        self.values = 0
+        self.slopes = 0
+        self.ends = time.process_time() + seconds
+
+    def __call__(self, z: np.ndarray) -> np.ndarray:
+        """The objective with its penalty at points, (S, p)."""
+        self.check_time()
+        found = evaluation.values(self.problem, z)
+        self.values += len(z)
+        excess = violations(found)
+        self.note(np.where(found.valid, found.objective, np.inf), excess)
+        penalised = found.objective + PENALTY * excess
+        return np.where(found.valid & np.isfinite(penalised), penalised, 1e6)
+
+    def derivatives(self, z: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
+        """Objective, excesses and their gradients at a point, (p,), by the program of `tune`."""
+        self.check_time()
+        rows = np.tile(z, (_tune.STARTS_TOGETHER, 1))
+        found = evaluation.forward_derivatives(self.problem, self.problem.candidates(rows))
+        found = jax.tree.map(lambda x: np.asarray(x)[0], found)
+        self.slopes += 1
+        excess = max(
+            float(np.max(found.value.exact_excess, initial=0.0)), -float(found.value.margin)
+        )
+        self.note(np.array([found.value.objective]), np.array([max(excess, 0.0)]))
+        owner = self.problem.search_space(1).constraints.owner
+        limits = range(len(found.value.exact_excess))
+        worst = [np.flatnonzero(owner == r)[np.argmax(found.pieces[0, owner == r])] for r in limits]
+        slopes = found.piece_gradients[0][:, worst].T
+        return float(found.value.loss), found.pieces[0, worst], found.gradient, slopes
+
+    def check_time(self) -> None:
+        """Raises TimeUpError after the last second."""
+        if time.process_time() > self.ends:
+            raise TimeUpError
+
+    def note(self, objective: np.ndarray, excess: np.ndarray) -> None:
+        """Keeps the best objective of points that keep the requirements."""
+        self.best = min(self.best, float(np.min(np.where(excess <= 0, objective, np.inf))))
+
+
+def finite_box(problem: TuningProblem) -> tuple[np.ndarray, np.ndarray]:
+    """The ranges in which `tune` takes its points, (p,) each."""
+    box = problem.box
+    low = np.where(np.isfinite(box.low), box.low, box.z - starts.UNLIMITED)
+    return low, np.where(np.isfinite(box.high), box.high, box.z + starts.UNLIMITED)
+
+
+def by_cma(judge: Judge) -> None:
+    """CMA-ES until the time is up."""
+    import cma
+
+    low, high = finite_box(judge.problem)
+    ends = {"bounds": [low.tolist(), high.tolist()], "popsize": 64, "verbose": -9}
+    for seed in range(1, 1000):
+        evolution = cma.CMAEvolutionStrategy(judge.problem.box.z, 0.5, ends | {"seed": seed})
+        while not evolution.stop():
+            points = evolution.ask()
+            evolution.tell(points, judge(np.stack(points)).tolist())
+
+
+def by_tpe(judge: Judge) -> None:
+    """Optuna's TPE until the time is up."""
+    import optuna
+
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    low, high = finite_box(judge.problem)
+    study = optuna.create_study(sampler=optuna.samplers.TPESampler(seed=1))
+    study.enqueue_trial({f"z{i}": float(x) for i, x in enumerate(judge.problem.box.z)})
+    ranges = list(zip(low.tolist(), high.tolist(), strict=True))
+    while True:
+        trials = [study.ask() for _ in range(16)]
+        points = [[t.suggest_float(f"z{i}", *x) for i, x in enumerate(ranges)] for t in trials]
+        for trial, found in zip(trials, judge(np.array(points)).tolist(), strict=True):
+            study.tell(trial, found)
+
+
+def by_slsqp(judge: Judge) -> None:
+    """SLSQP from one after another of the best points until the time is up."""
+    problem = judge.problem
+    points = np.concatenate([problem.box.z[None], starts.spread_points(problem.box, 255, 1)])
+    order = np.argsort(judge(points), kind="stable")
+    for start in points[order]:
+        slsqp(judge.derivatives, start, finite_box(problem), steps=60, tolerance=1e-6)
+
+
+PEERS: dict[str, Callable[[Judge], None]] = {
+    "CMA-ES": by_cma,
+    "Optuna's TPE": by_tpe,
+    "SLSQP": by_slsqp,
+}
+
+
+def peers(name: str) -> list[list[Any]]:
+    """The rows of one problem: `tune`, and the other methods for its processor time."""
+    for module in ("cma", "optuna"):  # their imports do not count
+        importlib.import_module(module)
+    problem = built(name)
+    tuning(problem, problem.box.z, 0, dataclasses.replace(EFFORTS["normal"], iterations=1))
+    own = tuning(problem, problem.box.z, 0, EFFORTS["normal"])
+    Judge(problem, np.inf).derivatives(problem.box.z)  # compiles where `tune` had fewer starts
+    rows = [[name, "tune", own["objective"], own["values"], own["evaluations"], own["seconds"]]]
+    for method, solve in PEERS.items():
+        judge = Judge(problem, own["seconds"])
+        began = time.process_time()
+        with contextlib.suppress(TimeUpError):
+            solve(judge)
+        seconds = time.process_time() - began
+        rows.append([name, method, judge.best, judge.values, judge.slopes, seconds])
+    return rows
+
+
+def report_peers(names: list[str], file: str | None) -> None:
+    """Prints the table of `--peers`; the objective as its gap to the best of all methods."""
+    rows = []
+    for name in names:
+        found = peers(name)
+        best = min(x[2] for x in found)
+        rows += [[*x[:2], 100 * (x[2] / best - 1), *x[3:]] for x in found]
+        print(*rows[-len(found) :], sep="\n", file=sys.stderr, flush=True)
+    columns = ["problem", "method", "above the best %", "values", "with derivatives", "processor s"]
+    report("Equal processor time", columns, rows, file)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -227,14 +477,20 @@ def main() -> None:
     parser.add_argument("after", nargs="?", help="by default the working tree")
     parser.add_argument("--problem", help="one problem, also one of `LIMITED` of tuning.py")
     parser.add_argument("--count", type=int, default=8, help="tunings of a problem")
+    parser.add_argument("--seed", type=int, default=0, help="of the first tuning")
+    parser.add_argument("--reference", type=int, default=0, help="points of a long search")
+    parser.add_argument("--peers", action="store_true", help="other methods in the same time")
     parser.add_argument("--quick", action="store_true", help="two tunings of the first problem")
     parser.add_argument("--json", help="also write the table to this file")
     parser.add_argument("--worker", action="store_true", help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.worker:
-        print(json.dumps(tunings(args.problem, args.count)))
+        print(json.dumps(tunings(args.problem, args.count, args.seed, args.reference)))
         return
     names = [args.problem] if args.problem else list(PROBLEMS)[: 1 if args.quick else None]
+    if args.peers:
+        report_peers(names, args.json)
+        return
     count = 2 if args.quick else args.count
     commits = [args.after] if args.before is None else [args.before, args.after]
     rows = []
@@ -242,9 +498,10 @@ def main() -> None:
         found = {}
         for commit in commits:
             with checked_out(commit) as tree:
-                found[commit or "working tree"] = measured(tree, name, count)
+                own = measured(tree, name, count, args.seed, args.reference)
+                found[commit or "working tree"] = own
         best = min(x["objective"] for of_commit in found.values() for x in of_commit)
-        rows += [row(name, commit, x, best) for commit, x in found.items()]
+        rows += [row(name, commit, x[:count], best) for commit, x in found.items()]
         print(*rows[-len(found) :], sep="\n", file=sys.stderr, flush=True)
     columns = ["problem", "commit", "best known", "within 0.5 %", "from its own start, gap %"]
     columns += ["largest gap %", "called converged above 2 %", "evaluations", "processor s"]

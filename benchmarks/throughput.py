@@ -10,8 +10,9 @@ package's backends with the standard metrics and without, on one thread and on a
 forward sensitivities, and the limit: a rollout written by hand in C++ (`limit/paper_loop.cc`),
   which carries the state alone and is there for the paper's loop only.  The second
 loop is a planar chain of four joints; the third, a real arm of seven (`presets.iiwa14`), whose step
-is too long for XLA.  Last, `native` on 1e4, 1e5 and 1e6 runs, and on a law that is sampled beside
-one that is not; and gradients by the weights of a network in reverse mode, by kernels and by the
+is too long for XLA.  Last, `native` on 1e4, 1e5 and 1e6 runs, the whole call of `monte_carlo`
+beside the limit (of the limit: in processor time), and `native` on a law that is sampled beside one
+that is not; and gradients by the weights of a network in reverse mode, by kernels and by the
 scan, whose cost `in values` is that of so many runs without derivatives.  `a core` is steps per
 second of processor time: on a shared machine it is the number to compare.  A row that needs a
 package which is not there is left out.
@@ -422,6 +423,39 @@ def flat(quick: bool) -> list[list]:
     return result
 
 
+CALLS = ((65_536, 1_000), (4_096, 10_000))
+"""Runs and steps of the studies whose whole call is measured."""
+
+
+def calls(quick: bool) -> list[list]:
+    """The whole call of `monte_carlo`, which draws, runs, assesses the steps and makes the results,
+    beside the limit, which only steps: in turn, and compared in processor time.
+    """
+    jax.config.update("jax_enable_x64", False)
+    scenario = ij.presets.zhang_yan_2024()
+    unknown = {"plant.mass[1]": ij.factor(ij.uniform(0.9, 1.1))}
+    method, by_hand = method_for(quick), limit("float32")
+    result = []
+    for runs, steps in ((2, 20),) if quick else CALLS:
+        study = partial(ij.monte_carlo, scenario, unknown, runs=runs, duration=1e-3 * steps)
+        name_of_call = "monte_carlo, whole call"
+        ways = {name_of_call: partial(study, method=method, progress=False)}
+        if by_hand:
+            values = draws(canonical(ij.astype(scenario, "float32")), runs, "float32")
+            ways["limit"] = partial(by_hand, values, steps)
+        first = time.perf_counter()
+        ways[name_of_call]()
+        seconds = time.perf_counter() - first
+        found = in_turn(ways, 1 if quick else 5)
+        least = found.get("limit", (math.nan, math.nan))[1]
+        for name, (wall, cpu) in found.items():
+            speeds = runs * steps / wall, runs * steps / cpu
+            first_call = seconds if name == name_of_call else 0.0
+            row = ["paper", "float32", runs, name, steps, first_call]
+            result.append([*row, *speeds, math.nan, least / cpu])
+    return result
+
+
 SAMPLED = {
     "law at every instant": None,
     "law every 4 steps": ij.Sampling(4e-3),
@@ -598,7 +632,7 @@ def main() -> None:
     for loop in ["paper"] if options.quick else options.loops.split(","):
         for dtype in ["float32"] if options.quick else options.dtypes.split(","):
             rows += table(dtype, batches, loop, options.quick)
-    rows += flat(options.quick) + sampled(options.quick)
+    rows += flat(options.quick) + calls(options.quick) + sampled(options.quick)
     rows = [[*row, math.nan] for row in rows] + gradients(options.quick)
     columns = [
         "loop",

@@ -48,6 +48,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import time
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -435,7 +436,7 @@ class LimitedJudge:
         self.built = built
         self.seen: list[float] = []
         self.points: list[np.ndarray] = []
-        self.began = time.perf_counter()
+        self.began = time.process_time()
         reach = np.full(len(built.box.z), 4.0)
         self.low, self.high = (
             np.maximum(built.box.low, built.box.z - reach),
@@ -443,20 +444,12 @@ class LimitedJudge:
         )
 
     def both(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Objective (S,), and excess (S, R); sixteen at a time, so that one shape is compiled."""
+        """Objective (S,), and excess (S, R), by the batches of `tune`."""
         points = np.atleast_2d(points)
         self.points += list(points)
-        parts = [
-            np.concatenate([part, np.repeat(part[:1], 16 - len(part), 0)])
-            for part in np.split(points, range(16, len(points), 16))
-        ]
-        found = [evaluation.value(self.built, self.built.candidates(part)) for part in parts]
-        f = np.concatenate(
-            [np.where(np.asarray(x.valid), np.asarray(x.objective), 1e3) for x in found]
-        )[: len(points)]
-        excess = np.concatenate(
-            [np.where(np.asarray(x.valid)[:, None], np.asarray(x.exact_excess), 1e3) for x in found]
-        )[: len(points)]
+        found = evaluation.values(self.built, points)
+        f = np.where(found.valid, found.objective, 1e3)
+        excess = np.where(found.valid[:, None], found.exact_excess, 1e3)
         self.seen += np.where(np.all(excess <= 0, axis=1), f, np.inf).tolist()
         return f, excess
 
@@ -473,13 +466,27 @@ class LimitedJudge:
             0,
             np.asarray(self.seen),
             spent,
-            np.full(len(self.seen), time.perf_counter() - self.began),
+            np.full(len(self.seen), time.process_time() - self.began),
             self.points,
         )
 
 
-def _slsqp(judge: LimitedJudge, start: np.ndarray, everything: Any, steps: int) -> None:
-    """SciPy's SLSQP with a function that gives objective, excess and their slopes at once."""
+def slsqp(
+    everything: Callable[[np.ndarray], Any],
+    start: np.ndarray,
+    ranges: tuple[np.ndarray, np.ndarray],
+    steps: int,
+    tolerance: float,
+) -> None:
+    """SciPy's SLSQP with a function that gives objective, excess and their slopes at once.
+
+    Args:
+      everything: of a point, (p,), such a function; `start` is one.
+      start: where the search begins.
+      ranges: least and largest coordinates, (p,) each.
+      steps: at most.
+      tolerance: of the objective.
+    """
     kept: dict[bytes, Any] = {}
 
     def at(z: np.ndarray) -> Any:
@@ -488,14 +495,13 @@ def _slsqp(judge: LimitedJudge, start: np.ndarray, everything: Any, steps: int) 
         return kept[z.tobytes()]
 
     limit = {"type": "ineq", "fun": lambda z: -at(z)[1] - 1e-6, "jac": lambda z: -at(z)[3]}
-    bounds_ = list(zip(judge.low, judge.high, strict=True))
-    options = {"maxiter": steps, "ftol": 1e-8}
+    options = {"maxiter": steps, "ftol": tolerance}
     optimize.minimize(
         lambda z: at(z)[0],
         start,
         jac=lambda z: at(z)[2],
         method="SLSQP",
-        bounds=bounds_,
+        bounds=list(zip(*ranges, strict=True)),
         constraints=limit,
         options=options,
     )
@@ -517,25 +523,23 @@ def limited_searches(name: str, quick: bool) -> tuple[list[Search], float, ij.Tu
         "slope": lambda: evaluation.forward_derivatives(built, one),
     }
     seconds = interleaved(calls, 2 if quick else 10)
-    cost, began = seconds["slope"] / seconds["value"], time.perf_counter()
-    best = ij.tune(
-        scenario,
-        tunables,
-        goal,
-        effort=ij.tuning.Effort(iterations=4 if quick else 60),
-        progress=False,
-        **timing,
-        **study,
-    )
+    cost = seconds["slope"] / seconds["value"]
+
+    def tuned(iterations: int) -> ij.TuneResult:
+        effort = ij.tuning.Effort(iterations=iterations)
+        return ij.tune(scenario, tunables, goal, effort=effort, progress=False, **timing, **study)
+
+    tuned(1)  # compiles
+    began = time.process_time()
+    best = tuned(4 if quick else 60)
+    spent_seconds = time.process_time() - began
     history = best.history
     feasible = history["valid"] & np.all(history["excess"] <= 0, axis=-1)
     seen, spent = (
         np.where(feasible, history["objective"], np.inf).min(axis=1),
         best.probes + cost * history["evaluations"],
     )
-    searches = [
-        Search("iblf_jax tune", 0, seen, spent, np.full(len(seen), time.perf_counter() - began))
-    ]
+    searches = [Search("iblf_jax tune", 0, seen, spent, np.full(len(seen), spent_seconds))]
 
     judge = LimitedJudge(built)
 
@@ -559,7 +563,7 @@ def limited_searches(name: str, quick: bool) -> tuple[list[Search], float, ij.Tu
         )
 
     if runs == 1:  # the slope of a probability is that of a smoothed one
-        _slsqp(judge, z, exact, steps)
+        slsqp(exact, z, (judge.low, judge.high), steps, tolerance=1e-8)
         searches.append(judge.search("SLSQP, exact slopes", cost))
     judge = LimitedJudge(built)
 
@@ -578,7 +582,7 @@ def limited_searches(name: str, quick: bool) -> tuple[list[Search], float, ij.Tu
     rng = np.random.default_rng(0)
     drawn = z + rng.uniform(-1, 1, (1 if quick else 9, size))
     for start in [z, *np.clip(drawn, judge.low, judge.high)]:
-        _slsqp(judge, start, by_differences, steps)
+        slsqp(by_differences, start, (judge.low, judge.high), steps, tolerance=1e-8)
     searches.append(judge.search("SLSQP, 10 starts"))
     judge = LimitedJudge(built)
     ends = {
@@ -938,7 +942,7 @@ def main() -> None:
             "rollouts to 0.5 %",
             "values",
             "rollouts",
-            "seconds",
+            "processor s",
         ]
         report("Under limits", [*under, "cost of one"], limits, None if found else args.json)
     if not found:

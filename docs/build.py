@@ -160,6 +160,7 @@ def assemble() -> None:
     import barriers
     import choosing
     import field
+    import field_budget
     import flags
     import gallery
     import measured
@@ -198,6 +199,7 @@ def assemble() -> None:
     barriers.write(SOURCE / "theory")
     choosing.write(SOURCE / "how_to")
     field.write(SOURCE)
+    field_budget.write(SOURCE)
     measured.write(SOURCE / "benchmarks.md")
     shutil.copy(ROOT / "benchmarks" / "README.md", SOURCE / "lab_notes.md")
     shutil.copy(ROOT / "benchmarks" / "field" / "README.md", SOURCE / "add_an_entry.md")

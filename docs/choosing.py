@@ -10,18 +10,26 @@ import json
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from contents import ON_THIS_PAGE
 from measured import RESULTS, table
 
 
 class Advice(NamedTuple):
-    """When a law is the better choice, and when it is not."""
+    """What a law claims to keep, when it is the better choice, and when it is not."""
 
+    keeps: str
+    """The bounds that its theory covers; `NOTHING` if it claims none."""
     better: str
     worse: str
 
 
+NOTHING = ""
+POSITIONS = "positions"
+
+
 ADVICE = {
     "Backstepping(Integral)": Advice(
+        POSITIONS,
         "the certificate of the paper's theorem counts. It stays inside the bounds at 10 ms, where"
         " `Backstepping` with the other barriers does not, because those run at 2 to 4.4 times its"
         " gains: at twice its gains it leaves the bounds, too, and at its gains the other"
@@ -29,95 +37,121 @@ ADVICE = {
         "accuracy at a given effort counts; the other barriers have smaller errors",
     ),
     "Backstepping(Log)": Advice(
+        POSITIONS,
         "results are compared with the literature on logarithmic barriers",
         "the loop runs at 10 ms at the gains of this row, or the bounds are asymmetric and the"
         " plant has more than two levels",
     ),
     "Backstepping(Tan)": Advice(
+        POSITIONS,
         "the loop is fast; it has the least error of the four barriers",
         "there is a delay of 2 ms or more: at the gains of this effort it leaves the bounds",
     ),
     "Backstepping(TransformedError)": Advice(
+        POSITIONS,
         "the bounds are asymmetric and the law must be smooth",
         "the loop runs at 10 ms",
     ),
     "Backstepping(TransformedError), finite time": Advice(
+        POSITIONS,
         "the error must be in a band after a stated time; the error is 0.7 times that of the"
         " exponential decay at the same effort",
         "the loop runs at 10 ms; the gain near zero error is larger, and so is the ripple",
     ),
     "Backstepping(Integral), q measured": Advice(
+        POSITIONS,
         "the velocity is not measured, or the encoder is noisy: it has the least ripple of the"
         " table",
         "a certificate is needed; there is none for estimated velocities",
     ),
     "Saturated(auxiliary)": Advice(
+        "positions and torque",
         "the torque has a limit that is reached for a short time only, and a certificate must"
         " cover it; here the limit is 7 N m",
         "the limit is below the torque of the motion: with 1.3 times the masses it leaves the"
         " bounds",
     ),
     "AdaptiveParameters(masses)": Advice(
+        POSITIONS,
         "a claim for constant masses that are unknown is needed. The table does not show that it is"
-        " better with wrong masses: its error is 14 mrad, and that of `Backstepping(Integral)`"
-        " 1.1 mrad",
+        " better with wrong masses: its error is 14 mrad with its own gains, and that of"
+        " `Backstepping(Integral)` 1.1 mrad",
         "there are other disturbances, as here: it uses no observer, its error is ten times that"
         " of `Backstepping(Integral)`, and wrong masses raise it by a factor of 3.6, in place of"
         " 2.9",
     ),
     "AdaptiveRBF": Advice(
+        POSITIONS,
         "there is no model; wrong masses raise its error by a smaller factor than that of"
         " `Backstepping(Integral)`",
-        "there is a model, or the peak torque counts: it has the largest one of the table",
+        "there is a model, or the peak torque counts: with its own gains it has the largest one of"
+        " the table",
     ),
     "AdaptiveRBF, normalised": Advice(
-        "there is no model; error and peak torque are smaller than those of the Gaussians",
+        POSITIONS,
+        "there is no model; with the same k1 and K2 and other rates of adaptation, error and peak"
+        " torque are smaller than those of the Gaussians",
         "there is a model, or the loop is slow or has a delay: it leaves the bounds at 10 ms",
     ),
     "Backstepping, no bounds": Advice(
-        "there are no bounds to keep", "a start or a disturbance comes near a bound"
+        NOTHING, "there are no bounds to keep", "a start or a disturbance comes near a bound"
     ),
     "BarrierBackstepping(TransformedError)": Advice(
+        POSITIONS,
         "the plant has more than two levels, or several levels have bounds; it has the least error"
         " of the laws that keep bounds",
         "the sensor is noisy: its ripple is more than twice that of `Backstepping(Integral)`",
     ),
     "BarrierBackstepping(Integral, Integral)": Advice(
+        "positions and velocities",
         "positions and velocities have bounds",
         "the masses are uncertain: with masses that are 30 % wrong its error is six times as large",
     ),
     "DynamicSurface": Advice(
+        POSITIONS,
         "derivatives of the virtual control are too expensive; its row is close to that of"
         " `Backstepping(Integral)`, which has exact derivatives",
         "a claim of asymptotic stability is needed: its filter leaves ultimate boundedness",
     ),
     "SurfaceBarrier": Advice(
+        "a sum of position and velocity",
         "one barrier on the combination of position and velocity suffices",
         "each position has a bound of its own: it leaves the bounds here",
     ),
     "SafetyFilter": Advice(
+        POSITIONS,
         "a law without bounds exists already and must not leave them",
         "the loop is slow: at 10 ms it keeps the bounds, but with a large error",
     ),
     "ReferenceGovernor": Advice(
+        POSITIONS,
         "the law of the robot's controller cannot be changed, only its reference",
         "the reference must be followed closely: the governor moves it, and the error is more than"
         " a hundred times that of `Backstepping(Integral)`",
     ),
     "TerminalSlidingMode": Advice(
+        NOTHING,
         "accuracy counts and no bound has to be guaranteed; it has the least errors of the table",
         "a bound must be kept: it stayed inside here, but claims nothing about bounds",
     ),
     "ComputedTorque": Advice(
+        NOTHING,
         "the model is good and there are no bounds",
         "disturbances act: with 6.7 times its gains, its error is more than four times that of"
         " `Backstepping(Integral)`",
     ),
     "PDGravity": Advice(
-        "only the gravity of the model is known", "the masses are uncertain or the loop is slow"
+        NOTHING,
+        "only the gravity of the model is known",
+        "the masses are uncertain or the loop is slow",
     ),
 }
 """Law of the table -> what its theory and its row say."""
+
+OWN = "own"
+"""The factor of a law that no factor gives the effort of the first one; its gains are its own."""
+SLOW = "error, encoder and 10 ms [mrad]"
+WRONG = "error, masses +-30 % [mrad]"
 
 LOWER_IS_BETTER = (
     "error [mrad]",
@@ -138,32 +172,53 @@ def write(folder: Path) -> None:
 def page(result: dict[str, Any]) -> str:
     """The page of a result of `benchmarks/laws.py`."""
     rows = result["rows"]
-    advice = []
-    for name in (row["law"] for row in rows):
-        better, worse = ADVICE[name]
-        advice.append({"law": name, "the better choice where": better, "not where": worse})
     return "\n".join(
         [
             "# Choosing a law",
             "",
-            "The gains of every law are scaled by one factor to the same {term}`effort`, the RMS"
-            " torque above gravity of the first law, on the paper's arm with K2 = 2 N m s/rad. A"
-            " law that reaches this effort with no factor runs at its own gains ('own'); compare"
-            f" its torques as well as its errors. {of_own_gains(rows)} The effort is that of the"
-            " entire run, and most of it belongs to the start. Errors are the largest ones in the"
-            " second half of a run. 'left' is a run that leaves the bounds or diverges. The program"
-            f" that measures the table describes every column: `{result['command']}`.",
+            f"Four questions lead to a law, and {len(rows)} laws on one task show with numbers what"
+            " the choice costs. `ij.compare` gives the numbers of a scenario of your own.",
             "",
-            table(rows),
+            ON_THIS_PAGE,
             "",
-            "## What the numbers say",
+            "## Four questions",
+            "",
+            *four_questions(result),
+            "",
+            "## The table",
+            "",
+            "One arm, one motion and one disturbance. One factor on all gains of a law gives it the"
+            " {term}`effort` of the first law, where there is such a factor; a law without one runs"
+            " at gains of its own ('own'), and its errors are not comparable. The laws are not"
+            " tuned: [the same budget of tuning](../field_equal_budget.md) for each law is another"
+            " page. Errors are the largest ones in the second half of a run. 'left' is a run that"
+            " leaves the bounds or diverges. *Keeps bounds* says what the theory of a law covers,"
+            " with continuous time and its own gains; 'left' in the other columns says where that"
+            " did not suffice. The last section describes"
+            " [how it was measured](#how-it-was-measured).",
+            "",
+            table([with_bounds(row) for row in rows]),
+            "",
+            "## Best and worst of each column",
+            "",
+            "Least and largest are those of the laws with a factor.",
             "",
             *best_of_each_column(rows),
             "",
-            "The ranking holds for this setting: one arm, one motion, one disturbance, one K2 and"
-            " one encoder; `ij.compare` gives the numbers of another scenario.",
+            "## Each law: where, and where not",
             "",
-            "## Why this gain and this encoder",
+            "A law with gains of its own has another effort than the others: what is said of its"
+            " error and theirs is what the table has, and not that one law is better.",
+            "",
+            table(advice(rows)),
+            "",
+            "## How it was measured",
+            "",
+            "The effort is the RMS torque above gravity of the entire run, on the paper's arm with"
+            f" K2 = 2 N m s/rad; most of it belongs to the start. {of_own_gains(rows)} The ranking"
+            " holds for this setting:"
+            " one arm, one motion, one disturbance, one K2 and one encoder. The program that"
+            f" measures the table describes every column: `{result['command']}`.",
             "",
             "With the paper's K2 = 20 N m s/rad the first law leaves the bounds at a period of"
             " 10 ms, also without an encoder. The reason is the period: the largest eigenvalue of"
@@ -175,22 +230,100 @@ def page(result: dict[str, Any]) -> str:
             "",
             table(result["settings"]),
             "",
-            "## Fewer messages",
-            "",
-            "An event trigger belongs to the loop and works with every law, so that it is no row of"
-            f" the table. {saving(result['messages'])}",
-            "",
-            "## When to take which",
-            "",
-            table(advice),
-            "",
         ]
     )
 
 
+def four_questions(result: dict[str, Any]) -> list[str]:
+    """The decision list; every number and every list of laws in it is one of the table."""
+    rows = {row["law"]: row for row in result["rows"]}
+    bounded = [name for name in rows if ADVICE[name].keeps]
+    slow = [name for name in bounded if isinstance(rows[name][SLOW], float)]
+    wrong = [name for name in bounded if not isinstance(rows[name][WRONG], float)]
+    first, measured = rows["Backstepping(Integral)"], rows["Backstepping(Integral), q measured"]
+    longest = max(rows[name][LONGEST] for name in bounded)
+    patient = [name for name in bounded if rows[name][LONGEST] == longest]
+    growth = first[WRONG] / first["error [mrad]"]
+    least = _least(slow, rows, SLOW)
+    factors = [rows[f"Backstepping({name})"]["factor"] for name in ("Log", "Tan")]
+    others = (
+        "`Backstepping` with the other barriers leaves the bounds there at the gains of the table,"
+        f" which are {min(factors):.2g} to {max(factors):.2g} times those of `Integral`; at the"
+        " same gains it stays inside (lab notes)."
+    )
+    return [
+        "1. **What is bounded?**",
+        "   - *Positions*: `Backstepping` with a barrier. Begin with `Integral`, whose theorem"
+        " `ij.certify` checks; the questions below say when to leave it.",
+        "   - *Positions and velocities, or several levels of a plant*: `BarrierBackstepping` with"
+        " a barrier for each.",
+        "   - *The torque, too*: `Saturated` around such a law; the limit must be above the torque"
+        " of the motion.",
+        "   - *The tip, or a law exists already*: `SafetyFilter` around it. If only the reference"
+        " of that law can be changed: `ReferenceGovernor`.",
+        "   - *Nothing*: `ComputedTorque`, or `TerminalSlidingMode` where accuracy counts.",
+        "2. **What is measured?**",
+        "   - *Positions and velocities*: every law.",
+        "   - *Positions only, or a noisy encoder*: `Backstepping` with `observers.StateObserver`."
+        f" Its ripple is {measured['ripple [N m]']:.2g} N m, and {first['ripple [N m]']:.2g} N m"
+        " with a filtered difference as velocity; there is no certificate for it.",
+        "3. **What is uncertain?**",
+        "   - *A disturbance*: a law with an observer, as in the first rows of the table.",
+        "   - *The masses*: the error of the first law grows by a factor of"
+        f" {growth:.2g} if they are 30 % wrong. Outside the bounds then: {_or(wrong)}. If a claim"
+        " for unknown masses is needed: `AdaptiveParameters`.",
+        "   - *The whole model*: `AdaptiveRBF`, which needs none.",
+        "4. **How fast is the loop?** `ij.recommended_period` computes the period of a scenario.",
+        f"   - *1 ms and faster*: {_least(bounded, rows)} has the least error of the laws that keep"
+        " bounds and have a factor.",
+        f"   - *10 ms*: {'; '.join(slow)}. Of those with a factor {least} has the"
+        f" least error ({rows[least][SLOW]:.2g} mrad). {others}",
+        f"   - *A delay*: up to {longest:g} ms {_or(patient)}.",
+        f"   - *Messages are expensive*: an event trigger, with any law. "
+        f"{saving(result['messages'])}",
+    ]
+
+
+def _or(names: list[str]) -> str:
+    """Names in a sentence; names of laws may have commas."""
+    return " or ".join(names) if len(names) < 3 else "; ".join(names)
+
+
+def _least(names: list[str], rows: dict[str, dict[str, Any]], column: str = "error [mrad]") -> str:
+    """The law with the least error, of those among some that have a factor."""
+    known = [name for name in names if is_comparable(rows[name], column)]
+    return min(known, key=lambda name: rows[name][column])
+
+
+def is_comparable(row: dict[str, Any], column: str) -> bool:
+    """Whether a law has the effort of the first one, and a number in a column."""
+    return row["factor"] != OWN and isinstance(row[column], float)
+
+
+def with_bounds(row: dict[str, Any]) -> dict[str, Any]:
+    """A row with the column "keeps bounds" behind the name of its law."""
+    numbers = {column: value for column, value in row.items() if column != "law"}
+    return {
+        "law": row["law"],
+        "keeps bounds": ADVICE[row["law"]].keeps or "no claim",
+        **numbers,
+    }
+
+
+def advice(rows: list[dict[str, Any]]) -> list[dict[str, str]]:
+    """The rows of the table that says where each law is the better choice."""
+    found = []
+    for row in rows:
+        name = row["law"]
+        _, better, worse = ADVICE[name]
+        law = f"{name}, own gains" if row["factor"] == OWN else name
+        found.append({"law": law, "the better choice where": better, "not where": worse})
+    return found
+
+
 def of_own_gains(rows: list[dict[str, Any]]) -> str:
     """How many laws have a factor, in a sentence."""
-    own = sum(row["factor"] == "own" for row in rows)
+    own = sum(row["factor"] == OWN for row in rows)
     return f"Of {len(rows)} laws {len(rows) - own} have a factor and {own} do not."
 
 
@@ -206,10 +339,12 @@ def saving(rows: list[dict[str, Any]]) -> str:
 
 
 def best_of_each_column(rows: list[dict[str, Any]]) -> list[str]:
-    """The best, the worst and the failed laws of each column; names of laws may have commas."""
+    """The best and the worst law of each column, of those with a factor, and all laws that leave
+    the bounds; names of laws may have commas.
+    """
     lines = []
     for column in LOWER_IS_BETTER:
-        known = [row for row in rows if isinstance(row[column], float)]
+        known = [row for row in rows if is_comparable(row, column)]
         best, worst = (f(known, key=lambda row: row[column]) for f in (min, max))
         text = (
             f"- **{column}**: least with {best['law']} ({best[column]:.3g}), largest with"

@@ -59,7 +59,11 @@ html_theme_options = {
     "home_page_in_toc": True,
     "use_download_button": False,
     "navbar_persistent": [],  # the sidebar has the search
-    "secondary_sidebar_items": {"**": ["page-toc.html"], "members": []},  # its tables are wide
+    "secondary_sidebar_items": {
+        "**": ["page-toc.html"],
+        "members": [],  # the tables of these two are wide
+        "how_to/choosing_a_law": [],
+    },
     "icon_links": [
         {"name": "Repository", "url": URLS["Repository"], "icon": "fa-brands fa-github"},
         {"name": "Paper", "url": URLS["Paper"], "icon": "fa-solid fa-file-lines"},

@@ -26,6 +26,7 @@ from typing import Any
 
 import alt_text
 import entry_tables
+from contents import ON_THIS_PAGE
 from matplotlib import pyplot
 from matplotlib.figure import Figure
 
@@ -173,14 +174,15 @@ def index() -> str:
     others = (
         "Published examples of other authors, in `benchmarks/field/entries`. Each page lists the"
         " printed, corrected and missing parameters, the published numbers beside those that this"
-        " package reached, and what was not reproduced. The"
-        " [benchmark of the field](../field.md) compares the laws of the package on those that are"
-        " measured."
+        " package reached, and what was not reproduced. On the tasks of some of them laws are"
+        " compared with [the same budget of tuning](../field_equal_budget.md)."
     )
     toctree = "```{toctree}\n:hidden:\n\n" + "\n".join(map(page_name, PAGES)) + "\n```"
     parts = [
         "# Gallery",
         words,
+        ON_THIS_PAGE,
+        "## Figures of the package",
         _cards(SCRIPTS),
         "(reproductions)=\n## Published examples",
         others,
@@ -204,7 +206,7 @@ def _cards(scripts: list[Path]) -> str:
             f":::{{grid-item-card}} {title}\n:link: {name}\n:link-type: doc\n:img-top:"
             f" {picture}\n:::"
         )
-    return "::::{grid} 1 2 3 3\n:gutter: 2\n\n" + "\n".join(cards) + "\n\n::::"
+    return "::::{grid} 2 3 4 4\n:gutter: 2\n\n" + "\n".join(cards) + "\n\n::::"
 
 
 def main() -> None:

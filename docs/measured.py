@@ -33,7 +33,7 @@ class Plot(NamedTuple):
 
 
 PLOTS = {
-    "latency": Plot(("row",), "ms", "A single run, as in a notebook; less is better."),
+    "latency": Plot(("row",), "processor ms", "A single run, as in a notebook; less is better."),
     "throughput": Plot(
         ("row", "type"),
         "steps/s per core",
@@ -101,7 +101,8 @@ PLOTS = {
         ("search",),
         "rollouts to 0.5 %",
         "Two gains under a torque limit and a margin: rollouts until 0.5 % above the best, and the"
-        " seconds of the entire search, in which the order is another one; less is better.",
+        " processor seconds of the entire search, in which the order is another one; less is"
+        " better.",
     ),
 }
 

@@ -11,6 +11,8 @@ import re
 from pathlib import Path
 from types import SimpleNamespace
 
+from contents import ON_THIS_PAGE
+
 from iblf_jax import (
     actuators,
     barriers,
@@ -42,6 +44,12 @@ FAMILIES = (
     ("Observers", observers, "`iblf_jax.observers`", ()),
     ("Robots", robots, "`iblf_jax.robots`", ()),
     ("Plants", plants, "`iblf_jax.plants`", ()),
+    (
+        "Restoring forces of a vessel",
+        SimpleNamespace(MEMBERS=plants.RESTORING),
+        "`iblf_jax.plants`",
+        (),
+    ),
     ("References", references, "`iblf_jax.references`", ()),
     ("Bounds", bounds, "`iblf_jax.bounds`", ()),
     ("Regions", regions, "`iblf_jax.regions`", ()),
@@ -97,7 +105,7 @@ def table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> list[str]:
 
 
 def systems() -> list[str]:
-    """The systems that the paper names, and what each is made of."""
+    """The systems that the paper names, and what each is made of; the members have the sources."""
     rows = []
     for name in (*controllers.LAWS, *controllers.KEEPERS):
         law = controllers.law_by_name(name)
@@ -109,13 +117,12 @@ def systems() -> list[str]:
             type(barrier).__name__ if barrier else "-",
             "none" if observer_of(name, usual) is not usual else "any",
         )
-        described = type(barrier) if isinstance(law, controllers.Backstepping) else type(law)
-        rows.append((f"`{name}`", *parts, cell(source(described))))
-    return table(("system", "law", "barrier", "observer", "source"), rows)
+        rows.append((f"`{name}`", *parts))
+    return table(("system", "law", "barrier", "observer"), rows)
 
 
 def text() -> str:
-    """The whole page."""
+    """The page."""
     lines = [
         "# Members",
         "",
@@ -123,6 +130,8 @@ def text() -> str:
         "",
         "The page lists all members of all families; the [reference](reference/index.md) documents"
         " their arguments.",
+        "",
+        ON_THIS_PAGE,
         "",
         "## Systems of the paper",
         "",
@@ -137,19 +146,10 @@ def text() -> str:
         rows = []
         for name, cls in module.MEMBERS.items():
             made = [cell(first_line(getattr(cls, claim))) for claim in claims]
-            rows.append(
-                (f"`{name}`", f"`{cls.__name__}`", cell(first_line(cls)), *made, cell(source(cls)))
-            )
-        lines += table(
-            (
-                "name",
-                "class",
-                "what it is",
-                *(claim.replace("_", " ") for claim in claims),
-                "source",
-            ),
-            rows,
-        )
+            names = f"`{name}` `{cls.__name__}`"
+            rows.append((names, cell(first_line(cls)), *made, cell(source(cls))))
+        of_claims = (claim.replace("_", " ") for claim in claims)
+        lines += table(("name and class", "what it is", *of_claims, "source"), rows)
     return "\n".join(lines) + "\n"
 
 

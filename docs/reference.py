@@ -50,8 +50,8 @@ PAGES: dict[str, tuple[str, str]] = {
     "proofs": (
         "Proofs",
         (
-            "prove Proof largest_level largest_parameters gains_for_guarantee GuaranteedGains"
-            " proofs.Verdict proofs.GrowthPoint proofs.GuaranteedTube"
+            "prove Proof largest_level largest_parameters largest_period gains_for_guarantee"
+            " GuaranteedGains proofs.Verdict proofs.GrowthPoint proofs.GuaranteedTube"
         ),
     ),
     "tuning": (

@@ -128,6 +128,7 @@ if TYPE_CHECKING:
     from iblf_jax.proofs import gains_for_guarantee as gains_for_guarantee
     from iblf_jax.proofs import largest_level as largest_level
     from iblf_jax.proofs import largest_parameters as largest_parameters
+    from iblf_jax.proofs import largest_period as largest_period
     from iblf_jax.proofs import prove as prove
     from iblf_jax.reports import report as report
     from iblf_jax.studies.compare import compare as compare
@@ -177,6 +178,7 @@ _ON_FIRST_USE = {
     "identify": ("iblf_jax.identification", "identify"),
     "largest_level": ("iblf_jax.proofs", "largest_level"),
     "largest_parameters": ("iblf_jax.proofs", "largest_parameters"),
+    "largest_period": ("iblf_jax.proofs", "largest_period"),
     "load": ("iblf_jax.files.results", "load"),
     "load_sweep": ("iblf_jax.studies.sweep", "load_sweep"),
     "monte_carlo": ("iblf_jax.studies.monte_carlo", "monte_carlo"),

@@ -10,8 +10,11 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import time
 from collections.abc import Callable
 
+STARTED = time.time()
+"""When this process began to load the package [s]."""
 INTERRUPTED = 130
 """Exit code of a process that was interrupted."""
 AT_END: list[Callable[[], None]] = []

@@ -30,6 +30,7 @@ from iblf_jax.core.status import FAILED, describe, has_flag
 from iblf_jax.core.tables import Table, number
 from iblf_jax.core.units import as_text
 from iblf_jax.simulation.paths import get, parameters, unit_at
+from iblf_jax.simulation.results import NUMBERED
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import PER_REGION
 from iblf_jax.simulation.units import status_words
@@ -145,10 +146,6 @@ def _scenario(scenario: Scenario) -> Shown:
         words.append(f"{plant.order} levels: {', '.join(texts[:-1])}; input: {texts[-1]}")
     content = {"Parts": _parts_of(scenario), "Parameters": leaves}
     return Shown("Scenario", words, content, figures, scenario)
-
-
-NUMBERED = tuple(f"violation_{what}" for what in ("joint", "region", "level", "component"))
-"""Ends of the names of metrics that are a number of something, -1 for none."""
 
 
 def metrics_table(runs: Mapping[str, Rollout]) -> Table:

@@ -52,9 +52,8 @@ def _words(values) -> str:
 
 
 def _inertial(mass, centre, inertia) -> str:
-    return (
-        f'<inertial pos="{_words(centre)}" mass="{_words(mass)}" fullinertia="{_words(inertia)}"/>'
-    )
+    place = f'pos="{_words(centre)}" mass="{_words(mass)}"'
+    return f'<inertial {place} fullinertia="{_words(inertia)}"/>'
 
 
 def as_mjcf(arm: ij.robots.Arm) -> str:
@@ -63,15 +62,16 @@ def as_mjcf(arm: ij.robots.Arm) -> str:
         arm.carried,
         f'pos="{_words(arm.tip_position)}" quat="{_words(arm.tip_rotation)}"',
     )
-    inner = (
-        f'<site name="tip" {tip}/><body name="load"'
-        f" {tip}>{_inertial(carried.mass, carried.centre, carried.inertia)}</body>"
-    )
+    inner = f'<site name="tip" {tip}/>'
+    if carried.mass > 0.0:
+        inertial = _inertial(carried.mass, carried.centre, carried.inertia)
+        inner += f'<body name="load" {tip}>{inertial}</body>'
     for i in reversed(range(arm.n)):
         kind = {"revolute": "hinge", "prismatic": "slide"}[arm.kinds[i]]
         joint = (
             f'<joint name="{arm.joints[i]}" type="{kind}" axis="{_words(arm.axis[i])}"'
-            f' armature="{_words(arm.armature[i])}"/>'
+            f' armature="{_words(arm.armature[i])}" damping="{_words(arm.damping[i])}"'
+            f' frictionloss="{_words(arm.friction[i])}"/>'
         )
         place = f'pos="{_words(arm.position[i])}" quat="{_words(arm.rotation[i])}"'
         inertial = _inertial(arm.mass[i], arm.centre[i], arm.inertia[i])
@@ -107,17 +107,14 @@ def dynamics_of(model, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def loop_on(arm, law, **parts) -> ij.Scenario:
-    """A law on an `independent_arm.TwoLinkArm`, which follows a sinusoid inside wide bounds."""
-    plant = ij.robots.TwoLink(
-        mass=arm.mass, length=arm.length, centre=arm.centre, inertia=arm.inertia, g=arm.g
-    )
+    """A law on the arm of an `independent.Loop`, which follows a sinusoid inside wide bounds."""
+    numbers = arm.mass, arm.length, arm.centre, arm.inertia
+    plant = ij.robots.TwoLink(*numbers, g=arm.g)
     values = {"initial": ij.Initial(q=[0.45, 0.2], dq=[0.1, 0.2])} | parts
     return canonical(
         ij.Scenario(
             plant=plant,
-            reference=ij.references.Sinusoid(
-                offset=0.3, amplitude=0.2, frequency=1.5, phase=[0.0, 0.4]
-            ),
+            reference=ij.references.Sinusoid(0.3, 0.2, 1.5, phase=[0.0, 0.4]),
             bounds=ij.Bounds(lower=ij.bounds.Constant(-0.5), upper=ij.bounds.Constant(1.5)),
             controller=law,
             **values,

@@ -67,16 +67,10 @@ def pendulum() -> Pendulum:
     return Pendulum(D=other.D, B=other.B, N=other.N, M=other.M, H=other.H, Km=other.KM)
 
 
-def _arm() -> ij.robots.TwoLink:
-    return ij.robots.TwoLink(
-        mass=other.MASS, length=other.LENGTH, centre=other.CENTRE, inertia=other.INERTIA
-    )
-
-
 PLANTS = {
     "coupled": lambda: plants.StrictFeedback(_table_drift, _table_gain, n=2, order=3),
     "flexible": lambda: plants.FlexibleJoint(
-        _arm(),
+        ij.robots.TwoLink(other.MASS, other.LENGTH, other.CENTRE, other.INERTIA),
         stiffness=other.STIFFNESS,
         motor_inertia=other.MOTOR_INERTIA,
         motor_damping=other.MOTOR_DAMPING,
@@ -98,9 +92,20 @@ def _disturbance(name: str):
         parts = [_sinusoids({key: [value[i]] for key, value in rows.items()}) for i in (0, 1)]
         return disturbances.Levels((None, *parts))
     rows = other.COUPLED_DISTURBANCE
-    return disturbances.Levels(
-        tuple(_sinusoids({key: value[i] for key, value in rows.items()}) for i in range(3))
-    )
+    levels = ({key: value[i] for key, value in rows.items()} for i in range(3))
+    return disturbances.Levels(tuple(_sinusoids(level) for level in levels))
+
+
+@jax.jit
+def commands(scenario: ij.Scenario, points: dict[str, jax.Array]) -> controllers.Command:
+    """What a law commands at points of the independent program."""
+
+    def at(point):
+        state = point.get("beta", ())
+        t, x, d_hat = (point[name] for name in ("t", "x", "d_hat"))
+        return scenario.controller.command(t, x, d_hat, scenario.context, state)[0]
+
+    return jax.vmap(at)(points)
 
 
 def scenario(name: str, **parts) -> ij.Scenario:

@@ -3,13 +3,14 @@ second opinion.
 
 Two-link arm, sinusoidal reference and bounds, the disturbance (4.3), the law (3.14) with either
 barrier and either variant, its observer.  alpha' is derived by hand here, and by automatic
-differentiation there.
+differentiation there.  Programs of other laws take the arm, the bounds and alpha from here.
 """
 
 from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -26,6 +27,15 @@ def sine(offset, amplitude, frequency, phase):
         return offset + amplitude * s, amplitude * frequency * c, -amplitude * frequency**2 * s
 
     return at
+
+
+class Virtual(NamedTuple):
+    """e1, its bound k on the side that it is on, alpha and alpha'."""
+
+    e1: np.ndarray
+    k: np.ndarray
+    alpha: np.ndarray
+    dalpha: np.ndarray
 
 
 @dataclass
@@ -69,6 +79,35 @@ class Loop:
         dM = -p3 * sin2 * np.array([[2.0, 1.0], [1.0, 0.0]])
         return M, C, G, dM
 
+    def inverse_dynamics(self, q, v, acceleration):
+        """M q" + C v + G."""
+        M, C, G, _ = self.arm(q)
+        return M @ acceleration + C(v) @ v + G
+
+    def acceleration(self, q, v, tau):
+        """q" under a torque."""
+        M, C, G, _ = self.arm(q)
+        return np.linalg.solve(M, tau - C(v) @ v - G)
+
+    def disturbance(self, t, q, v):
+        """(4.3), which the law does not know."""
+        M, C, _, _ = self.arm(q)
+        return M @ sine(*self.force_a)(t)[0] + C(v) @ sine(*self.force_b)(t)[0]
+
+    def virtual(self, t, q, v) -> Virtual:
+        """The virtual velocity of the paper's barriers, kappa included."""
+        (xd, dxd, ddxd), (lo, dlo, ddlo), (up, dup, ddup) = (
+            sine(*x)(t) for x in (self.reference, self.lower, self.upper)
+        )
+        kl, dkl, ddkl = xd - lo, dxd - dlo, ddxd - ddlo
+        ku, dku, ddku = up - xd, dup - dxd, ddup - ddxd
+        e1, ru, rl = q - xd, dku / ku, dkl / kl
+        kappa = np.sqrt(ru**2 + rl**2 + self.o)
+        dkappa = (ru * (ddku / ku - ru**2) + rl * (ddkl / kl - rl**2)) / kappa
+        gain = self.k1 + kappa
+        dalpha = ddxd - dkappa * e1 - gain * (v - dxd)
+        return Virtual(e1, np.where(e1 > 0, ku, kl), dxd - gain * e1, dalpha)
+
     def evaluate(self, t, x, since=None):
         """The rate of (q, q', eta), and what the package records.
 
@@ -76,24 +115,7 @@ class Loop:
         """
         q, v, eta = x[:2], x[2:4], x[4:]
         M, C, G, dM_dq2 = self.arm(q)
-        xd, dxd, ddxd = sine(*self.reference)(t)
-        lo, dlo, ddlo = sine(*self.lower)(t)
-        up, dup, ddup = sine(*self.upper)(t)
-        kl, dkl, ddkl, ku, dku, ddku = (
-            xd - lo,
-            dxd - dlo,
-            ddxd - ddlo,
-            up - xd,
-            dup - dxd,
-            ddup - ddxd,
-        )
-        e1 = q - xd
-        ru, rl = dku / ku, dkl / kl
-        kappa = np.sqrt(ru**2 + rl**2 + self.o)
-        dkappa = (ru * (ddku / ku - ru**2) + rl * (ddkl / kl - rl**2)) / kappa
-        gain = self.k1 + kappa
-        alpha, dalpha = dxd - gain * e1, ddxd - dkappa * e1 - gain * (v - dxd)
-        k = np.where(e1 > 0, ku, kl)
+        e1, k, alpha, dalpha = self.virtual(t, q, v)
         xi = e1 / k
         if self.p is None:
             slope, V1 = 2 * e1 / (k**2 - e1**2), -np.log(1 - xi**2)
@@ -102,67 +124,35 @@ class Loop:
             slope, V1 = e1 ** (m - 1) / (k**m - e1**m), -np.log(1 - xi**m) / m
         e2 = v - alpha
         f_hat = eta + self.kf * (M @ v)
-        tau = (
-            C(v) @ (alpha if self.corrected else v) + G + M @ dalpha - f_hat - self.K2 * e2 - slope
-        )
-        f = M @ sine(*self.force_a)(t)[0] + C(v) @ sine(*self.force_b)(t)[0]
-        f = f + sum(
-            (
-                np.asarray(size)
-                for time, size in self.steps
-                if time <= (t if since is None else since)
-            ),
-            np.zeros(2),
-        )
-        ddq = np.linalg.solve(M, tau + f - C(v) @ v - G)
-        known = (
-            tau - C(v) @ v - G + self.kf * (M @ v) + (dM_dq2 * v[1] @ v if self.corrected else 0.0)
-        )
+        moving = alpha if self.corrected else v
+        tau = C(v) @ moving + G + M @ dalpha - f_hat - self.K2 * e2 - slope
+        appeared = t if since is None else since
+        f = self.disturbance(t, q, v)
+        f = f + sum((np.asarray(x) for time, x in self.steps if time <= appeared), np.zeros(2))
+        ddq = self.acceleration(q, v, tau + f)
+        rate = dM_dq2 * v[1] @ v if self.corrected else 0.0
+        known = tau - C(v) @ v - G + self.kf * (M @ v) + rate
         deta = -self.kf * eta - self.kf * known
         V = V1.sum() + 0.5 * e2 @ M @ e2 + 0.5 * (f - f_hat) @ (f - f_hat)
-        return np.concatenate([v, ddq, deta]), {
-            "tau": tau,
-            "e1": e1,
-            "e2": e2,
-            "xi": xi,
-            "V": V,
-            "f": f,
-            "f_hat": f_hat,
-            "alpha": alpha,
-        }
+        recorded = {"tau": tau, "e1": e1, "e2": e2, "xi": xi, "V": V, "f": f}
+        return np.concatenate([v, ddq, deta]), recorded | {"f_hat": f_hat, "alpha": alpha}
 
     def solve(self, times, rtol=1e-11):
         """The run at these times, by DOP853: name -> (T, ...)."""
-        x0 = np.concatenate([self.q0, self.dq0, np.zeros(2)])
+        start = np.concatenate([self.q0, self.dq0, np.zeros(2)])
+        how = {"method": "DOP853", "t_eval": times, "rtol": rtol, "atol": 0.01 * rtol}
         span = (0.0, float(times[-1]))
-        solution = solve_ivp(
-            lambda t, x: self.evaluate(t, x)[0],
-            span,
-            x0,
-            "DOP853",
-            t_eval=times,
-            rtol=rtol,
-            atol=0.01 * rtol,
-        )
-        outputs = [self.evaluate(t, x)[1] for t, x in zip(times, solution.y.T, strict=True)]
-        return {
-            "q": solution.y[:2].T,
-            "dq": solution.y[2:4].T,
-            **{k: np.array([o[k] for o in outputs]) for k in outputs[0]},
-        }
+        y = solve_ivp(lambda t, x: self.evaluate(t, x)[0], span, start, **how).y
+        outputs = [self.evaluate(t, x)[1] for t, x in zip(times, y.T, strict=True)]
+        found = {name: np.array([x[name] for x in outputs]) for name in outputs[0]}
+        return {"q": y[:2].T, "dq": y[2:4].T, **found}
 
     def end(self, duration, rtol=1e-12):
         """The state at the end of a run whose integration is split where a step appears."""
         x = np.concatenate([self.q0, self.dq0, np.zeros(2)])
         cuts = [0.0, *sorted({time for time, _ in self.steps if 0.0 < time < duration}), duration]
         for a, b in itertools.pairwise(cuts):
-            found = solve_ivp(
-                lambda t, x, a=a: self.evaluate(t, x, since=a)[0],
-                (a, b),
-                x,
-                "DOP853",
-                rtol=rtol,
-                atol=0.01 * rtol,
-            )
-            x = found.y[:, -1]
+            how = {"method": "DOP853", "rtol": rtol, "atol": 0.01 * rtol}
+            x = solve_ivp(lambda t, x, a=a: self.evaluate(t, x, since=a)[0], (a, b), x, **how)
+            x = x.y[:, -1]
         return x

@@ -1,52 +1,20 @@
 """Adaptive laws in NumPy, written from the equations and from nothing of the package.
 
 The two-link arm has torques that are linear in (m1, m2, payload), with the regressor written out by
-hand; alpha' and the rates of all weights are derived by hand.  The bounds and the reference are
-those of the paper.
+hand, and so are the rates of all weights.  Bounds, reference and alpha are those of
+`independent.Loop`.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
-from scipy.integrate import solve_ivp
+from independent import Loop
 from scipy.stats import qmc
 
 LENGTH, CENTRE, INERTIA, G = (0.35, 0.31), (0.175, 0.155), (0.06125, 0.02042125), 9.81
-
-
-def two(x):
-    return np.asarray(x, float) * np.ones(2)
-
-
-@dataclass
-class Tracking:
-    """Reference, bounds and virtual velocity, kappa included."""
-
-    k1: np.ndarray = field(default_factory=lambda: two(2.0))
-    K2: np.ndarray = field(default_factory=lambda: two(20.0))
-    o: float = 0.1
-
-    def at(self, t, q, v):
-        """alpha, alpha', e1, the bound k of its side."""
-        s, c = math.sin(t), math.cos(t)
-        xd = np.array([0.5 + 0.14 * s, 0.5 + 0.14 * c])
-        dxd, ddxd = 0.14 * np.array([c, -s]), -0.14 * np.array([s, c])
-        # both bounds are 0.14 (cos t, sin t) and a constant
-        moving = 0.14 * np.array([c, s])
-        dmoving, ddmoving = 0.14 * np.array([-s, c]), -moving
-        kl, ku = xd - 0.2 - moving, 0.9 + moving - xd
-        dkl, ddkl = dxd - dmoving, ddxd - ddmoving
-        dku, ddku = -dkl, -ddkl
-        e = q - xd
-        a, b = dku / ku, dkl / kl
-        kappa = np.sqrt(a * a + b * b + self.o)
-        dkappa = (a * (ddku / ku - a * a) + b * (ddkl / kl - b * b)) / kappa
-        alpha = dxd - (self.k1 + kappa) * e
-        dalpha = ddxd - dkappa * e - (self.k1 + kappa) * (v - dxd)
-        return alpha, dalpha, e, np.where(e > 0, ku, kl)
 
 
 def regressor(q, v, u, a):
@@ -60,63 +28,62 @@ def regressor(q, v, u, a):
     of_p3 = np.array([first, cos2 * a[0] + sin2 * v[0] * u[0]])
     of_p4, of_p5 = np.array([g1, 0.0]), np.array([g12, g12])
     P = np.stack([of_p1, of_p2, of_p3, of_p4, of_p5], axis=1)
-    lumped = np.array(
-        [
-            [c1**2, l1**2, l1**2],
-            [0.0, c2**2, l2**2],
-            [0.0, l1 * c2, l1 * l2],
-            [c1, l1, l1],
-            [0.0, c2, l2],
-        ]
-    )
+    of_m1, of_m2 = [c1**2, 0.0, 0.0, c1, 0.0], [l1**2, c2**2, l1 * c2, l1, c2]
+    of_payload = [l1**2, l2**2, l1 * l2, l1, l2]
+    lumped = np.stack([of_m1, of_m2, of_payload], axis=1)
     Y0 = P @ np.array([INERTIA[0], INERTIA[1], 0.0, 0.0, 0.0])
     return Y0, P @ lumped
 
 
 def acceleration(theta, q, v, tau):
     """q" of the arm with (m1, m2, payload) = theta under a torque."""
+
+    def torque(u, a):
+        Y0, Y = regressor(q, v, u, a)
+        return Y0 + Y @ theta
+
     zero = np.zeros(2)
-    Y0, Y = regressor(q, v, v, zero)
-    rest = tau - Y0 - Y @ theta
-    columns = []
-    for i in range(2):
-        unit = np.eye(2)[i]
-        B0, B = regressor(q, zero, zero, unit)
-        N0, N = regressor(q, zero, zero, zero)
-        columns.append(B0 + B @ theta - N0 - N @ theta)
-    return np.linalg.solve(np.stack(columns, axis=1), rest)
+    rest = torque(zero, zero)
+    M = np.stack([torque(zero, unit) - rest for unit in np.eye(2)], axis=1)
+    return np.linalg.solve(M, tau - torque(v, zero))
 
 
-def projected(theta, rate, lower, upper, band):
-    room = np.where(rate > 0, upper - theta, theta - lower) / band
-    return rate * np.minimum(np.maximum(room, 0.0), 1.0)
+@dataclass(kw_only=True)
+class Adapted:
+    """Numbers that adapt between limits, with a leak to their start."""
+
+    start: np.ndarray
+    Gamma: np.ndarray
+    sigma: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    band: np.ndarray
+
+    def adaptation(self, theta, learned):
+        rate = -self.Gamma * (learned + self.sigma * (theta - self.start))
+        room = np.where(rate > 0, self.upper - theta, theta - self.lower) / self.band
+        return rate * np.minimum(np.maximum(room, 0.0), 1.0)
 
 
-@dataclass
-class AdaptiveArm(Tracking):
+@dataclass(kw_only=True)
+class AdaptiveArm(Adapted):
     """Integral barrier, adapting (m1, m2, payload)."""
 
-    true: np.ndarray = None
-    start: np.ndarray = None
-    Gamma: np.ndarray = None
-    sigma: np.ndarray = None
-    lower: np.ndarray = None
-    upper: np.ndarray = None
-    band: np.ndarray = None
+    loop: Loop
+    true: np.ndarray
 
     def rate(self, t, x):
         q, v, theta = x[:2], x[2:4], x[4:]
-        alpha, dalpha, e, k = self.at(t, q, v)
+        e, k, alpha, dalpha = self.loop.virtual(t, q, v)
         Y0, Y = regressor(q, v, alpha, dalpha)
         e2 = v - alpha
-        tau = Y0 + Y @ theta - self.K2 * e2 - 2 * e / (k**2 - e**2)
-        push = -self.Gamma * (Y.T @ e2 + self.sigma * (theta - self.start))
-        dtheta = projected(theta, push, self.lower, self.upper, self.band)
+        tau = Y0 + Y @ theta - self.loop.K2 * e2 - 2 * e / (k**2 - e**2)
+        dtheta = self.adaptation(theta, Y.T @ e2)
         return np.concatenate([v, acceleration(self.true, q, v, tau), dtheta])
 
 
 @dataclass
-class Approximator(Tracking):
+class Approximator(Loop):
     """Logarithmic barrier; spans of the inputs 0.5, 1, 3 around 0.5."""
 
     mass: np.ndarray = None
@@ -128,7 +95,7 @@ class Approximator(Tracking):
 
     def parts(self, t, x):
         q, v = x[:2], x[2:4]
-        alpha, dalpha, e, k = self.at(t, q, v)
+        e, k, alpha, dalpha = self.virtual(t, q, v)
         e2 = v - alpha
         return q, v, e2, -self.K2 * e2 - e / (k**2 - e**2), self.inputs(q, v, alpha, dalpha)
 
@@ -149,17 +116,10 @@ class Fuzzy(Approximator):
     def rate(self, t, x):
         q, v, e2, tau, z = self.parts(t, x)
         W = x[4:].reshape(self.nodes, 2)
-        fired = np.array(
-            [
-                math.prod(
-                    math.exp(-(((a - b) / self.width) ** 2)) for a, b in zip(z, c, strict=True)
-                )
-                for c in sobol(self.nodes, 8)
-            ]
-        )
-        share = fired / sum(fired)
-        dW = np.array([[-self.Gamma[i] * (s * e2[i] + self.sigma[i] * w[i]) for i in range(2)]
-                       for s, w in zip(share, W, strict=True)])  # fmt: skip
+        distances = (z - sobol(self.nodes, 8)) / self.width
+        fired = np.prod(np.exp(-(distances**2)), axis=1)
+        share = fired / np.sum(fired)
+        dW = -self.Gamma * (np.outer(share, e2) + self.sigma * W)
         return np.concatenate([v, acceleration(self.mass, q, v, tau + share @ W), dW.ravel()])
 
 
@@ -186,8 +146,8 @@ class HiddenLayer(Approximator):
         return np.concatenate([v, acceleration_, dW.ravel(), dV.ravel()])
 
 
-@dataclass
-class AdaptivePendulum:
+@dataclass(kw_only=True)
+class AdaptivePendulum(Adapted):
     """x1' = x2, D x2' = x3 - B x2 - N sin x1, M x3' = u - H x3 - Km x2, quadratic barriers, and H
     and Km that adapt; the reference is sin(1.5 t)."""
 
@@ -199,12 +159,6 @@ class AdaptivePendulum:
     Km: float
     k: np.ndarray
     w: np.ndarray
-    start: np.ndarray
-    Gamma: np.ndarray
-    sigma: np.ndarray
-    lower: np.ndarray
-    upper: np.ndarray
-    band: np.ndarray
 
     def rate(self, t, x):
         x1, x2, x3 = x[:3]
@@ -225,15 +179,6 @@ class AdaptivePendulum:
         e3 = x3 - alpha2
         wanted = dalpha2 - k3 * e3 - w2 / w3 * e2 / self.D
         u = self.M * wanted + theta[0] * x3 + theta[1] * x2
-        push = -self.Gamma * (
-            np.array([x3, x2]) * w3 * e3 / self.M + self.sigma * (theta - self.start)
-        )
-        dtheta = projected(theta, push, self.lower, self.upper, self.band)
+        dtheta = self.adaptation(theta, np.array([x3, x2]) * w3 * e3 / self.M)
         dx3 = (u - self.H * x3 - self.Km * x2) / self.M
         return np.concatenate([[x2, dx2, dx3], dtheta])
-
-
-def end(program, x, duration):
-    """The state at the end of a run, by DOP853."""
-    found = solve_ivp(program.rate, (0.0, duration), x, "DOP853", rtol=1e-12, atol=1e-13)
-    return found.y[:, -1]

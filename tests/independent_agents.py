@@ -21,7 +21,6 @@ alpha' is the imaginary part of one complex step, which is exact to rounding.
 from __future__ import annotations
 
 import numpy as np
-from scipy.integrate import solve_ivp
 
 ADJACENCY = np.array([[0, 0, 0.5, 0], [1, 0, 0, 0], [0, 0.8, 0, 0.3], [0, 0, 1.2, 0]], float)
 LEADER = np.array([1.0, 0.0, 0.0, 0.4])
@@ -40,13 +39,11 @@ W1 = np.array([1.0, 0.7, 1.2, 0.4])
 W2 = np.array([0.9, 1.1, 1.0, 1.3])
 MU = np.array([0.02, 0.03, 0.025, 0.015])
 P0 = np.array([0.2, 0.3, 0.1, 0.25])
-END = 2.0
 
 M = INERTIA + MASS * CENTRE**2
 
 
 def gravity(p):
-    """m g c cos p."""
     return MASS * G * CENTRE * np.cos(p)
 
 
@@ -99,21 +96,3 @@ def field(t, state, distributed):
         u, dbeta = input_with_graph(t, y, v)[0], np.zeros(0)
     acceleration = (u - gravity(np.linalg.solve(H, y))) / M
     return np.concatenate([H @ v, acceleration, dbeta])
-
-
-def trajectory(times, distributed):
-    """The state at some times, from rest at `P0`."""
-    y, v = H @ P0, np.zeros(4)
-    start = [y, v, distributed_alpha(0.0, y, v)] if distributed else [y, v]
-    span = (0.0, float(times[-1]))
-    found = solve_ivp(
-        field,
-        span,
-        np.concatenate(start),
-        "DOP853",
-        times,
-        args=(distributed,),
-        rtol=1e-12,
-        atol=1e-13,
-    )
-    return found.y.T

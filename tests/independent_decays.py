@@ -4,7 +4,7 @@ opinion.
 `Powers` and `Prescribed` are the gains g(t, V) that are added to the constant gain of a level, for
 numbers and for the power series of `independent_chains`, whose cases may have one for each level.
 
-`Arm` is the closed loop of a two-link arm under TransformedError and
+`Arm` is the law of a two-link arm under TransformedError,
 
     tau = C alpha + G + M alpha' - K2 e2 - s - g2(t, W) M e2,   W = 1/2 e2^T M e2,
 
@@ -13,13 +13,11 @@ with alpha' by complex steps along (1, q').
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 
 import independent
 import numpy as np
 from independent_chains import Series, exp, log
-from scipy.integrate import solve_ivp
 
 
 @dataclass(frozen=True)
@@ -64,7 +62,7 @@ class Prescribed:
 
 @dataclass
 class Arm(independent.Loop):
-    """The paper's arm under TransformedError, corrected, with decays and without friction."""
+    """The paper's arm under TransformedError, corrected, with decays."""
 
     first: object = None
     second: object = None
@@ -75,8 +73,7 @@ class Arm(independent.Loop):
 
     def mapped(self, t, q):
         """z, dz/dq and the rate of z at fixed e1."""
-        (x_d, _), (low, dlow), (up, dup) = self.tube(t)
-        dx_d = self.tube(t)[0][1]
+        (x_d, dx_d), (low, dlow), (up, dup) = self.tube(t)
         e, k_l, k_u = q - x_d, x_d - low, up - x_d
         dk_l, dk_u = dx_d - dlow, dup - dx_d
         room = (k_l + e) * (k_u - e)
@@ -92,7 +89,7 @@ class Arm(independent.Loop):
         return dx_d - (gain * z + z_t) / z_e
 
     def torque(self, t, q, dq):
-        """tau, e2 and M."""
+        """The command."""
         step = 1e-30
         alpha = self.alpha(t, q)
         dalpha = self.alpha(t + 1j * step, q + 1j * step * dq).imag / step
@@ -101,26 +98,7 @@ class Arm(independent.Loop):
         e2 = dq - alpha
         W = 0.5 * e2 @ M @ e2
         tau = C(dq) @ alpha + G + M @ dalpha - self.K2 * e2 - z * z_e
-        return tau - self.second.gain(t, W) * (M @ e2), e2, M
-
-    def rate(self, t, y):
-        """(q', q") without a disturbance."""
-        q, dq = y[:2], y[2:]
-        tau, _, M = self.torque(t, q, dq)
-        _, C, G, _ = self.arm(q)
-        return np.concatenate([dq, np.linalg.solve(M, tau - C(dq) @ dq - G)])
-
-    def run_at(self, times, least_smooth):
-        """States at some times by DOP853, with a step that ends at each time where a decay is least
-        smooth.
-        """
-        ends = sorted({*np.round(times, 9), *least_smooth})
-        y = np.concatenate([self.q0, self.dq0]).astype(float)
-        states = {ends[0]: y}
-        for begin, end in itertools.pairwise(ends):
-            y = solve_ivp(self.rate, (begin, end), y, "DOP853", rtol=1e-11, atol=1e-13).y[:, -1]
-            states[end] = y
-        return np.array([states[t] for t in np.round(times, 9)])
+        return tau - self.second.gain(t, W) * (M @ e2)
 
 
 def _sine_at(parts, t):

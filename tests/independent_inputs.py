@@ -17,58 +17,29 @@ import itertools
 
 import independent_chains as chains
 import numpy as np
-from independent import Loop, sine
+from independent import Loop
 from scipy.integrate import solve_ivp
 
 
 def limited_arm(loop: Loop, limit, k, t, y):
-    """The rate of y = (q, q', eta, lambda), and the torque, V2 and w s . lambda there."""
+    """The rate of y = (q, q', eta, lambda), and the torque and V2 there."""
     q, v, eta, aux = np.split(np.asarray(y, float), 4)
     M, C, G, dM_dq2 = loop.arm(q)
-    (xd, dxd, ddxd), low, up = (sine(*x)(t) for x in (loop.reference, loop.lower, loop.upper))
-    room_low = [a - b for a, b in zip((xd, dxd, ddxd), low, strict=True)]
-    room_up = [b - a for a, b in zip((xd, dxd, ddxd), up, strict=True)]
-    squares, products = loop.o, 0.0
-    for width, rate, second in (room_low, room_up):
-        share = rate / width
-        squares = squares + share**2
-        products = products + share * (second / width - share**2)
-    kappa = np.sqrt(squares)
-    e1 = q - xd
-    alpha = dxd - (loop.k1 + kappa) * e1
-    dalpha = ddxd - products / kappa * e1 - (loop.k1 + kappa) * (v - dxd)
+    e1, side, alpha, dalpha = loop.virtual(t, q, v)
     centre, centre_rate = alpha + aux, dalpha - k * aux
     z = v - centre
-    side = np.where(e1 > 0, room_up[0], room_low[0])
     slope = 2 * e1 / (side**2 - e1**2)
     f_hat = eta + loop.kf * (M @ v)
     tau = C(v) @ centre + G + M @ centre_rate - f_hat - loop.K2 * z - slope
     applied = np.minimum(np.maximum(tau, -limit), limit)
-    f = M @ sine(*loop.force_a)(t)[0] + C(v) @ sine(*loop.force_b)(t)[0]
-    inverse = np.linalg.inv(M)
+    f, inverse = loop.disturbance(t, q, v), np.linalg.inv(M)
     ddq = inverse @ (applied + f - C(v) @ v - G)
     dM = dM_dq2 * v[1]
     deta = -loop.kf * (f_hat + applied - C(v) @ v - G + dM @ v)
     daux = -k * aux + inverse @ (applied - tau)
     V1 = -np.log(1 - (e1 / side) ** 2)
     V = V1.sum() + 0.5 * z @ M @ z + 0.5 * (f - f_hat) @ (f - f_hat)
-    return np.concatenate([v, ddq, deta, daux]), {"tau": applied, "V": V, "growth": slope @ aux}
-
-
-def arm_run(loop: Loop, limit, k, times):
-    """(q, q', eta, lambda) at these times, (T, 8), by DOP853 with a small step."""
-    start = np.concatenate([loop.q0, loop.dq0, np.zeros(4)])
-    found = solve_ivp(
-        lambda t, y: limited_arm(loop, limit, k, t, y)[0],
-        (0.0, float(times[-1])),
-        start,
-        method="DOP853",
-        t_eval=times,
-        rtol=1e-10,
-        atol=1e-12,
-        max_step=2e-3,
-    )
-    return found.y.T
+    return np.concatenate([v, ddq, deta, daux]), {"tau": applied, "V": V}
 
 
 def limited_chain(case, limit, k, t, x, d_hat, aux):
@@ -126,14 +97,7 @@ def triggered_chain(case, period, delta, m, count, adjust=None):
             rows = y.reshape(case.order, case.n).tolist()
             return np.array(chains.flow(case, t, rows, held.tolist()), float).ravel()
 
-        found = solve_ivp(
-            rate,
-            (t, t + period),
-            np.ravel(x),
-            method="DOP853",
-            rtol=1e-11,
-            atol=1e-13,
-        )
+        found = solve_ivp(rate, (t, t + period), np.ravel(x), "DOP853", rtol=1e-11, atol=1e-13)
         x = found.y[:, -1].reshape(case.order, case.n).tolist()
         states.append(np.array(x))
         commands.append(held)

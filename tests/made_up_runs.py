@@ -73,9 +73,7 @@ jax.tree_util.register_pytree_node(Holder, lambda holder: ((), holder), lambda h
 
 
 def chain(n):
-    return ij.robots.PlanarChain(
-        mass=[1.0] * n, length=[0.3] * n, centre=[0.15] * n, inertia=[0.02] * n
-    )
+    return ij.robots.PlanarChain([1.0] * n, [0.3] * n, [0.15] * n, [0.02] * n)
 
 
 def made_up(plant, *, duration=4.0, dt=0.01, shift=0.0, status=0):
@@ -84,10 +82,8 @@ def made_up(plant, *, duration=4.0, dt=0.01, shift=0.0, status=0):
     joints = np.arange(plant.n)
     q_d = 0.5 + 0.2 * np.sin(t[:, None] + 0.5 * joints)
     e1 = 0.15 * np.exp(-3 * t[:, None]) * (1 + 0.1 * joints) + shift * np.sin(3 * t[:, None])
-    lower, upper = (
-        q_d - 0.3 - 0.05 * np.cos(t[:, None] + joints),
-        q_d + 0.4 + 0.05 * np.sin(t[:, None] + joints),
-    )
+    lower = q_d - 0.3 - 0.05 * np.cos(t[:, None] + joints)
+    upper = q_d + 0.4 + 0.05 * np.sin(t[:, None] + joints)
     f = 0.1 * np.cos(2 * t[:, None] + joints)
     arrays = {
         "t": t,

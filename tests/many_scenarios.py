@@ -11,16 +11,11 @@ import iblf_jax as ij
 from iblf_jax.core.programs import COMPILE_EVENT
 
 CHAIN = ij.robots.PlanarChain(mass=[1.0], length=[0.4], centre=[0.2], inertia=[0.02])
-REFERENCES = (
-    ij.references.Sinusoid(offset=0.0, amplitude=[0.1], frequency=1.0, phase=0.0),
-    ij.references.Quintic(start=[0.1], end=[0.2], duration=3.0),
-    ij.references.SmoothStep(start=[0.1], end=[0.2], duration=3.0),
-    *(
-        ij.references.WaypointSpline(
-            times=tuple(range(points)), waypoints=[[0.1 + 0.05 * (i % 2)] for i in range(points)]
-        )
-        for points in range(3, 8)
-    ),
+REFERENCES = tuple(
+    ij.references.WaypointSpline(
+        times=tuple(range(points)), waypoints=[[0.1 + 0.05 * (i % 2)] for i in range(points)]
+    )
+    for points in range(2, 10)
 )
 BARRIERS = (
     ij.barriers.Log(),

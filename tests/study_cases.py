@@ -24,22 +24,15 @@ def perturbations(mass=0.1, q=0.05):
     """Two perturbations by standard deviation; other numbers do not recompile."""
     import iblf_jax as ij
 
-    return {
-        "plant.mass[1]": ij.factor(ij.normal(1.0, mass)),
-        "initial.q": ij.offset(ij.normal(0.0, q)),
-    }
+    draws = {"plant.mass[1]": ij.factor(ij.normal(1.0, mass))}
+    return draws | {"initial.q": ij.offset(ij.normal(0.0, q))}
 
 
 def options():
     import iblf_jax as ij
 
-    return {
-        "duration": 0.02,
-        "dt": 1e-3,
-        "method": "euler",
-        "metrics": (ij.metrics.Margin(),),
-        "seed": 3,
-    }
+    run = {"duration": 0.02, "dt": 1e-3, "method": "euler"}
+    return run | {"metrics": (ij.metrics.Margin(),), "seed": 3}
 
 
 GRID = {"controller.K2": [10.0, 20.0, 40.0], "observer.kf": [10.0, 20.0]}
@@ -90,14 +83,14 @@ def study(runs=600, ways=None, **more):
     )
 
 
-def table(store=None, unit=UNIT, **more):
+def table(store=None, unit=UNIT, scenario=None, **more):
     """The small sweep; `store` is a path, or a `StoreOptions` that has its unit."""
     import iblf_jax as ij
 
     if store is not None and not isinstance(store, ij.studies.StoreOptions):
         store = ij.studies.StoreOptions(store, unit)
     return ij.sweep(
-        ij.presets.zhang_yan_2024(),
+        scenario or ij.presets.zhang_yan_2024(),
         GRID,
         perturbations=perturbations(),
         runs=RUNS,
@@ -140,12 +133,8 @@ def environment(cache: Path, **more: str) -> dict[str, str]:
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
     }
     path = os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH", "")]))
-    return (
-        os.environ
-        | chosen
-        | {"PYTHONPATH": path, "JAX_PLATFORMS": "cpu", "PYTHONUNBUFFERED": "1"}
-        | more
-    )
+    chosen |= {"PYTHONPATH": path, "JAX_PLATFORMS": "cpu", "PYTHONUNBUFFERED": "1"}
+    return os.environ | chosen | more
 
 
 def start(cache: Path, *words: str, **more: str) -> subprocess.Popen:

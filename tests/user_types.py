@@ -6,16 +6,21 @@ from __future__ import annotations
 from typing import ClassVar, assert_type
 
 import jax
+from jax import Array
 
 import iblf_jax as ij
+
+Robot = ij.robots.Robot
+State = ij.observers.State
+Tube = ij.bounds.Tube
 
 
 def of_a_run(scenario: ij.Scenario) -> None:
     """The signals of a run and its metrics are arrays."""
     run = ij.simulate(scenario, duration=1.0)
-    assert_type(run.q, jax.Array)
-    assert_type(run.disturbance_estimate, jax.Array)
-    assert_type(run.metrics.rmse, jax.Array)
+    assert_type(run.q, Array)
+    assert_type(run.disturbance_estimate, Array)
+    assert_type(run.metrics.rmse, Array)
     assert_type(run[0], ij.Rollout)
 
 
@@ -25,14 +30,10 @@ class Drive(ij.actuators.Actuator):
 
     gain: ij.Leaf = ij.leaf("1", sign="positive")
 
-    def init(self, tau: jax.Array) -> ij.actuators.State:
-        """The state that delivers a torque."""
+    def init(self, tau: Array) -> ij.actuators.State:
         return tau
 
-    def deliver(
-        self, asked: jax.Array, dq: jax.Array, state: ij.actuators.State
-    ) -> ij.actuators.Delivered:
-        """Torque, whether a limit acted, and the rate of the state."""
+    def deliver(self, asked: Array, dq: Array, state: ij.actuators.State) -> ij.actuators.Delivered:
         return ij.actuators.Delivered(state, asked > 1.0, self.gain * (asked - state))
 
 
@@ -42,19 +43,17 @@ class Wrapping(ij.controllers.Law):
 
     law: ij.controllers.TrackingLaw
 
-    def init(self, x: jax.Array, context: ij.controllers.LawContext) -> ij.controllers.State:
-        """The wrapped law's state."""
+    def init(self, x: Array, context: ij.controllers.LawContext) -> ij.controllers.State:
         return ij.controllers.law_of_x(self.law).init(x, context)
 
     def command(
         self,
-        t: jax.Array,
-        x: jax.Array,
-        d_hat: jax.Array,
+        t: Array,
+        x: Array,
+        d_hat: Array,
         context: ij.controllers.LawContext,
         state: ij.controllers.State,
     ) -> tuple[ij.controllers.Command, ij.controllers.State]:
-        """The wrapped law's command."""
         return ij.controllers.law_of_x(self.law).command(t, x, d_hat, context, state)
 
 
@@ -66,35 +65,26 @@ class Barrier(ij.barriers.Barrier):
     uses_o: ClassVar[bool] = False
     value_unit: ClassVar[str] = "1"
 
-    def value(self, tube: ij.bounds.Tube, q: jax.Array) -> jax.Array:
-        """V1."""
+    def value(self, tube: Tube, q: Array) -> Array:
         return 0.5 * ij.barriers.guarded_error(tube, q, self.guard).e ** 2
 
-    def slope(self, tube: ij.bounds.Tube, q: jax.Array) -> jax.Array:
-        """dV1/dq."""
+    def slope(self, tube: Tube, q: Array) -> Array:
         error: ij.barriers.GuardedError = ij.barriers.guarded_error(tube, q, self.guard)
         return error.e
 
-    def virtual_velocity(
-        self, tube: ij.bounds.Tube, q: jax.Array, k1: jax.Array, o: jax.Array | None
-    ) -> jax.Array:
-        """Alpha."""
+    def virtual_velocity(self, tube: Tube, q: Array, k1: Array, o: Array | None) -> Array:
         return tube.dq_d - k1 * (q - tube.q_d)
 
-    def decay_rate(self, k1: jax.Array) -> jax.Array | None:
-        """No claim."""
+    def decay_rate(self, k1: Array) -> Array | None:
         return None
 
-    def xi_bound(self, V: jax.Array, tube: ij.bounds.Tube) -> jax.Array | None:
-        """No claim."""
+    def xi_bound(self, V: Array, tube: Tube) -> Array | None:
         return None
 
-    def error_over_slope(self, tube: ij.bounds.Tube, q: jax.Array) -> jax.Array | None:
-        """No claim."""
+    def error_over_slope(self, tube: Tube, q: Array) -> Array | None:
         return None
 
-    def error_at(self, V: jax.Array, tube: ij.bounds.Tube, above: jax.Array) -> jax.Array | None:
-        """No claim."""
+    def error_at(self, V: Array, tube: Tube, above: Array) -> Array | None:
         return None
 
 
@@ -104,31 +94,15 @@ class Observer(ij.observers.RobotObserver):
 
     gain: ij.Leaf = ij.leaf("1/s", sign="positive")
 
-    def init(self, q: jax.Array, dq: jax.Array, model: ij.robots.Robot) -> ij.observers.State:
-        """The state at the start."""
+    def init(self, q: Array, dq: Array, model: Robot) -> State:
         return 0.0 * q
 
-    def estimate(
-        self,
-        t: jax.Array,
-        q: jax.Array,
-        dq: jax.Array,
-        model: ij.robots.Robot,
-        state: ij.observers.State,
-    ) -> jax.Array:
-        """The estimate of f."""
+    def estimate(self, t: Array, q: Array, dq: Array, model: Robot, state: State) -> Array:
         return state + self.gain * dq
 
     def derivative(
-        self,
-        t: jax.Array,
-        q: jax.Array,
-        dq: jax.Array,
-        tau: jax.Array,
-        model: ij.robots.Robot,
-        state: ij.observers.State,
-    ) -> ij.observers.State:
-        """Its rate."""
+        self, t: Array, q: Array, dq: Array, tau: Array, model: Robot, state: State
+    ) -> State:
         return -self.gain * (state + tau)
 
 
@@ -138,19 +112,10 @@ class Push(ij.disturbances.Disturbance):
 
     size: ij.Leaf = ij.leaf("N m")
 
-    def torque(
-        self,
-        t: jax.Array,
-        q: jax.Array,
-        dq: jax.Array,
-        plant: ij.robots.Robot,
-        model: ij.robots.Robot,
-    ) -> jax.Array:
-        """The torque on the plant."""
+    def torque(self, t: Array, q: Array, dq: Array, plant: Robot, model: Robot) -> Array:
         return self.size + 0.0 * q
 
-    def jump_times(self) -> jax.Array:
-        """None."""
+    def jump_times(self) -> Array:
         return jax.numpy.zeros(0)
 
 
@@ -160,19 +125,12 @@ class Sensor(ij.sensors.RobotSensor):
 
     draws: ClassVar[int] = 0
 
-    def init(self, q: jax.Array, dq: jax.Array, period: jax.Array) -> ij.sensors.State:
-        """No state."""
+    def init(self, q: Array, dq: Array, period: Array) -> ij.sensors.State:
         return ()
 
     def measure(
-        self,
-        q: jax.Array,
-        dq: jax.Array,
-        normal: jax.Array,
-        period: jax.Array,
-        state: ij.sensors.State,
+        self, q: Array, dq: Array, normal: Array, period: Array, state: ij.sensors.State
     ) -> tuple[ij.sensors.Measurement, ij.sensors.State]:
-        """The measurement and the next state."""
         return ij.sensors.Measurement(q, dq), ()
 
 
@@ -184,12 +142,10 @@ class Plant(ij.plants.Plant):
     order: ClassVar[int] = 2
     units: ClassVar[tuple[ij.plants.Units, ...]] = ("m", "m/s", "N")
 
-    def drift(self, t: jax.Array, x: jax.Array) -> jax.Array:
-        """f."""
+    def drift(self, t: Array, x: Array) -> Array:
         return 0.0 * x
 
-    def gain(self, t: jax.Array, x: jax.Array) -> jax.Array:
-        """G."""
+    def gain(self, t: Array, x: Array) -> Array:
         return 1.0 + 0.0 * x
 
 
@@ -199,20 +155,17 @@ class Largest(ij.metrics.Fold):
 
     units: ClassVar[dict[str, str]] = {"largest": "rad"}
 
-    def init(self, sample: ij.metrics.Sample) -> jax.Array:
-        """Zero."""
+    def init(self, sample: ij.metrics.Sample) -> Array:
         return 0.0 * sample.e1
 
-    def update(self, acc: jax.Array, sample: ij.metrics.Sample) -> jax.Array:
-        """The larger one."""
+    def update(self, acc: Array, sample: ij.metrics.Sample) -> Array:
         return jax.numpy.maximum(acc, sample.e1)
 
-    def finish(self, acc: jax.Array) -> dict[str, jax.Array]:
-        """The result by name."""
+    def finish(self, acc: Array) -> dict[str, Array]:
         return {"largest": acc}
 
 
-def of_own_parts(scenario: ij.Scenario, sample: ij.metrics.Sample, tube: ij.bounds.Tube) -> None:
+def of_own_parts(scenario: ij.Scenario, sample: ij.metrics.Sample, tube: Tube) -> None:
     """Parts of a user's own fit where the package's do."""
     actuator: ij.actuators.Actuator = Drive(gain=3.0)
     law: ij.controllers.Law = Wrapping(law=scenario.controller)
@@ -225,6 +178,6 @@ def of_own_parts(scenario: ij.Scenario, sample: ij.metrics.Sample, tube: ij.boun
     ij.simulate(scenario, duration=1.0, metrics=(Largest(),))
     ij.with_parts(scenario, actuator=actuator, controller=law, observer=observer, sensor=sensor)
     ij.with_parts(scenario, disturbance=disturbance, plant=plant)
-    assert_type(sample.e1, jax.Array)
-    assert_type(tube.q_d, jax.Array)
+    assert_type(sample.e1, Array)
+    assert_type(tube.q_d, Array)
     assert_type(actuator.deliver(sample.tau, sample.dq, ()), ij.actuators.Delivered)

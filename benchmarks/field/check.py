@@ -143,9 +143,6 @@ def _faults_of_text(entry: Entry) -> list[str]:
         if not number.tolerance > 0.0:
             found.append(f"entry.toml: the tolerance of {number.quantity!r} must be positive")
     found += _faults_of_corrections(entry)
-    for pair in entry.equal_rows:
-        if pair.law == pair.other:
-            found.append(f"entry.toml: [[equal_rows]] needs two laws, not {pair.law!r} twice")
     keys = [x.quantity for x in entry.published] + [x.statement for x in entry.claims]
     for key in sorted({key for key in keys if keys.count(key) > 1}):
         found.append(f"entry.toml: {key!r} is there twice")

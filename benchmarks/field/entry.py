@@ -32,13 +32,14 @@ CHECKS = FOLDER / "checks"
 TEMPLATE = FOLDER / "template"
 
 PUBLISHED = "published law"
-"""The row of the law that sets the effort, in the results of `measure.py`."""
+"""The law whose effort is the unit of the limits, in the results of `equal_budget.py`."""
 FAMILIES = ("robot", "flexible joint", "drive", "vessel", "vehicle", "strict feedback")
 METHODS = ("barrier", "prescribed performance", "constrained")
 READ = {
     "article": "article",
     "program": "program of the authors",
     "thesis": "thesis",
+    "group": "program of an author's group",
     "secondary": "program of others",
 }
 """Value of `source.read` -> what was read, in words."""
@@ -46,12 +47,12 @@ KINDS = {
     "formula": "Terms and signs of formulas",
     "number": "Printed numbers that do not give the published result",
     "program": "Programs that differ from their text or from their plant",
-    "condition": "Conditions and claims that do not hold",
+    "condition": "Conditions and claims",
     "figure": "Figures that show something else",
     "other": "Others",
 }
 """Value of `kind` of a correction -> heading of its group on the page of all corrections."""
-FOUND_IN = {"publication": "Errors in publications", "program": "Errors in programs"}
+FOUND_IN = {"publication": "Corrections of publications", "program": "Corrections of programs"}
 """Value of `found_in` of a correction -> heading of its list on the page of all corrections."""
 NOT_CONTACTED = "not contacted"
 CONTACTED = (NOT_CONTACTED, "asked", "confirmed", "disputed")
@@ -166,15 +167,6 @@ class NotReproduced:
 
 
 @dataclasses.dataclass(frozen=True)
-class EqualRows:
-    """Two laws whose rows in the results agree, and the reason."""
-
-    law: str
-    other: str
-    reason: str
-
-
-@dataclasses.dataclass(frozen=True)
 class InputLimit:
     """Limits of the input that every law of the task keeps."""
 
@@ -209,10 +201,6 @@ class Entry:
     claims: tuple[Claim, ...] = ()
     input_limits: tuple[InputLimit, ...] = ()
     """One for each component, or one for all."""
-    not_measured: str = ""
-    """Why `measure.py` has no results of this entry, if that is intended."""
-    equal_rows: tuple[EqualRows, ...] = ()
-    """Pairs of laws whose rows may agree; `measure.py` refuses others that do."""
 
 
 class Reproduction(NamedTuple):
@@ -228,9 +216,9 @@ class Reproduction(NamedTuple):
     details: dict[str, str]
     """Statement of a claim -> the numbers and the criterion that decide it."""
     not_applicable: dict[str, str]
-    """Law -> why `measure.py` leaves it out."""
+    """Law -> why `equal_budget.py` leaves it out."""
     uncertain: tuple[str, ...] | None
-    """Paths of the plant parameters that `measure.py` varies."""
+    """Paths of the plant parameters that `equal_budget.py` varies."""
     constraints: dict[str, Callable[..., Any]]
     """Name with unit -> function (t, x) whose numbers must not become negative; x is (r, n)."""
 

@@ -80,7 +80,7 @@ def read_result(task: dict[str, Any], path: Path) -> tuple[np.ndarray, np.ndarra
 def numbers_of(
     task: dict[str, Any], t: np.ndarray, x: np.ndarray, u: np.ndarray
 ) -> dict[str, float]:
-    """The numbers of a row of the tables, by the definitions of `measure.py`."""
+    """The numbers of a row, for the second half of the run and, effort and peak, the entire one."""
     n, count = task["components"], task["components"] * task["levels"]
     level = x[:, :count]
     reference = read_task.evaluate(task, "reference", t)[:, :n]

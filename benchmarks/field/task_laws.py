@@ -1,8 +1,7 @@
 """The task of an entry, and the laws of the package at its scales.
 
 The laws of robots are those of `benchmarks/laws.py`.  Their gains follow from the rate of the
-published law, and their boxes and limits from the published run; `measure.py` then scales all gains
-of a law to the effort of the published one.
+published law, and their boxes and limits from the published run; `equal_budget.py` tunes them.
 """
 
 from __future__ import annotations
@@ -24,6 +23,8 @@ from iblf_jax.world import plants
 
 RECORDS = 4000
 """Recorded samples of a run, about."""
+UNCERTAIN = ("mass", "payload", "inertia")
+"""Beginnings of the names of uncertain parameters, where an entry does not name them."""
 OF_ROBOTS = "laws of robots"
 BARRIERS = {
     "Integral": barriers.Integral(),
@@ -105,6 +106,28 @@ def with_standard_metrics(scenario: ij.Scenario, options: dict[str, Any]) -> ij.
     """A run with the metrics of `ij.compare`, so that both share one program."""
     folds = (*standard(), *optional_folds(scenario), AboveGravity())
     return ij.simulate(scenario, metrics=folds, **options)
+
+
+def uncertain_of(made: entry.Reproduction) -> tuple[str, ...]:
+    """The uncertain parameters of an entry, without those that are zero."""
+    known = {parameter.path: parameter.value for parameter in ij.parameters(made.scenario)}
+    paths = made.uncertain
+    if paths is None:
+        paths = tuple(path for path in known if is_uncertain(path))
+    return tuple(path for path in paths if np.any(np.asarray(known[path]) != 0.0))
+
+
+def is_uncertain(path: str) -> bool:
+    """Whether a path is that of a mass, a payload or an inertia of the plant."""
+    return path.startswith("plant.") and path.rsplit(".", 1)[-1].startswith(UNCERTAIN)
+
+
+def scaled_parameters(
+    scenario: ij.Scenario, uncertain: tuple[str, ...], share: float
+) -> dict[str, Any]:
+    """Path -> value times a factor; of the plant only, so that the model remains."""
+    known = {parameter.path: parameter.value for parameter in ij.parameters(scenario)}
+    return {path: share * np.asarray(known[path]) for path in uncertain}
 
 
 # ---------------------------------------------------------------------------- laws

@@ -33,10 +33,10 @@ def scenario(name, size, **parts):
     return ij.with_parts(paper, controller=law, **parts)
 
 
-def simulate(name, size):
+def simulate(name, size, duration=DURATION, **parts):
     """A run, with its effort above gravity as a metric."""
     metrics = (*ij.metrics.standard(), ij.metrics.AboveGravity())
-    return ij.simulate(scenario(name, size), duration=DURATION, dt=DT, metrics=metrics)
+    return ij.simulate(scenario(name, size, **parts), duration=duration, dt=DT, metrics=metrics)
 
 
 def size_for(name, effort):
@@ -122,6 +122,6 @@ for name in names:
     row = ""
     for share in shares:
         start = ij.Initial(q=tube.q_d + share * tube.k_u, dq=0.0)
-        moved = scenario(name, sizes[name], initial=start)
-        row += f"{time_inside(ij.simulate(moved, duration=2.0 * DURATION, dt=DT), 1e-4):6.2f} s"
+        run = simulate(name, sizes[name], 2.0 * DURATION, initial=start)
+        row += f"{time_inside(run, 1e-4):6.2f} s"
     print(f"{name:18}{row}")

@@ -48,13 +48,13 @@ NOISY = (
 )
 TRIGGERED = Statement(
     "event trigger",
-    "(E.3)",
+    "(E.1)",
     "max over t of sum |e2_i| (delta_i |tau_i| + m_i), which held commands may add to V2'",
     "N m rad/s",
 )
 COMPENSATED = Statement(
     "event trigger, compensated",
-    "(E.2)",
+    "(E.3)",
     "sum 0.557 epsilon_i, which held commands may add to V' at a check",
     "N m rad/s",
 )

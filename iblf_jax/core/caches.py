@@ -22,6 +22,8 @@ from typing import Any, TypeVar, cast
 
 F = TypeVar("F", bound=Callable)
 
+MEMOISED_TYPE = type(lru_cache(abs))
+"""The type of a function whose results are kept."""
 MAX_MARKS = 1024
 """Marks per topic: a mark is a text, or a tuple of shapes and of the structure of a pytree."""
 

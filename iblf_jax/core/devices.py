@@ -36,6 +36,12 @@ def platform() -> str:
     return default_devices()[0].platform
 
 
+def is_alone() -> bool:
+    """Whether this process is the only one of its program, and has a CPU and no other device."""
+    is_single = jax.process_count() == 1 and jax.local_device_count() == 1
+    return is_single and jax.default_backend() == "cpu"
+
+
 def processors() -> int:
     """Number of processors that this process may run on."""
     if hasattr(os, "sched_getaffinity"):

@@ -18,7 +18,9 @@ import hashlib
 import os
 import shutil
 import stat
+import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -34,8 +36,7 @@ MAX_BYTES = 2 * 2**30
 JAX_SUFFIX = "-cache"
 """Suffix of the names of JAX's entries."""
 SUFFIXES = (JAX_SUFFIX, "-atime", ".so", ".cubin", ".program")
-"""Suffixes of the names of entries that may be removed: JAX's and ours.  Release candidates kept
-scalar programs in ".program" files, which nothing reads any more."""
+"""Suffixes of the names of entries that may be removed: JAX's and ours."""
 DIGEST_SIZE = 32
 """Bytes of a digest."""
 IN_USE = 3600.0
@@ -50,10 +51,25 @@ class VerifiedCache:
 
     def __init__(self, base: Any, folder: Path) -> None:
         self._base = base
-        self._path = folder
+        self._path = folder  # which JAX prints when it resets its cache
+        self._thread = threading.local()
+
+    @contextlib.contextmanager
+    def unused(self) -> Iterator[None]:
+        """Context manager in which the cache keeps nothing and has nothing, for this thread."""
+        self._thread.is_unused = True
+        try:
+            yield
+        finally:
+            self._thread.is_unused = False
+
+    def _is_unused(self) -> bool:
+        return getattr(self._thread, "is_unused", False)
 
     def get(self, key: str) -> bytes | None:
         """The entry of a key; None, after its removal, if it is not what was put there."""
+        if self._is_unused():
+            return None
         path = self._path / f"{key}{JAX_SUFFIX}"
         try:
             is_file = stat.S_ISREG(path.lstat().st_mode)
@@ -76,6 +92,8 @@ class VerifiedCache:
 
     def put(self, key: str, value: bytes) -> None:
         """Keeps an entry."""
+        if self._is_unused():
+            return
         self._base.put(key, value + entry_digest(key, value))
 
 
@@ -84,8 +102,8 @@ def entry_digest(key: str, image: bytes) -> bytes:
     return hashlib.sha256(key.encode() + b"\0" + image).digest()
 
 
-def _verify_entries(folder: Path) -> None:
-    """Makes JAX use `VerifiedCache` for its folder.
+def _verify_entries(folder: Path) -> VerifiedCache | None:
+    """Makes JAX use `VerifiedCache` for its folder, and returns it.
 
     JAX has no public function to set a cache. A release that keeps its cache elsewhere is not
     changed; its entries are then not verified, and `tests/kernels/test_toolchain.py` fails.
@@ -98,15 +116,18 @@ def _verify_entries(folder: Path) -> None:
             compilation_cache, "_cache_initialized"
         )
     except (ImportError, AttributeError, TypeError):
-        return
-    if holds_cache:
-        compilation_cache._cache = VerifiedCache(base, folder)  # type: ignore[assignment]
-        compilation_cache._cache_initialized = True
+        return None
+    if not holds_cache:
+        return None
+    cache = VerifiedCache(base, folder)
+    compilation_cache._cache = cache  # type: ignore[assignment]
+    compilation_cache._cache_initialized = True
+    return cache
 
 
 @memoised(1)
-def keep_programs() -> None:
-    """Removes old entries and enables JAX's cache on the disk, once per process.
+def keep_programs() -> VerifiedCache | None:
+    """Removes old entries and enables JAX's cache on the disk, once per process; returns the cache.
 
     JAX's cache stays as it is where the user has configured or disabled it, or where no folder is
     safe.
@@ -122,7 +143,7 @@ def keep_programs() -> None:
             or not config.jax_enable_compilation_cache
             or _reloads_badly()
         ):
-            return
+            return None
         # XLA's programs are for one kind of processor, which JAX does not check, and several
         # machines may share a home folder.
         folder = top / f"xla-{hashlib.sha256(processor().encode()).hexdigest()[:12]}"
@@ -130,7 +151,7 @@ def keep_programs() -> None:
             folder.mkdir(mode=0o700, exist_ok=True)
             foreign = _not_ours(folder)
     except OSError:
-        return
+        return None
     if foreign is not None:
         problem = f"{top} holds {foreign!r}, a link or of another user; remove it."
         notices.warn(f"compiled programs are not kept: {problem}")
@@ -139,7 +160,28 @@ def keep_programs() -> None:
         config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
         config.update("jax_persistent_cache_min_entry_size_bytes", -1)
         reset_cache()  # a program that JAX compiled earlier has made it decide to keep nothing
-        _verify_entries(folder)
+        return _verify_entries(folder)
+    return None
+
+
+def keeps_programs() -> bool:
+    """Whether JAX keeps compiled programs in our folder now."""
+    cache = keep_programs()
+    config: Any = jax.config
+    return (
+        cache is not None
+        and config.jax_enable_compilation_cache
+        and config.jax_compilation_cache_dir == str(cache._path)
+    )
+
+
+def without_cache() -> contextlib.AbstractContextManager[None]:
+    """Context manager in which JAX compiles anew: XLA cannot write an executable that it has read
+    once more.
+    """
+    cache = keep_programs()
+    assert cache is not None, "only where `keeps_programs`"
+    return cache.unused()
 
 
 def _reloads_badly() -> bool:

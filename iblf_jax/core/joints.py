@@ -68,6 +68,8 @@ def _entries(field: str, joints: object) -> Sequence[Any]:
             field, joints, EXPECTED, "Give one truth value for each joint, in a list."
         )
     if isinstance(joints, jax.Array | np.ndarray | np.generic):
+        if jax.dtypes.issubdtype(joints.dtype, jax.dtypes.prng_key):
+            raise checks.fail(field, joints, EXPECTED)
         array = np.asarray(joints)
         if array.ndim > 1:
             raise checks.fail(field, joints, EXPECTED, f"Its shape is {array.shape}.")
@@ -82,7 +84,7 @@ def _entries(field: str, joints: object) -> Sequence[Any]:
 def _entry(field: str, joints: object, entry: object) -> int | str:
     if isinstance(entry, bool | np.bool_):
         return bool(entry)
-    if isinstance(entry, int | np.integer):
+    if isinstance(entry, int | np.integer) and abs(int(entry)) < 2**31:
         return int(entry)
     if isinstance(entry, str):
         return entry

@@ -29,11 +29,12 @@ import jax
 import numpy as np
 
 from iblf_jax.core import devices
+from iblf_jax.core.disk_cache import keeps_programs
+from iblf_jax.core.kept_programs import COMPILE_EVENT, KeptProgram
+from iblf_jax.core.thread_options import current_options, process_options
 from iblf_jax.kernels import without_garbage_collection
 
 MAPS, MAX_MAPS = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
-COMPILE_EVENT = "/jax/core/compile/backend_compile_duration"
-"""JAX's event of a program that is compiled, or read from the disk."""
 MAX_MAP_FRACTION = 0.6
 """Share of the permitted maps above which programs are released: libraries and other threads need
 some, too."""
@@ -128,12 +129,14 @@ class StructuredFunction:
         static_argnums: tuple[int, ...] = (),
         static_argnames: tuple[str, ...] = (),
         options: dict[str, Any] | None = None,
+        kept: bool = False,
     ) -> None:
         self._function = function
         self._programs = programs
         self._static_argnums = static_argnums
         self._static_argnames = static_argnames
         self._options = options
+        self._kept = kept
         update_wrapper(self, function)
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
@@ -174,17 +177,33 @@ class StructuredFunction:
         others = [x for i, x in enumerate(args) if i not in self._static_argnums]
         named = {name: x for name, x in kwargs.items() if name not in self._static_argnames}
         leaves, structure = jax.tree.flatten((others, named))
-        # JAX accepts options for XLA only where it neither transforms the function nor makes it a
-        # part of another program.
-        options = None
-        if self._options is not None and devices.platform() == "cpu":
-            traced = any(isinstance(x, jax.core.Tracer) for x in (jax.device_put(ZERO), *leaves))
-            options = None if traced else self._options
+        # JAX accepts options for XLA, and a program from the disk, only where it neither transforms
+        # the function nor makes it a part of another program.
+        options, kept = self._options, self._kept
+        if devices.platform() != "cpu":
+            options = None
+        # A program from the disk is one for the only device.
+        kept = kept and keeps_programs() and devices.is_alone()
+        if (options is not None or kept) and any(
+            isinstance(x, jax.core.Tracer) for x in (jax.device_put(ZERO), *leaves)
+        ):
+            options, kept = None, False
         shapes = tuple([getattr(x, "shape", ()) for x in leaves])
         # The options are a part of the key: two programs may be made of one function.
         of_compiler = tuple((options or {}).items())
         key = (self._function, of_compiler, tuple(static), structure, shapes)
-        return self._programs.get(key, partial(self._copy, options))
+        if not kept:
+            return self._programs.get(key, partial(self._copy, options))
+        types = tuple([(x.dtype, x.weak_type) for x in map(jax.typeof, leaves)])
+        parts = (*key, types)
+        # A program of JAX knows itself what else it was traced for.
+        now = (*current_options().values(), *process_options().values())
+        return self._programs.get(
+            (*parts, now),
+            lambda: KeptProgram(
+                self._copy(options), parts, self._static_argnums, self._static_argnames
+            ),
+        )
 
     def _copy(self, options: dict[str, Any] | None) -> Any:
         """A copy of the function, to be compiled by JAX for one structure."""
@@ -213,6 +232,7 @@ def jit(
     static_argnums: int | Sequence[int] = (),
     static_argnames: str | Sequence[str] = (),
     options: dict[str, Any] | None = None,
+    kept: bool = False,
 ) -> Any:
     """As `jax.jit`, for a function of many structures (head of this module); also a decorator with
     options.
@@ -223,12 +243,15 @@ def jit(
       static_argnames: names of keyword arguments that are compiled in.
       options: compiler options of the program on a CPU, UNOPTIMISED or SHORTEST_TO_COMPILE for one
         that runs for less time than it compiles; XLA's own if None.
+      kept: whether the program is kept on the disk (`kept_programs`).  What the trace of the
+        function reads must then be its arguments or in the environment of `durable_keys`, and it
+        must have no effect, such as a warning.
     """
     numbers = (static_argnums,) if isinstance(static_argnums, int) else tuple(static_argnums)
     names = (static_argnames,) if isinstance(static_argnames, str) else tuple(static_argnames)
 
     def decorated(function: Callable) -> StructuredFunction:
-        return StructuredFunction(function, PROGRAMS, numbers, names, options)
+        return StructuredFunction(function, PROGRAMS, numbers, names, options, kept)
 
     if function is None:
         return decorated

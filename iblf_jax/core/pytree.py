@@ -82,7 +82,10 @@ def component(cls: type[T]) -> type[T]:
     """
     if not isinstance(cls, type):
         raise checks.fail("component", cls, "a class", "Write @iblf_jax.component above it.")
-    adopt(cls, Part)
+    try:
+        adopt(cls, Part)
+    except TypeError as error:
+        raise checks.fail("component", cls, "a class written in Python", f"{error}.") from error
     _keep_required(cls)
     has_own_init = "__init__" in vars(cls)
     try:

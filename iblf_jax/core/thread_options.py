@@ -49,6 +49,12 @@ def current_options() -> dict[str, Any]:
     return {name: getattr(jax.config, name) for name in OPTIONS}
 
 
+def process_options() -> dict[str, Any]:
+    """All options of JAX as this process has them, by name."""
+    options: Any = jax.config
+    return dict(options.values)
+
+
 def of_any_process() -> dict[str, Any]:
     """The options of the current thread that another process takes over."""
     return {name: value for name, value in current_options().items() if name in OF_ANY_PROCESS}

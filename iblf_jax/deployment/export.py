@@ -275,7 +275,7 @@ def _check_options(
                 raise checks.fail(name, value, expected, "Only a closed loop has this option.")
         return
     for name, value in ros_only.items():
-        if value is None or (name == "on_fault" and value == "hold"):
+        if value is None or (name == "on_fault" and isinstance(value, str) and value == "hold"):
             continue
         expected = f"the default for the target {target!r}"
         raise checks.fail(name, value, expected, 'Only target="ros2" has this option.')
@@ -331,7 +331,7 @@ def _export_loop(
     check_method(scenario, method)
     key = np.asarray(noise_key(jax.random.key(seed)), float)
     scenario = realised(scenario, jnp.asarray(key, scenario.initial.q.dtype))
-    loop = loop_program(scenario, method)
+    loop = loop_program(scenario, method, has_shape=target == "wasm")
     joints = plants.declared_joints(scenario.plant)
     generated = loop_files(scenario, loop, name, method, joints)
     run_settings = [dt]

@@ -26,11 +26,26 @@ from iblf_jax.reports import card
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.paths import sign_at
 from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.world import plants
 
 GAIN_RANGE = 5.0
 """The slider of a gain ranges from the gain divided by this to the gain times this."""
 START_RANGE = 0.3
 """The slider of an initial position or of a bound reaches this far to both sides [rad]."""
+WORDS_OF_GAINS = {
+    "controller.k1": "Position decay k1",
+    "controller.K2": "Velocity damping K2",
+    "controller.o": "Margin for moving bounds o",
+    "controller.weight": "Weight of the barrier",
+    "controller.Kp": "Position gain Kp",
+    "controller.Kd": "Velocity gain Kd",
+    "controller.limit": "Torque limit",
+    "observer.kf": "Observer gain kf",
+    "observer.bandwidth": "Observer bandwidth",
+}
+"""Path of a gain -> the words of its slider; others have their path within law or observer."""
+START = "initial.q"
+BOUND = re.compile(r"bounds\[(\d+)\]\.(lower|upper)\.(?:offset|value)")
 DRAWN_INSTANTS = 500
 """Approximate number of instants of a run that are drawn."""
 HEIGHT = 640
@@ -132,6 +147,8 @@ def _loop(scenario: Scenario, dt: float, method: str) -> dict[str, Any]:
         table = json.loads((Path(folder) / "iblf_loop.json").read_text())
     for row in table["parameters"]:
         row |= _slider(scenario, row)
+    table["input"] = plants.input_name(scenario.plant)
+    table["names"] = list(plants.component_names(scenario.plant))
     table["flags"] = [(int(flag), words) for flag, words in WORDS.items()]
     table["failed"] = int(FAILED)
     return {"wasm": module, "table": table}
@@ -147,8 +164,29 @@ def _slider(scenario: Scenario, row: dict[str, Any]) -> dict[str, Any]:
     if path.startswith(("controller.", "observer.")) and sign_at(scenario, path) == "positive":
         first = float(values[0])
         ends = [[first / GAIN_RANGE, first * GAIN_RANGE]]
-        return {"slider": ends, "positive": True, "each": False}
-    if re.fullmatch(r"initial\.q|bounds\[\d+\]\.(lower|upper)\.(offset|value)", path):
-        ends = [[float(x) - START_RANGE, float(x) + START_RANGE] for x in values]
-        return {"slider": ends, "positive": False, "each": True}
-    return {}
+        words = {"words": _words_of_gain(path), "group": "Gains"}
+        return {"slider": ends, "positive": True, "each": False} | words
+    bound = BOUND.fullmatch(path)
+    if path != START and not bound:
+        return {}
+    words = {"words": "Start", "group": "Start"}
+    if bound:
+        words = {
+            "words": f"{bound[2].capitalize()} bound",
+            "group": _level(scenario, int(bound[1])),
+        }
+    ends = [[float(x) - START_RANGE, float(x) + START_RANGE] for x in values]
+    return {"slider": ends, "positive": False, "each": True} | words
+
+
+def _words_of_gain(path: str) -> str:
+    """The words of the slider of a gain."""
+    part, _, rest = path.partition(".")
+    owner = {"controller": "law", "observer": "observer"}[part]
+    return WORDS_OF_GAINS.get(path, f"{rest} of the {owner}")
+
+
+def _level(scenario: Scenario, level: int) -> str:
+    """The words above the sliders of the bounds of a level, counted from 0."""
+    names = plants.level_names(scenario.plant)
+    return f"Bounds of the {names[level]}"

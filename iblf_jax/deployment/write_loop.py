@@ -12,7 +12,7 @@ import numpy as np
 from iblf_jax import __version__
 from iblf_jax.deployment.build import build, write_files, zig
 from iblf_jax.deployment.c_names import Parameters
-from iblf_jax.deployment.loop_program import Loop, LoopOutput, loop_outputs
+from iblf_jax.deployment.loop_program import Loop, LoopOutput, Shape, loop_outputs
 from iblf_jax.deployment.write_c import SEGMENT, fill_template, shared_values
 from iblf_jax.kernels import plain_function
 from iblf_jax.simulation.noise import has_noise
@@ -29,6 +29,7 @@ class GeneratedLoop(NamedTuple):
     files: dict[str, str]
     parameters: Parameters
     outputs: tuple[LoopOutput, ...]
+    shape: Shape | None
     values: dict[str, Any]
     """The values for the placeholders of the templates."""
 
@@ -62,12 +63,13 @@ def loop_files(
         "output_count": output_count,
         "memory_size": loop.carry_size,
         "outputs": ", ".join(output.name for output in outputs),
+        "shape": "".join(f", then {name} [m]" for name in _drawn(loop.shape)),
         "noise_setting": noise_setting,
         "buffer_rows": RECORD_BUFFER,
         "real_bytes": loop.step.dtype.itemsize,
     }
     texts = {f"{name}.{ending}": fill_template(f"loop.{ending}", values) for ending in "hc"}
-    return GeneratedLoop(texts, parameters, outputs, values)
+    return GeneratedLoop(texts, parameters, outputs, loop.shape, values)
 
 
 def table(generated: GeneratedLoop, run_settings: list[float]) -> dict[str, Any]:
@@ -85,7 +87,13 @@ def table(generated: GeneratedLoop, run_settings: list[float]) -> dict[str, Any]
         {"name": output.name, "unit": output.unit, "offset": k * n, "size": n}
         for k, output in enumerate(generated.outputs)
     ]
-    columns.append({"name": "status", "unit": "1", "offset": len(columns) * n, "size": 1})
+    end = len(columns) * n
+    columns.append({"name": "status", "unit": "1", "offset": end, "size": 1})
+    end += 1
+    for name, array in _drawn(generated.shape).items():
+        column = {"name": name, "unit": "m", "offset": end, "size": array.size}
+        columns.append(column | {"shape": array.shape})
+        end += array.size
     return {
         "parameters": rows,
         "count": offset,
@@ -97,6 +105,12 @@ def table(generated: GeneratedLoop, run_settings: list[float]) -> dict[str, Any]
         "method": values["method"],
         "version": __version__,
     }
+
+
+def _drawn(shape: Shape | None) -> dict[str, Any]:
+    """The arrays of a shape that are there, by name."""
+    found = {} if shape is None else shape._asdict()
+    return {name: array for name, array in found.items() if not isinstance(array, tuple)}
 
 
 def wasm_files(generated: GeneratedLoop, folder: Path, run_settings: list[float]) -> list[str]:

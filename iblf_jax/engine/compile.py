@@ -25,7 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.core import checks, notices
+from iblf_jax.core import checks, kept_programs, notices
 from iblf_jax.core.caches import CACHE
 from iblf_jax.engine import plan, registry, thresholds
 from iblf_jax.engine.batch import Batch, Stepper, carry_shapes, linearization_batch
@@ -327,7 +327,8 @@ def single_batch(inputs: Inputs, request: RunRequest) -> Batch:
 def plan_of_single_run(
     request: RunRequest, machine: Machine, structure: PyTreeDef, shapes: tuple
 ) -> SingleRunPlan:
-    """The plan of one run; the first executor has started to build the kernel of the step.
+    """The plan of one run; the first executor has started to build the kernel of the step, unless
+    an earlier process has made the plan.
 
     Args:
       request: `structural_part` of the request.
@@ -335,6 +336,16 @@ def plan_of_single_run(
       structure: tree structure of the `Inputs`.
       shapes: shapes of their leaves (`shapes_of`).
     """
+    return kept_programs.computed_once(
+        partial(_plan_of_single_run, request, machine, structure, shapes),
+        *("plan of a single run", request, machine, structure, shapes),
+    )
+
+
+def _plan_of_single_run(
+    request: RunRequest, machine: Machine, structure: PyTreeDef, shapes: tuple
+) -> SingleRunPlan:
+    """As `plan_of_single_run`."""
     inputs = _tree_of_shapes(structure, shapes)
     execution = choose_plan(request, None, machine)
     if not execution.backends:

@@ -385,7 +385,7 @@ def sampled_jacobians(scenario: Scenario, times: jax.Array, states: LoopState) -
     return _sampled_jacobians(scenario, times, states, request=request)
 
 
-@programs.jit(static_argnames="request")
+@programs.jit(static_argnames="request", options=programs.SHORTEST_TO_COMPILE)
 def _sampled_jacobians(
     scenario: Scenario, times: jax.Array, states: LoopState, *, request: RunRequest
 ) -> jax.Array:

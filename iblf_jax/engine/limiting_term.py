@@ -163,7 +163,7 @@ def _relative_to_limit(
     return radius
 
 
-@programs.jit
+@programs.jit(options=programs.SHORTEST_TO_COMPILE)
 def _period_maps(scenario: Scenario, times: jax.Array, states: LoopState) -> jax.Array:
     """The derivatives of the maps from one period to the next, (INSTANTS, m, m)."""
 
@@ -175,7 +175,7 @@ def _period_maps(scenario: Scenario, times: jax.Array, states: LoopState) -> jax
     return jax.vmap(at)(times, states)
 
 
-@programs.jit
+@programs.jit(options=programs.SHORTEST_TO_COMPILE)
 def _jacobians(scenario: Scenario, times: jax.Array, states: LoopState) -> jax.Array:
     """The closed loop's Jacobians, (INSTANTS, m, m) [1/s]."""
     return jax.vmap(lambda t, state: jacobian(scenario, t, state))(times, states)
@@ -202,7 +202,7 @@ def _instants(scenario: Scenario, run: Rollout) -> Iterator[tuple[jax.Array, Loo
     yield jnp.asarray(recorded[nearest], dtype), _states_at(scenario, x)
 
 
-@programs.jit
+@programs.jit(options=programs.SHORTEST_TO_COMPILE)
 def _states_at(scenario: Scenario, x: jax.Array) -> LoopState:
     """Initial states of a loop at these states of the plant, (INSTANTS, r, n)."""
     return jax.vmap(lambda x: initial_state(dataclasses.replace(scenario, initial=Initial(x=x))))(x)

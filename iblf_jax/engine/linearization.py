@@ -136,15 +136,22 @@ def jacobian_carry(scenario: Scenario, time: jax.Array, state: LoopState) -> Lin
     return linearization_at(time, perturbed_state(state), watched, no_estimate)
 
 
-def fastest_mode(scenario: Scenario, found: Linearization) -> jax.Array:
-    """The mode that a `LinearizationStep` has found, () [1/s]: of what a step integrates."""
+def fastest_modes(scenario: Scenario, found: Linearization) -> jax.Array:
+    """The modes that `LinearizationStep`s have found, (...) [1/s]: of what a step integrates.
+
+    Args:
+      scenario: the structure of the loops.
+      found: linearizations, with leading axes (...).
+    """
     jacobian = stability.resolved_jacobian(found.jacobian, scenario.sampling is not None)
     if scenario.sampling is not None:
         size = ravel_pytree(integrated_part(initial_state(scenario)))[0].size
-        return stability.growth_rate_of_matrix(jacobian[:size, :size])
-    is_complete = len(jacobian) == found.state.size
-    if is_complete:
-        return stability.growth_rate_of_matrix(jacobian)
+        jacobian = jacobian[..., :size, :size]
+    is_complete = jacobian.shape[-1] == found.state.shape[-1]
+    if is_complete or scenario.sampling is not None:
+        # (..., m, m) -> (m, m, ...) with the axis of the runs last.
+        runs_last = jnp.swapaxes(jacobian.T, 0, 1)
+        return stability.growth_rate_of_matrix(runs_last).T
     return stability.growth_rate(found.power_iteration)
 
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from iblf_jax.core.pytree import is_absent
 from iblf_jax.core.status import Status, flag, has_flag
 from iblf_jax.engine.carry import Carry, Inputs
-from iblf_jax.engine.linearization import Linearization, fastest_mode
+from iblf_jax.engine.linearization import Linearization
 from iblf_jax.engine.metric_folds import finished
 from iblf_jax.simulation import error_estimate, error_growth, integrators, stability
 from iblf_jax.world import plants
@@ -32,6 +32,7 @@ def outcome_of(
     carry: Carry,
     unresolved: error_estimate.UnresolvedSignals,
     instants: Linearization,
+    modes: jax.Array,
 ) -> Outcome:
     """The folds' results and the accuracy, and the status with the verdict on the step.
 
@@ -42,17 +43,17 @@ def outcome_of(
       unresolved: the unresolved signals of the run, as accelerations.
       instants: linearizations at the start, at the instant nearest to a bound and at the end of the
         run, (3, ...).
+      modes: `fastest_modes` of these, (3,) [1/s].
     """
     scenario = inputs.scenario
     accuracy = error_estimate.with_unresolved(carry.accuracy, unresolved)
-    maps: jax.Array | None = None
+    sampled: _Sampled | None = None
     rounding: dict[str, jax.Array] = {}
-    if inputs.scenario.sampling is not None:
-        maps = _period_maps(inputs, carry, instants)
+    if scenario.sampling is not None:
+        sampled = _Sampled.of(inputs, carry, instants)
     if not is_absent(accuracy.error_growth):
-        bounds = _bounds_of_growth(inputs, carry, instants, maps)
+        bounds = _bounds_of_growth(inputs, carry, sampled)
         accuracy, rounding = error_growth.with_growth(accuracy, bounds, unresolved.width)
-    modes = jax.vmap(partial(fastest_mode, inputs.scenario))(instants)
     mode = jnp.max(jnp.where(jnp.isfinite(modes), modes, 0.0))
     limit = integrators.tableau(method).stability
     status = carry.status | flag(inputs.dt * mode > limit, Status.STEP_TOO_LARGE)
@@ -73,8 +74,8 @@ def outcome_of(
         end = inputs.dt * inputs.steps
         metrics |= plant.switching(end)
         status |= flag(~plant.has_complete_path(end), Status.MODES_EXHAUSTED)
-    if maps is not None:
-        found = _sampling_radii(inputs, carry, instants, maps)
+    if sampled is not None:
+        found = _sampling_radii(inputs, carry, sampled)
         radii, growth_by_sampling = jax.lax.stop_gradient(found)
         metrics[stability.RADIUS] = jnp.max(jnp.where(jnp.isfinite(radii), radii, 0.0))
         metrics |= rounding
@@ -83,37 +84,41 @@ def outcome_of(
     return Outcome(None, metrics, status, mode)
 
 
-def _period_maps(inputs: Inputs, carry: Carry, instants: Linearization) -> jax.Array:
-    """The `stability.period_map` at each instant, (k, m, m) [1]."""
-    derivatives = stability.resolved_jacobian(instants.jacobian, sampled=True)
-    return jax.vmap(partial(stability.period_map, inputs.scenario, carry.state))(derivatives)
+class _Sampled(NamedTuple):
+    """A sampled loop at the `instants` of `outcome_of`."""
+
+    derivatives: jax.Array
+    """`stability.resolved_jacobian` of the loop between samples, (k, m, m)."""
+    maps: jax.Array
+    """`stability.period_map`, (k, m, m) [1]."""
+
+    @staticmethod
+    def of(inputs: Inputs, carry: Carry, instants: Linearization) -> _Sampled:
+        derivatives = stability.resolved_jacobian(instants.jacobian, sampled=True)
+        period_map = partial(stability.period_map, inputs.scenario, carry.state)
+        return _Sampled(derivatives, jax.vmap(period_map)(derivatives))
 
 
-def _bounds_of_growth(
-    inputs: Inputs, carry: Carry, instants: Linearization, maps: jax.Array | None
-) -> jax.Array:
+def _bounds_of_growth(inputs: Inputs, carry: Carry, sampled: _Sampled | None) -> jax.Array:
     """The largest `error_growth.bound` of the position error, (n,) [rad]; infinite for a continuous
     loop, which has no period maps.
     """
-    if maps is None:
+    if sampled is None:
         return jnp.full_like(carry.accuracy.error, jnp.inf)
     sampling: Any = inputs.scenario.sampling
-    derivatives = stability.resolved_jacobian(instants.jacobian, sampled=True)
     periods = inputs.dt * inputs.steps / sampling.period
     bound = partial(error_growth.bound, inputs.scenario, carry.accuracy.error_growth, carry.state)
-    found = jax.vmap(bound, in_axes=(0, 0, None))(derivatives, maps, periods)
+    found = jax.vmap(bound, in_axes=(0, 0, None))(sampled.derivatives, sampled.maps, periods)
     return jnp.max(found, axis=0)
 
 
-def _sampling_radii(
-    inputs: Inputs, carry: Carry, instants: Linearization, maps: jax.Array
-) -> tuple[jax.Array, jax.Array]:
+def _sampling_radii(inputs: Inputs, carry: Carry, sampled: _Sampled) -> tuple[jax.Array, jax.Array]:
     """The spectral radius of the period map at each instant, and the growth by sampling, (k,) each
     [1].
     """
-    derivatives = stability.resolved_jacobian(instants.jacobian, sampled=True)
     continuous_map = partial(stability.continuous_map, inputs.scenario, carry.state)
-    radii = jax.vmap(stability.spectral_radius)(maps)
-    continuous = jax.vmap(stability.spectral_radius)(jax.vmap(continuous_map)(derivatives))
+    radii = jax.vmap(stability.spectral_radius)(sampled.maps)
+    continuous = jax.vmap(continuous_map)(sampled.derivatives)
+    continuous_radii = jax.vmap(stability.spectral_radius)(continuous)
     sampling: Any = inputs.scenario.sampling
-    return radii, stability.growth_by_sampling(radii, continuous, sampling.period)
+    return radii, stability.growth_by_sampling(radii, continuous_radii, sampling.period)

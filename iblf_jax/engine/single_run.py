@@ -140,7 +140,7 @@ def _run_by_executor(compiled: Compiled, nodes: int, request: RunRequest, leaves
     return outcome._replace(records=records)
 
 
-@programs.jit(static_argnums=(0, 1), options=programs.SHORTEST_TO_COMPILE)
+@programs.jit(static_argnums=(0, 1), options=programs.SHORTEST_TO_COMPILE, kept=True)
 def _initialize(
     compiled: Compiled, request: RunRequest, leaves: list
 ) -> tuple[Carry, Linearization]:
@@ -148,7 +148,7 @@ def _initialize(
     return initialize(run_steps, compiled.batch(leaves, request), request.method)
 
 
-@programs.jit(static_argnums=(0, 1))
+@programs.jit(static_argnums=(0, 1), kept=True)
 def _all_steps(
     compiled: Compiled, request: RunRequest, leaves: list, carry: Carry
 ) -> tuple[Carry, Any]:
@@ -172,7 +172,7 @@ def _steps_in_calls(
     return carry, jax.tree.map(lambda *x: jnp.asarray(np.concatenate(x)), *recorded)
 
 
-@programs.jit(static_argnums=(0, 1, 2))
+@programs.jit(static_argnums=(0, 1, 2), kept=True)
 def _steps_from(
     compiled: Compiled,
     request: RunRequest,
@@ -204,8 +204,12 @@ def _finalized(
     return jax.tree.map(lambda x: x[0], outcome)
 
 
-_finalize = programs.jit(_finalized, static_argnums=(0, 1), options=programs.SHORTEST_TO_COMPILE)
-_finalize_sampled = programs.jit(_finalized, static_argnums=(0, 1), options=programs.UNOPTIMISED)
+_finalize = programs.jit(
+    _finalized, static_argnums=(0, 1), options=programs.SHORTEST_TO_COMPILE, kept=True
+)
+_finalize_sampled = programs.jit(
+    _finalized, static_argnums=(0, 1), options=programs.UNOPTIMISED, kept=True
+)
 """Of a sampled loop, whose errors are summed over its periods in loops."""
 
 

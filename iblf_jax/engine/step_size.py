@@ -92,7 +92,7 @@ def side_by_side(scenario: Scenario, dt: float, steps: int, *, method: str) -> P
     return pair
 
 
-@programs.jit(static_argnames="method")
+@programs.jit(static_argnames="method", options=programs.SHORTEST_TO_COMPILE)
 def _start(scenario: Scenario, dt: jax.Array, steps: jax.Array, *, method: str) -> Pair:
     start, zero = initial_state(scenario), jnp.zeros_like(dt)
     x = ravel_pytree(start)[0]
@@ -183,7 +183,7 @@ def _one_step(scenario: Scenario, times: jax.Array, dt: jax.Array, pair: Pair, m
     return Pair(pair.step + 1, coarse, fine, accuracy, difference, nearest, going)
 
 
-@programs.jit
+@programs.jit(options=programs.SHORTEST_TO_COMPILE)
 def start_and_along(scenario: Scenario, times: jax.Array) -> LoopState:
     """The state at the start, and those of a loop that follows its reference exactly; time axis
     first, (1 + T, ...).

@@ -68,6 +68,7 @@ def family(module: str, members: dict[str, Any]) -> Family:
 FAMILIES: dict[Any, Family] = {
     robots.Robot: family("robots", robots.MEMBERS),
     plants.Plant: family("plants", plants.MEMBERS),
+    plants.Restoring: Family("plants", {"RESTORING": plants.RESTORING}),
     references.Reference: family("references", references.MEMBERS),
     bounds.Side: family("bounds", bounds.MEMBERS),
     regions.Region: family("regions", regions.MEMBERS),

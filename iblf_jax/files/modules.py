@@ -206,7 +206,7 @@ def with_modules_read(
       ValueError: a description that cannot be rebuilt, weights that do not belong to it, or a key
         of `given` at which the tables have no module.
     """
-    given = checks.mapping("modules", given or {}, '{"controller.net": net}')
+    given = checks.mapping("modules", {} if given is None else given, '{"controller.net": net}')
     known = [path for path, _ in tables_of_modules(tables)]
     for path in given:
         if path not in known:

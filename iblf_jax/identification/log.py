@@ -88,6 +88,7 @@ def read(log: object, n: int, what: str = "log", joints: Sequence[str] = ()) -> 
       OSError: a file cannot be read.
     """
     if isinstance(log, list | tuple):
+        checks.flat_enough(what, log)
         if not log:
             raise checks.fail(what, log, "at least one log")
         return [one for i, x in enumerate(log) for one in read(x, n, f"{what}[{i}]", joints)]

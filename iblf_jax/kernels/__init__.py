@@ -111,7 +111,11 @@ from iblf_jax.kernels.program import UnsupportedError as UnsupportedError
 from iblf_jax.kernels.toolchain import StoppedError as StoppedError
 from iblf_jax.kernels.toolchain import ToolchainError as ToolchainError
 from iblf_jax.kernels.toolchain import built_for as built_for
+from iblf_jax.kernels.toolchain import cache_path as cache_path
+from iblf_jax.kernels.toolchain import cached_file as cached_file
 from iblf_jax.kernels.toolchain import compiler as compiler
+from iblf_jax.kernels.toolchain import compiler_key as compiler_key
+from iblf_jax.kernels.toolchain import content_of as content_of
 from iblf_jax.kernels.toolchain import has_ziglang as has_ziglang
 from iblf_jax.kernels.toolchain import stop_compilers as stop_compilers
 from iblf_jax.kernels.toolchain import stop_own_compilers as stop_own_compilers

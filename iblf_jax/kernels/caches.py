@@ -33,8 +33,8 @@ class Caches:
         """Process number of a compiler that runs -> the mark of the thread that needs it."""
         self.libraries: dict[str, ctypes.CDLL] = {}
         """Key of a kernel -> its library: loaded once, as XLA takes one address for a name."""
-        self.registered: set[str] = set()
-        """Names of the functions that XLA knows."""
+        self.registered: dict[str, tuple[str, str]] = {}
+        """Name of a function that XLA knows -> its file in the cache, and its name there."""
 
     def function(self, maxsize: int | None) -> Callable[[F], F]:
         """A decorator: the function's last `maxsize` results are kept."""

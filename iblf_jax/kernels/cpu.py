@@ -6,7 +6,7 @@ persistent cache finds the same kernel in another process.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,7 +18,7 @@ from iblf_jax.kernels.caches import CACHES
 from iblf_jax.kernels.emit_c import header, source
 from iblf_jax.kernels.packed import Packed, Shapes, record_shapes
 from iblf_jax.kernels.program import Program
-from iblf_jax.kernels.toolchain import build_ahead, built, loaded
+from iblf_jax.kernels.toolchain import build_ahead, built, cache_folder, loaded
 
 
 class Build(NamedTuple):
@@ -94,8 +94,27 @@ def register(target: str, library: Path, function: str, platform: str) -> str:
     if target not in CACHES.registered:
         address = loaded(library, function)[function]
         jax.ffi.register_ffi_target(target, jax.ffi.pycapsule(address), platform=platform)
-        CACHES.registered.add(target)
+        CACHES.registered[target] = (library.name, function)
     return target
+
+
+def files_of(targets: Iterable[str]) -> dict[str, tuple[str, str]] | None:
+    """Where the functions that XLA knows by these names are, as `register_files` reads it; None if
+    one of them is not of a kernel.
+    """
+    if any(target not in CACHES.registered for target in targets):
+        return None
+    return {target: CACHES.registered[target] for target in targets}
+
+
+def register_files(files: Mapping[str, tuple[str, str]]) -> None:
+    """Makes functions of kernels that another process has built known to XLA (`files_of`).
+
+    Raises:
+      ToolchainError: a file is missing or damaged.
+    """
+    for target, (name, function) in files.items():
+        register(target, cache_folder() / name, function, "cpu")
 
 
 def pack(leaves: Sequence[jax.Array], shapes: Shapes, dtype, runs: int) -> Packed:

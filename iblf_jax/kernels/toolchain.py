@@ -338,10 +338,8 @@ def built(source: str, extra: tuple[str, ...] = ()) -> tuple[Path, str]:
       ToolchainError: no compiler, or an error from it.
     """
     command = compiler()
-    version = _version(command)
-    header = Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h"
-    flags = [*flags_of(version.kind), *extra]
-    content = [source, *flags, *command, version.line, processor(), header.read_text()]
+    flags = [*flags_of(_version(command).kind), *extra]
+    content = [source, *extra, *compiler_key()]
 
     def compile_to(result: Path) -> None:
         text = result.with_suffix(".cc")
@@ -354,6 +352,16 @@ def built(source: str, extra: tuple[str, ...] = ()) -> tuple[Path, str]:
             _run([*command, *flags, *files], "stderr", TIMEOUT)
 
     return cached_file(content, ".so", compile_to)
+
+
+def compiler_key() -> tuple[str, ...]:
+    """What decides, beside its source, how a kernel is compiled; ToolchainError if there is no
+    compiler.
+    """
+    command = compiler()
+    version = _version(command)
+    header = Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h"
+    return (*flags_of(version.kind), *command, version.line, processor(), header.read_text())
 
 
 def cached_file(
@@ -381,8 +389,13 @@ def cache_path(content: Iterable[str], suffix: str) -> Path:
     `cached_file`.
     """
     key = hashlib.sha256("\0".join(content).encode()).hexdigest()[:32]
+    return cache_folder() / f"{key}{suffix}"
+
+
+def cache_folder() -> Path:
+    """The folder of the cache; ToolchainError if there is no safe place for it."""
     try:
-        return directory() / f"{key}{suffix}"
+        return directory()
     except OSError as error:
         raise ToolchainError(str(error)) from None
 

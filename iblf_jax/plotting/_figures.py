@@ -657,7 +657,7 @@ def paper_figures(runs: Runs, *, zoom: float | None = None, note: str = "") -> d
     curves = curves_of(runs)
     n = curves[0].run.n
     e2 = " and ".join(f"$e_{{2{joint + 1}}}$" for joint in range(n))
-    notes = [note] if note else []
+    notes = [note] if checks.string("note", note, "a sentence") else []
     found = {}
     for joint in range(min(n, 2)):
         number = joint + 1

@@ -23,8 +23,10 @@ from iblf_jax.plotting._panels import (
     annotate_clipped_peak,
     disturbance_quantity,
     draw,
+    draw_band,
     draw_bounds,
     level_quantity,
+    noise_band,
     quantity_of,
     say_zero,
     set_limits,
@@ -145,11 +147,23 @@ def _together(figure: Figure, where: SubplotSpec, curve: Curve, window: Window) 
             if line.get_label() == symbol:
                 line.set(color=_style.blend(0.396), linewidth=2.4)
             line.set_label("_")
-    axes = figure.add_subplot(cells[5])
+    _lyapunov(figure.add_subplot(cells[5]), curve, window)
+
+
+def _lyapunov(axes: Axes, curve: Curve, window: Window) -> None:
+    """The Lyapunov function on a logarithmic axis, as a band where it is a noise there."""
     V = curve["V"]
+    t = curve.t[: len(V)]
     positive = np.where(np.isfinite(V) & (V > 0), V, np.nan)
-    axes.plot(*thinned(curve.t[: len(V)], positive), color=_style.blend(0.733))
-    energy = scenario.loop.model.energy_of_errors
+    colour = _style.blend(0.733)
+    band = noise_band(t, np.log(positive))
+    if band is None:
+        axes.plot(*thinned(t, positive), color=colour)
+    else:
+        middle, low, high, mean = band
+        draw_band(axes, middle, np.exp(low), np.exp(high), {"color": colour})
+        axes.plot(middle, np.exp(mean), color=colour)
+    energy = curve.run.scenario.loop.model.energy_of_errors
     symbol = r"$\sum w_i V_i$" if is_default(energy, Plant.energy_of_errors) else "$V_2$"
     if np.isfinite(positive).any():
         axes.set_yscale("log")

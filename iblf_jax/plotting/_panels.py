@@ -49,6 +49,9 @@ NOISE_BLOCKS = 80
 """Number of blocks in which a noise is drawn as a band."""
 NOISE_REVERSALS = 0.3
 """Share of the steps of a noise that change their sign, at least; white noise has 2/3."""
+NOISE_CROSSINGS = 4.0
+"""Or a noise passes its range in a block at least so many times: one that a sampled law holds moves
+smoothly between the samples, and its steps rarely change their sign."""
 NOISE_SIZE = 0.03
 """Typical range of a noise in a block, as a share of the range of the signal, at least."""
 
@@ -250,13 +253,13 @@ def draw(
     band = noise_band(t[in_window], y[in_window])
     if band is not None:
         shown_t, low, high, shown_y = band
-        _draw_band(axes, shown_t, low, high, options)
+        draw_band(axes, shown_t, low, high, options)
         options["drawstyle"] = "default"
     axes.plot(shown_t, shown_y, **options)
     return y[in_window]
 
 
-def _draw_band(
+def draw_band(
     axes: Axes, t: np.ndarray, low: np.ndarray, high: np.ndarray, options: dict[str, Any]
 ) -> None:
     """Draws the range of a noise in the colour of its line."""
@@ -269,17 +272,22 @@ def noise_band(t: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...] | None:
     """Times, lowest and highest values and means of the blocks of a noise, which a line would fill;
     None for a signal without noise.
 
-    A signal is a noise if at least NOISE_REVERSALS of its steps change their sign, its blocks have
-    several samples each, and its typical range in a block is visible.
+    A signal is a noise if at least NOISE_REVERSALS of its steps change their sign, or if it passes
+    its range in a block at least NOISE_CROSSINGS times; its blocks must have several samples each,
+    and its typical range in a block must be visible.
     """
     if len(y) < 4 * NOISE_BLOCKS or not np.all(np.isfinite(y)):
         return None
     steps = np.diff(y)
-    steps = steps[steps != 0.0]  # A held sample changes nothing.
-    if len(steps) < 2 * NOISE_BLOCKS or np.mean(steps[1:] * steps[:-1] < 0.0) < NOISE_REVERSALS:
+    jumps = steps[steps != 0.0]  # A held sample changes nothing.
+    if len(jumps) < 2 * NOISE_BLOCKS:
         return None
     starts = np.linspace(0, len(y), NOISE_BLOCKS + 1).astype(int)
     low, high = (f.reduceat(y, starts[:-1]) for f in (np.minimum, np.maximum))
+    path = np.add.reduceat(np.append(np.abs(steps), 0.0), starts[:-1])
+    crosses = np.median(path) >= NOISE_CROSSINGS * np.median(high - low)
+    if not crosses and np.mean(jumps[1:] * jumps[:-1] < 0.0) < NOISE_REVERSALS:
+        return None
     if np.median(high - low) < NOISE_SIZE * np.ptp(y):
         return None
     sizes = np.diff(starts)

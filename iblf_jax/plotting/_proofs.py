@@ -78,15 +78,15 @@ def _heading(found: Proof) -> str:
 
 
 def _draw_violation(axes: Axes, found: Proof, i: int) -> None:
-    """The run that violates the bounds, at the times of its start; in red for the joint that leaves
-    them.
+    """The run that refutes the statement, at the times of its start; in red for the joint that
+    leaves its bounds.
     """
     (curve,) = curves_of(found.replay())
     assert found.violation is not None
     t = curve.t[: curve.samples] + found.violation.state.t
     shown = t <= found.duration
     style: dict[str, Any] = {"color": _style.blend(0.733), "linewidth": 1.2}
-    style["label"] = "run that violates a bound"
+    style["label"] = "run that refutes the statement"
     if curve.exit_index("q", i) is not None:
         style |= {"color": _style.failure(), "label": "joint that violates its bounds"}
     axes.plot(t[shown], curve["q"][shown, i], **style)

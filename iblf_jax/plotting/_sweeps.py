@@ -100,9 +100,7 @@ def heat_map(
     """
     if isinstance(metric, str):
         metric = [metric]
-    metrics = list(metric)
-    if not metrics:
-        raise checks.fail("metric", metric, "at least one name")
+    metrics = checks.nonempty_list("metric", metric, '["failed", "rmse"], or a name')
     width = _style.WIDTH
     if len(metrics) > 1:
         width = 5.2 * len(metrics)

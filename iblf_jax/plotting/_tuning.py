@@ -309,8 +309,12 @@ def paths(
     points = checks.positive_integer("points", points, least=2, most=checks.MAX_POINTS)
     pair = [result.names.index(name) for name in names]
     iterates = {"tune": result.history["x"][:, result.best_start][:, pair]}
-    for name, x in (others or {}).items():
-        iterates[name] = np.asarray(x, float).reshape(-1, 2)
+    others = {} if others is None else checks.mapping("others", others, '{"grid": tried}')
+    for name, x in others.items():
+        tried = np.asarray(checks.as_floats(f"others[{name!r}]", x))
+        if tried.ndim != 2 or tried.shape[1] != 2:
+            raise checks.fail(f"others[{name!r}]", x, "the values of the two gains, (N, 2)")
+        iterates[name] = tried
     tuned = result.tuned[pair]
     all_gains = np.concatenate([*iterates.values(), tuned[None]])
     logarithmic = bool(np.all(all_gains > 0))

@@ -116,8 +116,10 @@ def _differ_most_before(curves: list[Curve], joint: int, end: float) -> bool:
 
 def _name_window(axes: Axes, curves: list[Curve], row: PanelRow, end: float, reason: str) -> None:
     """Adds the reason for the window of a panel, and the range of its quantity after the window, to
-    its title.
+    its title; in a paper the caption says it.
     """
+    if _style.in_paper():
+        return
     words = ",\n".join(filter(None, [reason, range_after(curves, row.quantity, row.joint, end)]))
     axes.set_title("\n".join(filter(None, [axes.get_title(), words])))
 

@@ -6,11 +6,12 @@ V_w = V with the weight w of the estimation error.  Four steps answer:
    largest ones by random steps.  If every weight has a point with V_w' > 0, no weight proves the
    statement.
 2. At the weight with the least largest V_w', or at a neighbour with which the search advances
-   faster, branch and bound with outward rounding decides whether V_w' < 0 everywhere.
+   faster, branch and bound with outward rounding decides whether V_w' < 0 everywhere.  For a
+   sampled loop, a search before it proves bounds of the rates of a held torque.
 3. At this weight, bounds of the torque on the whole set are proved. Limits of the torque are part
    of the statement: weights with a torque beyond them do not count.
 4. Without a proof, runs start at the points with the largest V_w': one that violates the bounds
-   refutes the statement.
+   refutes the statement, and of a sampled loop one with V_w > level at a sample.
 """
 
 from __future__ import annotations
@@ -35,12 +36,15 @@ from iblf_jax.engine.simulate import SimulationWarning, simulate
 from iblf_jax.kernels import UnsupportedError, enclose
 from iblf_jax.proofs.arms import ArmProblem, arm_problem
 from iblf_jax.proofs.chains import chain_problem
+from iblf_jax.proofs.held_rates import proved_rates
 from iblf_jax.proofs.periods import AperiodicError
 from iblf_jax.proofs.points import PARENTS, Sampled, sample_weights
 from iblf_jax.proofs.problem import LevelSetProblem
 from iblf_jax.proofs.proposal import LevelChoice, Proposal, Start, proposed_level, start_of
 from iblf_jax.proofs.result import GrowthPoint, Proof, Verdict, Violation, WorstBox
+from iblf_jax.proofs.sampled_values import sampled_values
 from iblf_jax.proofs.search import SearchedBox, SearchResult, search
+from iblf_jax.proofs.support import step_within
 from iblf_jax.proofs.torque import TorqueRange, found_torque, proved_torque
 from iblf_jax.proofs.undecided import left_over
 from iblf_jax.simulation.results import Rollout
@@ -64,6 +68,9 @@ LEAST_DURATION = 5.0
 """Length of these runs, at least [s]."""
 TIME_STEPS = (1e-3, 1e-4, 1e-5)
 """Their time steps [s]: the first one with which a run is accurate."""
+EXCESS = 1e-6
+"""Part of the level by which V_w must be above it at a sample to refute: the start is on the level
+but for rounding, which is smaller by far."""
 UNRELIABLE = Status.INACCURATE | Status.STEP_TOO_LARGE
 """Flags of runs that refute nothing."""
 
@@ -96,7 +103,9 @@ def prove(
     Args:
       scenario: the loop of a robot with the corrected backstepping law and the momentum observer,
         whose torque may have limits (`Saturated`, `Motor`), or of a plant in strict-feedback form
-        of order 2 or 3 with one number per level and the law `BarrierBackstepping`.
+        of order 2 or 3 with one number per level and the law `BarrierBackstepping`.  The loop of a
+        robot may be sampled, with the observer's step "poles" or "euler", exact measurements and no
+        delay; the statement then is about all times, also between samples.
       level: level c of V_w, in its unit, N m rad for robots. If not given, for a robot half of the
         greatest level at which no point with V_w' > 0 was found, or the least level whose set
         contains the start if that is more; `Proof.level_choice` has both. `largest_level` searches
@@ -114,7 +123,7 @@ def prove(
       threads: number of threads; one for each processor if not given.
       progress: whether a bar shows the progress; None for where a user sees it.
       checkpoint: file from which an interrupted search continues, and to which it is written.
-      runs: number of runs that try to refute the bounds where no proof is found; 0 for none.
+      runs: number of runs that try to refute the statement where no proof is found; 0 for none.
       seed: of the random points.
 
     Returns:
@@ -319,15 +328,17 @@ def _searched_at_best(
     problem: LevelSetProblem, level: float, admitted: Sequence[Sampled], options: _Options
 ) -> dict[str, Any]:
     """The fields of a `Proof` at the best of some weights, from a search."""
-    best, result = _search_best_weight(problem, level, admitted, options)
-    fields = _of_search(problem, level, best.weight, result, options.seed)
+    best, found = _search_best_weight(problem, level, admitted, options)
+    result = found.result
+    fields = _of_search(problem, found, options.seed)
+    is_proved = result.proved and not found.is_of_held_rates
     is_within = True
     if problem.torque is not None:
-        torque = _torque(problem, level, best, options, to_prove=result.proved)
+        torque = _torque(problem, level, best, options, to_prove=is_proved)
         fields["torque"] = torque
         is_within = problem.torque.limits is None or torque.is_proved
     violation, verdict = None, Verdict.PROVED
-    if not result.proved or not is_within:
+    if not is_proved or not is_within:
         violation = _refuted(problem, level, best, options.runs)
         verdict = Verdict.UNDECIDED if violation is None else Verdict.REFUTED
     return {"verdict": verdict, "weight": best.weight, "violation": violation, **fields}
@@ -362,9 +373,20 @@ def _excess(problem: LevelSetProblem, level: float, at: Sampled, options: _Optio
 # --- branch and bound ----------------------------------------------------------------------------
 
 
+class _RateSearch(NamedTuple):
+    """A search for V_w' < 0."""
+
+    result: SearchResult
+    constants: list[np.ndarray]
+    """Of the bound."""
+    is_of_held_rates: bool = False
+    """Whether the search is the one for bounds of the rates of a held torque, which was not
+    complete, so that none for V_w' began."""
+
+
 def _search_best_weight(
     problem: LevelSetProblem, level: float, sampled: Sequence[Sampled], options: _Options
-) -> tuple[Sampled, SearchResult]:
+) -> tuple[Sampled, _RateSearch]:
     """The search at the weight with the least largest V_w', or at a neighbour with which it
     advances faster.
     """
@@ -381,36 +403,53 @@ def _search_best_weight(
     trials = min(TRIAL_BOXES, options.max_boxes)
     results = []
     for candidate in candidates:
-        result = _rate_searched(candidate.weight, problem, level, trials, options)
-        if result.proved:
-            return candidate, result
-        results.append((candidate, result))
-    candidate, result = max(results, key=lambda pair: pair[1].done)
-    if trials == options.max_boxes:
-        return candidate, result
-    most = options.max_boxes
-    result = _rate_searched(
-        candidate.weight, problem, level, most, options, checkpoint=options.checkpoint
-    )
-    return candidate, result
+        found = _rate_searched(candidate.weight, problem, level, trials, options)
+        if found.result.proved and not found.is_of_held_rates:
+            return candidate, found
+        results.append((candidate, found))
+    candidate, found = max(results, key=_progress)
+    if trials == options.max_boxes or found.is_of_held_rates:
+        return candidate, found
+    most, constants = options.max_boxes, found.constants
+    result = _bound_searched(problem, constants, most, options, checkpoint=options.checkpoint)
+    return candidate, found._replace(result=result)
+
+
+def _progress(pair: tuple[Sampled, _RateSearch]) -> tuple[bool, float]:
+    """How far a search for V_w' < 0 came."""
+    _, found = pair
+    return not found.is_of_held_rates, found.result.done
 
 
 def _rate_searched(
-    weight: float,
+    weight: float, problem: LevelSetProblem, level: float, max_boxes: int, options: _Options
+) -> _RateSearch:
+    """The search for V_w' < 0 at a weight."""
+    constants = problem.constants(weight, level)
+    searched = functools.partial(_searched, problem, options)
+    if problem.held_torque is not None:
+        limits, result = proved_rates(problem, constants, searched, options.max_boxes, options.seed)
+        if limits is None:
+            return _RateSearch(result, constants, is_of_held_rates=True)
+        constants = [*constants, limits]
+    return _RateSearch(_bound_searched(problem, constants, max_boxes, options), constants)
+
+
+def _bound_searched(
     problem: LevelSetProblem,
-    level: float,
+    constants: list[np.ndarray],
     max_boxes: int,
     options: _Options,
     **more: Any,
 ) -> SearchResult:
-    """The search for V_w' < 0 at a weight."""
+    """The search for V_w' < 0 with the constants of the bound."""
     return _searched(
         problem,
         options,
         problem.bound,
         problem.lower,
         problem.upper,
-        problem.constants(weight, level),
+        constants,
         scales=problem.scales,
         max_boxes=max_boxes,
         **more,
@@ -434,23 +473,26 @@ def _searched(
         raise checks.fail("prove: scenario", checks.Words(str(error)), expected) from error
 
 
-def _of_search(
-    problem: LevelSetProblem, level: float, weight: float, result: SearchResult, seed: int
-) -> dict[str, Any]:
+def _of_search(problem: LevelSetProblem, found: _RateSearch, seed: int) -> dict[str, Any]:
     """The fields of a `Proof` that describe its search."""
+    result, constants = found.result, found.constants
+    if found.is_of_held_rates:
+        return {"boxes": result.boxes}
     fields: dict[str, Any] = {"boxes": result.boxes, "done": result.done}
+    if problem.held_torque is not None:
+        fields["held_rates"] = constants[-1]
     if result.expected is not None:
         fields["expected_boxes"] = tuple(result.expected)
     if result.worst is not None:
-        fields["worst_box"] = _worst_box(problem, level, weight, result.worst)
+        fields["worst_box"] = _worst_box(problem, constants, result.worst)
     if result.proved:
         return fields
     fields["units_left"] = (len(result.left), result.units)
-    left = left_over(problem, problem.constants(weight, level), result.left, seed)
+    left = left_over(problem, constants, result.left, seed)
     return fields if left is None else fields | left._asdict()
 
 
-def _worst_box(problem: LevelSetProblem, level: float, weight: float, box: SearchedBox) -> WorstBox:
+def _worst_box(problem: LevelSetProblem, constants: list[np.ndarray], box: SearchedBox) -> WorstBox:
     """The worst box with the names of its coordinates, and its bounds with narrower intervals."""
     intervals = {
         name: (float(low), float(high))
@@ -462,7 +504,6 @@ def _worst_box(problem: LevelSetProblem, level: float, weight: float, box: Searc
         lower[row, k] = upper[row, k] = 0.5 * (box.lower[k] + box.upper[k])
     narrowed = {}
     if wide:
-        constants = problem.constants(weight, level)
         _, bounds = enclose(problem.bound, lower, upper, constants)
         least = bounds[0].min(axis=1)
         narrowed = {problem.names[k]: float(x) for k, x in zip(wide, least, strict=True)}
@@ -475,36 +516,72 @@ def _worst_box(problem: LevelSetProblem, level: float, weight: float, box: Searc
 def _refuted(
     problem: LevelSetProblem, level: float, sampled: Sampled, runs: int
 ) -> Violation | None:
-    """A run that starts in the set and violates the bounds; None if none was found.
+    """A run that starts in the set and violates the bounds, or of a sampled loop leaves the set;
+    None if none was found.
 
-    Runs start at the points with the largest V_w' that were found.  The time step is reduced until
-    the run is accurate; a run that is not accurate with the smallest one refutes nothing.
+    Runs start at the points with the largest V_w' that were found, or, if a part of the scenario
+    cannot be moved in time, at t = 0 with the other coordinates of these points.  The time step is
+    reduced until the run is accurate; a run that is not accurate with the smallest one refutes
+    nothing.
     """
     constants = problem.constants(sampled.weight, level)
     for point in sampled.points[:runs]:
-        duration = max(problem.duration, LEAST_DURATION)
-        if not problem.is_period:
-            duration = max(problem.duration - point[0], TIME_STEPS[0])
         try:
             scenario = problem.scenario_at(point, constants)
         except AperiodicError as error:
-            notices.warn(f"No run tried to refute the bounds: {error}.")
-            return None
-        for dt in TIME_STEPS:
+            notices.warn(f"The runs that try to refute the bounds start at t = 0: {error}.")
+            # Its other coordinates are a point of the level set at each time.
+            point = np.concatenate([[0.0], point[1:]])
+            scenario = problem.scenario_at(point, constants)
+        duration = max(problem.duration, LEAST_DURATION)
+        if not problem.is_period:
+            duration = max(problem.duration - point[0], TIME_STEPS[0])
+        for longest in TIME_STEPS:
+            dt = step_within(scenario, longest)
             run = _run(scenario, duration, dt)
             if not int(run.status) & Status.INACCURATE:
                 break
-        if int(run.status) & UNRELIABLE or not int(run.status) & Status.BOUND_VIOLATED:
+        if int(run.status) & UNRELIABLE:
             continue
+        value = None
+        if not int(run.status) & Status.BOUND_VIOLATED:
+            value = _value_above(scenario, run, level, sampled.weight, dt)
+            if value is None:
+                continue
         margin = float(np.min(np.asarray(run.metrics["margin"])))
         state = problem.state_of(point, constants)
-        return Violation(scenario, state, int(run.steps or 0) * dt, dt, margin)
+        return Violation(scenario, state, int(run.steps or 0) * dt, dt, margin, value)
+    return None
+
+
+def _value_above(
+    scenario: Scenario, run: Rollout, level: float, weight: float, dt: float
+) -> float | None:
+    """The largest V_w at a sample, if the loop is sampled and V_w is above the level there by more
+    than the difference that half of the time step makes; None otherwise.
+    """
+    if scenario.sampling is None:
+        return None
+    values = sampled_values(scenario, run, weight)
+    # A comparison with NaN is False.
+    if not np.max(values) > (1.0 + EXCESS) * level:
+        return None
+    again = _run(scenario, int(run.steps or 0) * dt, 0.5 * dt)
+    finer = sampled_values(scenario, again, weight)
+    k = int(np.argmax(np.minimum(values, finer)))
+    value = min(values[k], finer[k])
+    if value - level > max(EXCESS * level, abs(values[k] - finer[k])):
+        return float(value)
     return None
 
 
 def _run(scenario: Scenario, duration: float, dt: float) -> Rollout:
-    """A run, whose violations are no surprise."""
-    steps = math.floor(duration / dt)
+    """A run, whose violations are no surprise, recorded at the samples of a sampled loop."""
+    steps = math.floor(duration / dt * (1.0 + 1e-9))
+    every = steps
+    if scenario.sampling is not None:
+        every = round(float(scenario.sampling.period) / dt)
+        steps = max(1, steps // every) * every
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", SimulationWarning)
-        return simulate(scenario, duration=steps * dt, dt=dt, record_every=steps)
+        return simulate(scenario, duration=steps * dt, dt=dt, record_every=every)

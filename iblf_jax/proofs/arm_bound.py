@@ -302,7 +302,7 @@ class Corner(NamedTuple):
     """The terms of (B.1) at a corner of the box of parameters."""
 
     force: jax.Array
-    """|f0|, () [N m/s]."""
+    """|f0|, () [N m/s]; with a held torque |push|/w_f."""
     gain: jax.Array
     """lambda, () [1/s]."""
     coupling: jax.Array
@@ -315,24 +315,40 @@ class Corner(NamedTuple):
     min K2 and mu = m - 1/(4K)."""
 
 
+class HeldTorque(NamedTuple):
+    """What a held torque adds to (B.1), as a function of f_tilde (`arm_held`)."""
+
+    power: jax.Array
+    """Of V_w' at f_tilde = 0, () [N m rad/s]."""
+    push: jax.Array
+    """Of the coefficients of f_tilde, (n,) [rad/s]."""
+    slope: jax.Array
+    """Of H, (n, n) [1/s]."""
+
+
 def corner_terms(
-    constants: Constants, places: Places, point: ArmErrors, z: jax.Array
+    constants: Constants,
+    point: ArmErrors,
+    vertices: list[Affine],
+    held_torque: HeldTorque | None = None,
 ) -> list[Corner]:
-    """The terms of (B.1) at each corner of the box of parameters."""
+    """The terms of (B.1) at each corner of the box of parameters, from f' there."""
     parts, weight, b = constants.parts, constants.weight, point.b
     e2 = point.errors.e2
     kf, K = jnp.diag(parts.kf), jnp.min(parts.law.K2)
     terms = []
-    for vertex in corners(mismatch(constants, places, point.errors, z), z):
-        gain = least_eigenvalue(kf - 0.5 * (vertex.slope + vertex.slope.T))
-        push = weight * vertex.value
+    for vertex in vertices:
+        push, slope, force = weight * vertex.value, vertex.slope, norm(vertex.value)
+        if held_torque is not None:
+            push, slope = push + held_torque.push, slope + held_torque.slope
+            force = norm(push) / weight
+        gain = least_eigenvalue(kf - 0.5 * (slope + slope.T))
         drive = norm(e2 + push)
         m = weight * gain
         largest, least = upper(drive), lower(m)
         square = largest**2 / (4.0 * least) - least * (b - largest / (2.0 * least)) ** 2
         mu = lower(m - 1.0 / (4.0 * K))
         directed = inner(push, 2.0 * e2 + push) * K - K * (drive - b / (2.0 * K)) ** 2 - mu * b**2
-        force = norm(vertex.value)
         terms.append(Corner(force, gain, b * drive - m * b**2, square, directed))
     return terms
 
@@ -351,15 +367,30 @@ def arm_bound(places: Places, n: int, x: jax.Array, constants: Constants) -> jax
     """
     at = coordinates(x, n, places.coordinates)
     point = arm_errors(constants, at)
+    vertices = corners(mismatch(constants, places, point.errors, at.z), at.z)
+    bounds = bounds_from(constants, point, dissipation_bound(constants, point), vertices)
+    return jnp.where(is_inside_guard(constants, point), bounds, jnp.inf)
+
+
+def bounds_from(
+    constants: Constants,
+    point: ArmErrors,
+    losses: jax.Array,
+    vertices: list[Affine],
+    held_torque: HeldTorque | None = None,
+) -> jax.Array:
+    """Upper bounds of V_w' from lower bounds of the dissipation and f' at the corners of the box
+    of parameters, (3,) [N m rad/s].
+    """
     e2, b = point.errors.e2, point.b
-    losses = dissipation_bound(constants, point)
-    terms = corner_terms(constants, places, point, at.z)
+    if held_torque is not None:
+        losses = losses - held_torque.power
+    terms = corner_terms(constants, point, vertices, held_torque)
     coupling = jnp.max(jnp.stack([jnp.minimum(term.coupling, term.square) for term in terms]))
     direct = coupling - losses - inner(e2, constants.parts.law.K2 * e2)
     directed = jnp.max(jnp.stack([term.directed for term in terms])) - losses
     squares = _squares(constants, norm(e2), b, terms) - losses
-    inside = is_inside_guard(constants, point)
-    return jnp.where(inside, jnp.stack([direct, squares, directed]), jnp.inf)
+    return jnp.stack([direct, squares, directed])
 
 
 def is_inside_guard(constants: Constants, point: ArmErrors) -> jax.Array:

@@ -61,11 +61,13 @@ class ArmParts(NamedTuple):
     law: controllers.Backstepping
     """Its barrier has no guard."""
     kf: jax.Array
-    """Gain of the observer, (n,) [1/s]."""
+    """Gain of the observer, (n,) [1/s]; of a sampled one, that of a period."""
     reference: Reference
     bounds: Bounds
     guard: jax.Array
     """Guard of the law's barrier, () [1]."""
+    period: jax.Array | None = None
+    """Of the samples, () [s]; None for a continuous loop."""
 
 
 class Errors(NamedTuple):

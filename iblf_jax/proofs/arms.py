@@ -18,17 +18,18 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from iblf_jax.control import controllers, observers
+from iblf_jax.control import controllers, observers, sensors
 from iblf_jax.core import checks
 from iblf_jax.core.linalg import matvec
 from iblf_jax.core.pytree import astype
-from iblf_jax.proofs import arm_motion, uncertainty
+from iblf_jax.proofs import arm_held, arm_motion, uncertainty
 from iblf_jax.proofs.arm_bound import Constants, arm_bound
 from iblf_jax.proofs.arm_motion import ArmParts, Errors, position
 from iblf_jax.proofs.arm_torque import torque_excess
 from iblf_jax.proofs.matrices import solve_transposed, upper_factor
 from iblf_jax.proofs.parameters import Uncertain, uncertain_coordinates
 from iblf_jax.proofs.problem import (
+    HeldFunctions,
     LevelSetProblem,
     LevelSetState,
     OfStructure,
@@ -36,9 +37,9 @@ from iblf_jax.proofs.problem import (
     split_point,
 )
 from iblf_jax.proofs.support import (
-    CONTINUOUS,
     INSTANTS,
     REAL_NUMBERS,
+    SAMPLED_REAL_NUMBERS,
     bounds_of,
     check_absent,
     check_exponential,
@@ -57,6 +58,7 @@ from iblf_jax.proofs.torque import without_limits
 from iblf_jax.proofs.uncertainty import Places
 from iblf_jax.proofs.users_parts import agreement_of_robot
 from iblf_jax.simulation.initial import Initial
+from iblf_jax.simulation.sampling import Sampling
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.world import plants
@@ -66,10 +68,23 @@ from iblf_jax.world.references import WaypointSpline
 from iblf_jax.world.robots import Robot
 
 APPLIED = "The torque of the law is applied as it is: without {parts} or delay."
+HELD_TORQUE = (
+    "Law and observer read exact measurements at the same instant every {period:g} s, and their"
+    " torque is held from this instant to the next one; the observer makes a step of the kind"
+    ' "{observer}" meanwhile.',
+    "A run starts at a sample, so that each torque is one that the law commanded inside the set."
+    " V_w of a state between samples is that of the torque that the law would command there, and of"
+    " the estimate interpolated by (G.6).",
+)
 EXACT = (
     "The observer's error and the state are exactly those of the level set; measurements have no"
     " noise."
 )
+KNOWN_STEPS = ("poles", "euler")
+"""Steps of the observer whose estimate the bound has between samples."""
+MOST_NUMBERS = 6
+"""Largest number m of uncertain numbers: the bound has a copy of its terms for each of 2^m corners.
+Plants in strict-feedback form have a bound without corners."""
 VECTORS = ("q", "dq", "f_tilde", "f_hat", "eta")
 """Vectors of a point in physical numbers, as in `LevelSetState`."""
 
@@ -94,6 +109,57 @@ class ArmRate(OfStructure):
         rate = arm_motion.lyapunov_rate(at.parts, numbers.weight, at.errors, at.f_tilde, at.rate)
         now = arm_motion.motion(at.parts, at.errors, at.f_tilde).now
         return infinite_unless_defined(rate, arm_motion.required_torque(at.parts, now))
+
+
+class SampledArmBound(OfStructure):
+    """The bound of sampled arms of one structure."""
+
+    def __call__(self, x: jax.Array, constants: list[jax.Array]) -> tuple[jax.Array, jax.Array]:
+        """The upper bound of V_w' over a box, and no region; the last constant are bounds of the
+        rates.
+        """
+        *leaves, limits = constants
+        numbers: Constants = jax.tree.unflatten(self.structure, leaves)
+        n = numbers.parts.kf.shape[0]
+        rates = arm_held.PathRates(*limits)
+        return arm_held.held_bound(self.places, n, x, numbers, rates), jnp.zeros((0,))
+
+
+class HeldRatesExcess(OfStructure):
+    """The bound of the rates of sampled arms of one structure, in parts of their limits."""
+
+    def __call__(self, x: jax.Array, constants: list[jax.Array]) -> tuple[jax.Array, jax.Array]:
+        """Its upper bound over a box, and no region; the last constant are the limits."""
+        *leaves, limits = constants
+        numbers: Constants = jax.tree.unflatten(self.structure, leaves)
+        rates = arm_held.PathRates(*limits)
+        return arm_held.rate_excess(self.places, x, numbers, rates), jnp.zeros((0,))
+
+
+class HeldRates(OfStructure):
+    """The rates of a held torque at a point of sampled arms of one structure."""
+
+    def __call__(self, point: jax.Array, constants: list[jax.Array]) -> jax.Array:
+        """Those at the age 0, (3, n) [N m/s]."""
+        numbers: Constants = jax.tree.unflatten(self.structure, constants)
+        at = point_of(self.places, jnp.asarray(point), numbers)
+        return jnp.stack(arm_held.rates_at(at.parts, at.errors, at.f_tilde))
+
+
+class SampledArmRate(ArmRate):
+    """V_w' at a point of sampled arms of one structure, to first order in the period."""
+
+    def __call__(self, point: jax.Array, constants: list[jax.Array]) -> jax.Array:
+        """The larger one of those at the ages 0 and a period of the torque, () [N m rad/s]."""
+        fresh = super().__call__(point, constants)
+        numbers: Constants = jax.tree.unflatten(self.structure, constants)
+        at = point_of(self.places, jnp.asarray(point), numbers)
+        h = cast(jax.Array, numbers.parts.period)
+        rates = arm_held.rates_at(at.parts, at.errors, at.f_tilde)
+        added = arm_held.held_addition(
+            at.parts, numbers.weight, at.errors, at.f_tilde, -h * rates.command, h * rates.lag
+        )
+        return fresh + jnp.maximum(added, 0.0)
 
 
 class ArmTorqueExcess(OfStructure):
@@ -155,7 +221,7 @@ def point_of(places: Places, point: jax.Array, constants: Constants) -> ArmPoint
 class ArmProblem(LevelSetProblem):
     """The proof problem of an arm."""
 
-    bound: ArmBound
+    bound: ArmBound | SampledArmBound
     parts: ArmParts
     units: ClassVar[tuple[str, str]] = ("rad/(N m)", "N m rad")
     first_barrier: ClassVar[str] = "barrier"
@@ -205,7 +271,7 @@ class ArmProblem(LevelSetProblem):
 
 @functools.partial(jax.jit, static_argnums=0)
 def _physical(
-    bound: ArmBound, point: jax.Array, constants: list[jax.Array]
+    bound: OfStructure, point: jax.Array, constants: list[jax.Array]
 ) -> dict[str, jax.Array]:
     """Time, position, velocity, f_tilde, f_hat, eta and the further rate at a point."""
     at = point_of(bound.places, point, jax.tree.unflatten(bound.structure, constants))
@@ -242,9 +308,10 @@ def arm_problem(
     with jax.enable_x64(True):
         scenario = canonical(astype(scenario, jnp.float64))
         free, limits = without_limits(scenario)
-        _check_rate(disturbance_rate, limits)
+        _check_rate(disturbance_rate, limits, scenario.sampling)
         parts = _parts_of(free)
         uncertain = uncertain_coordinates(scenario, parameters, disturbance_rate)
+        _check_count(len(uncertain.low))
         varying = {
             "reference": scenario.reference,
             **bounds_of(scenario),
@@ -259,16 +326,21 @@ def arm_problem(
         zero = jnp.zeros(())
         structure = jax.tree.structure(Constants(parts, uncertain.numbers, zero, zero))
     of_structure = (structure, uncertain.places, tuple(examination.digests))
-    applied = APPLIED.format(parts="sampling, saturation" if limits is None else "sampling")
     claims = claim_sentences([parts.law.barrier])
-    assumptions = (REAL_NUMBERS, applied, EXACT, *claims, *examination.assumed)
+    assumptions = (*_timing(scenario, limits), EXACT, *claims, *examination.assumed)
     torque = TorqueFunctions(ArmTorque(*of_structure), ArmTorqueExcess(*of_structure), limits)
+    bound: ArmBound | SampledArmBound = ArmBound(*of_structure)
+    rate, held_torque = ArmRate(*of_structure), None
+    if scenario.sampling is not None:
+        bound, rate = SampledArmBound(*of_structure), SampledArmRate(*of_structure)
+        held_torque = HeldFunctions(HeldRates(*of_structure), HeldRatesExcess(*of_structure))
     return ArmProblem(
         scenario,
         uncertain,
-        ArmBound(*of_structure),
-        ArmRate(*of_structure),
+        bound,
+        rate,
         torque if disturbance_rate is None else None,
+        held_torque,
         length,
         is_period,
         assumptions,
@@ -284,15 +356,14 @@ def check_supported(scenario: Scenario) -> None:
     not known here.
     """
     _check_plant(scenario)
+    # It comes before the law, whose claims are compiled.
+    _check_sampling(scenario)
     _check_law(scenario.controller)
     observer = scenario.observer
     if type(observer) is not observers.Momentum:
         reason = "The error of this observer does not obey f_tilde' = f' - kf f_tilde."
         raise unsupported("observer", type(observer).__name__, "observers.Momentum", reason)
-    reasons = {
-        "sampling": CONTINUOUS,
-        "process_noise": "V_w' of a stochastic loop has further terms.",
-    }
+    reasons = {"process_noise": "V_w' of a stochastic loop has further terms."}
     check_absent(scenario, reasons, input="torque", rate="f'")
     if scenario.bounds[1] is not None:
         reason = "The level set bounds positions only."
@@ -312,15 +383,72 @@ def check_supported(scenario: Scenario) -> None:
         raise unsupported("reference and bounds", f"{smooth:g}", expected, reason)
 
 
-def _check_rate(disturbance_rate: ArrayLike | None, limits: np.ndarray | None) -> None:
-    """Raises ValueError for limits of the torque and a disturbance without a bound."""
-    if disturbance_rate is None or limits is None:
+def _check_sampling(scenario: Scenario) -> None:
+    """Raises ValueError for samples of which the age of the torque, or what the law reads, is not
+    known here.
+    """
+    sampling = scenario.sampling
+    if sampling is None:
+        return
+    if type(scenario.sensor) is not sensors.Ideal:
+        reason = "The bound has no errors of measurements, and no velocity from differences."
+        raise unsupported("sensor", type(scenario.sensor).__name__, "sensors.Ideal", reason)
+    if sampling.trigger is not None:
+        reason = "A command that is not sent leaves an old torque, whose age has no bound."
+        raise unsupported("sampling.trigger", type(sampling.trigger).__name__, "None", reason)
+    if float(sampling.delay) > 0.0:
+        reason = (
+            "The bound is that of a torque that is applied from its sample on, and until the first"
+            " command arrives the torque is not one of the law."
+        )
+        raise unsupported("sampling.delay", float(sampling.delay), "0 s", reason)
+    if sampling.observer not in KNOWN_STEPS:
+        reason = (
+            "Its estimate is off by about kf period / 2 times the torque that accelerates the"
+            " robot, which the bound does not have."
+        )
+        expected = " or ".join(f'"{step}"' for step in KNOWN_STEPS)
+        raise unsupported("sampling.observer", sampling.observer, expected, reason)
+
+
+def _timing(scenario: Scenario, limits: np.ndarray | None) -> list[str]:
+    """Sentences on time and on how the torque is applied."""
+    sampling = scenario.sampling
+    if sampling is None:
+        parts = "sampling, saturation" if limits is None else "sampling"
+        return [REAL_NUMBERS, APPLIED.format(parts=parts)]
+    numbers = {"period": float(sampling.period), "observer": sampling.observer}
+    return [SAMPLED_REAL_NUMBERS, *(sentence.format(**numbers) for sentence in HELD_TORQUE)]
+
+
+def _check_rate(
+    disturbance_rate: ArrayLike | None, limits: np.ndarray | None, sampling: Sampling | None
+) -> None:
+    """Raises ValueError for a disturbance without a bound, where one is needed."""
+    if disturbance_rate is None:
+        return
+    if sampling is not None:
+        remedy = (
+            "The bound of a sampled loop does not have it. Add a disturbance with an uncertain"
+            " parameter to the scenario."
+        )
+        raise checks.fail("disturbance_rate", disturbance_rate, "None with a sampling", remedy)
+    if limits is None:
         return
     remedy = (
         "A disturbance of which only the rate is bounded may need any torque. Add a disturbance"
         " with an uncertain parameter to the scenario, or leave out the limits of the torque."
     )
     raise checks.fail("disturbance_rate", disturbance_rate, "None with torque limits", remedy)
+
+
+def _check_count(count: int) -> None:
+    """Raises ValueError for too many uncertain numbers."""
+    if count <= MOST_NUMBERS:
+        return
+    expected = f"at most {MOST_NUMBERS} uncertain numbers, those of disturbance_rate included"
+    remedy = "Let numbers vary together: shared=True, or paths joined by commas."
+    raise checks.fail("parameters", f"{count} numbers", expected, remedy)
 
 
 def _check_plant(scenario: Scenario) -> None:
@@ -366,15 +494,21 @@ def _parts_of(scenario: Scenario) -> ArmParts:
     guard = jnp.asarray(law.barrier.guard)
     object.__setattr__(law, "barrier", without_guard(law.barrier))
     zero = jnp.zeros(())
+    observer, period = cast(observers.Momentum, scenario.observer), None
+    if scenario.sampling is not None:
+        period = scenario.sampling.period
+        if scenario.sampling.observer == "poles":
+            observer = observer.at_period(period)
     return ArmParts(
         cast(Robot, scenario.model).at(zero),
         cast(Robot, scenario.plant).at(zero),
         scenario.disturbance,
         law,
-        jnp.broadcast_to(cast(observers.Momentum, scenario.observer).kf, (scenario.n,)),
+        jnp.broadcast_to(observer.kf, (scenario.n,)),
         scenario.reference,
         scenario.bounds[0],
         guard,
+        period,
     )
 
 

@@ -257,7 +257,9 @@ def chain_problem(
     claims = (*claim_sentences(law.barriers), *_without_claim(scenario))
     assumptions = (*ASSUMPTIONS, *claims, *examination.assumed)
     functions = (ChainBound(*of_structure), ChainRate(*of_structure), None)
-    return ChainProblem(scenario, uncertain, *functions, length, is_period, assumptions, parts)
+    return ChainProblem(
+        scenario, uncertain, *functions, None, length, is_period, assumptions, parts
+    )
 
 
 def _without_claim(scenario: Scenario) -> list[str]:
@@ -400,6 +402,9 @@ def _check_law(scenario: Scenario) -> None:
     if law.filter is not None:
         reason = "With filters V' has the errors of the filters, which are not in V."
         raise unsupported("controller.filter", law.filter, "exact derivatives (None)", reason)
+    if law.addition:
+        reason = "V' is known for (S.2) alone."
+        raise unsupported("controller", law.addition, "nothing beside (S.2)", reason)
     check_exponential(law, "V'")
     one, tube = jnp.ones(1), unit_tube()
     for i, barrier in enumerate(law.barriers):

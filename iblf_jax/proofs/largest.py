@@ -1,4 +1,6 @@
-"""The greatest level, or the largest box of parameters, for which `prove` finds a proof."""
+"""The greatest level, the largest box of parameters, or the longest period of a sampled loop for
+which `prove` finds a proof.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +15,7 @@ from iblf_jax.core import checks
 from iblf_jax.proofs._prove import prove
 from iblf_jax.proofs.result import Attempt, Proof
 from iblf_jax.simulation import paths
+from iblf_jax.simulation.sampling import Sampling
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies.distributions import Perturbation, interval, is_interval
 
@@ -40,7 +43,7 @@ def largest_level(
       between: the least and the greatest level that are tried, in the unit of V_w.
       accuracy: ratio - 1 of the two levels at which the search ends [1].
       max_boxes: largest number of boxes of each proof.
-      options: of `prove`; without `runs`, no attempt is made to refute the bounds.
+      options: of `prove`; without `runs`, no attempt is made to refute the statement.
 
     Returns:
       The `Proof` of the greatest level that was proved, with all attempts in `history`; that of the
@@ -56,7 +59,7 @@ def largest_level(
     def proof_at(level: float) -> Proof:
         return prove(scenario, level=level, parameters=parameters, max_boxes=max_boxes, **given)
 
-    return _bisected(proof_at, between, accuracy)
+    return _bisected("levels", proof_at, between, accuracy)
 
 
 def largest_parameters(
@@ -81,7 +84,7 @@ def largest_parameters(
       between: the least and the greatest s that are tried [1].
       accuracy: ratio - 1 of the two factors at which the search ends [1].
       max_boxes: largest number of boxes of each proof.
-      options: of `prove`; without `runs`, no attempt is made to refute the bounds.
+      options: of `prove`; without `runs`, no attempt is made to refute the statement.
 
     Returns:
       The `Proof` of the largest box that was proved, with all attempts in `history`; that of the
@@ -105,7 +108,58 @@ def largest_parameters(
         }
         return prove(scenario, level=level, parameters=narrowed, max_boxes=max_boxes, **given)
 
-    return _bisected(proof_at, between, accuracy)
+    return _bisected("factors of the intervals", proof_at, between, accuracy)
+
+
+def largest_period(
+    scenario: Scenario,
+    *,
+    level: float,
+    parameters: Mapping[str, Perturbation],
+    between: tuple[float, float],
+    accuracy: float = 0.05,
+    max_boxes: int = MAX_BOXES,
+    **options: Any,
+) -> Proof:
+    """Searches the longest period h of the samples for which the level set is proved to be
+    invariant, by bisection.
+
+    Each proof is about one period.  Those that were not tried are not covered, shorter ones
+    included: the gain of the observer's step "poles" depends on the period.
+
+    Args:
+      scenario: the loop of a robot with a `Sampling`, whose period is replaced.
+      level: c [N m rad].
+      parameters: path -> perturbation by an `interval`, as in `prove`.
+      between: the shortest and the longest period that are tried [s].
+      accuracy: ratio - 1 of the two periods at which the search ends [1].
+      max_boxes: largest number of boxes of each proof.
+      options: of `prove`; without `runs`, no attempt is made to refute the statement.
+
+    Returns:
+      The `Proof` of the longest period that was proved, with all attempts in `history`; that of the
+      shortest one if none was proved.
+
+    Raises:
+      ValueError: a scenario without a sampling, or bad arguments, as in `prove`.
+
+    Source: bisection.
+    """
+    if not isinstance(scenario, Scenario):
+        raise checks.fail("scenario", scenario, "a Scenario", "Make one with ij.presets.")
+    sampling = scenario.sampling
+    if sampling is None:
+        remedy = 'Add one: sampling=ij.Sampling(period=1e-3, observer="poles").'
+        raise checks.fail("scenario.sampling", None, "a Sampling", remedy)
+    given = {"runs": 0} | options
+
+    def proof_at(period: float) -> Proof:
+        # A new one, whose queue is that of the period.
+        changed = Sampling(period, sampling.delay, sampling.observer, trigger=sampling.trigger)
+        loop = dataclasses.replace(scenario, sampling=changed)
+        return prove(loop, level=level, parameters=parameters, max_boxes=max_boxes, **given)
+
+    return _bisected("periods [s]", proof_at, between, accuracy)
 
 
 def scaled(
@@ -123,9 +177,16 @@ def scaled(
 
 
 def _bisected(
-    proof_at: Callable[[float], Proof], between: Sequence[float], accuracy: float
+    searched: str, proof_at: Callable[[float], Proof], between: Sequence[float], accuracy: float
 ) -> Proof:
-    """The proof at the greatest value, within the accuracy, by bisection of the logarithm."""
+    """The proof at the greatest value, within the accuracy, by bisection of the logarithm.
+
+    Args:
+      searched: the values in words, with their unit.
+      proof_at: value -> proof.
+      between: the least and the greatest value.
+      accuracy: ratio - 1 of the two values at which the search ends [1].
+    """
     low, high = ends_of("between", between)
     accuracy = checks.positive_number("accuracy", accuracy, "1")
     history = []
@@ -136,19 +197,16 @@ def _bisected(
         return found
 
     best = tried(low)
-    if not best.proved:
-        return dataclasses.replace(best, history=tuple(history))
-    top = tried(high)
-    if top.proved:
-        return dataclasses.replace(top, history=tuple(history))
-    while high > (1.0 + accuracy) * low:
+    if best.proved and (top := tried(high)).proved:
+        best, low = top, high
+    while best.proved and high > (1.0 + accuracy) * low:
         middle = math.sqrt(low * high)
         found = tried(middle)
         if found.proved:
             best, low = found, middle
         else:
             high = middle
-    return dataclasses.replace(best, history=tuple(history))
+    return dataclasses.replace(best, history=tuple(history), searched=searched)
 
 
 def ends_of(field: str, between: object) -> tuple[float, float]:

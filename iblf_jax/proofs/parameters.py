@@ -20,8 +20,6 @@ from iblf_jax.studies.draws import targets_of
 
 SUPPORTED_PARTS = ("plant", "disturbance")
 """Parts of a scenario whose parameters may be uncertain."""
-MOST_CORNERS = 6
-"""Largest number of uncertain coordinates: a bound has 2^m corners."""
 
 
 class Uncertain(NamedTuple):
@@ -102,10 +100,6 @@ def uncertain_coordinates(
         rates = np.broadcast_to(rates, (n,))
     references += [0.0] * len(rates)
     low, high = [*low, *(-rates)], [*high, *rates]
-    if len(low) > MOST_CORNERS:
-        expected = f"at most {MOST_CORNERS} uncertain numbers, those of disturbance_rate included"
-        remedy = "Let numbers vary together: shared=True, or paths joined by commas."
-        raise checks.fail("parameters", f"{len(low)} numbers", expected, remedy)
     labels = [" and ".join(x) for x in names]
     labels += [f"disturbance_rate[{i}]" for i in range(len(rates))]
     numbers = Numbers(tuple(bases), tuple(slopes), jnp.asarray(references, float))

@@ -8,7 +8,6 @@ from collections.abc import Iterator, Sequence
 from fractions import Fraction
 from typing import Any
 
-import jax
 import numpy as np
 
 from iblf_jax.world import bounds, disturbances, references
@@ -96,8 +95,12 @@ def _frequencies(name: str, part: Any, *, all_count: bool) -> Iterator[float]:
                 yield abs(float(w))
 
 
-def shifted(part: Any, t: jax.Array | float) -> Any:
-    """A part of `period_of` as it is t [s] later: part at time s is the result at time s - t."""
+def shifted(part: Any, t: float) -> Any:
+    """A part of `period_of` as it is t [s] later: part at time s is the result at time s - t.  Any
+    part is its own after 0 s.
+    """
+    if t == 0.0:
+        return part
     if type(part) is disturbances.Sum:
         return disturbances.Sum(tuple(shifted(inner, t) for inner in part.parts))
     if type(part) is disturbances.Levels:

@@ -87,6 +87,20 @@ class TorqueFunctions(NamedTuple):
     """Least and greatest torque of the loop, (2, n) [N m]; None without limits."""
 
 
+class HeldFunctions(NamedTuple):
+    """Functions of the rates with which a held torque and a sampled estimate become old.
+
+    The last constant of `LevelSetProblem.bound` then are bounds of these rates on the whole set,
+    (k, n).
+    """
+
+    at_point: Callable[[jax.Array, Any], jax.Array]
+    """The rates at a point, (k, n) [N m/s], in plain floating-point numbers."""
+    excess: Callable
+    """A hashable function for `search.search`: the bound of the rates in parts of those in the last
+    constant, minus 1.  It has the coordinate share of `TorqueFunctions.excess`."""
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class LevelSetProblem(abc.ABC):
     """Is V_w' < 0 at every point of V_w = level, at every time and for all parameters of a box?
@@ -109,6 +123,8 @@ class LevelSetProblem(abc.ABC):
     """V_w' at a point in plain floating-point numbers, to be compiled and differentiated."""
     torque: TorqueFunctions | None
     """None where the torque is not bounded."""
+    held_torque: HeldFunctions | None
+    """None for a continuous loop."""
     duration: float
     """Length of the time interval of the proof [s]."""
     is_period: bool
@@ -220,12 +236,20 @@ class LevelSetProblem(abc.ABC):
         function = self.torque.at_point
         return np.asarray(_at_points(function, np.asarray(points, float), list(constants)))
 
+    @jax.enable_x64(True)
+    def held_rates(self, points: np.ndarray, constants: Sequence[np.ndarray]) -> np.ndarray:
+        """The rates of a held torque at points, (count, p) -> (count, k, n) [N m/s], in plain
+        floating-point numbers.
+        """
+        assert self.held_torque is not None
+        function = self.held_torque.at_point
+        return np.asarray(_at_points(function, np.asarray(points, float), list(constants)))
+
     @property
-    def torque_search(self) -> tuple[Callable, np.ndarray, np.ndarray, np.ndarray]:
-        """Function, lower and upper ends and scales for a search over the whole set."""
-        assert self.torque is not None
+    def whole_set(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Lower and upper ends and scales for a search over the whole set."""
         lower, upper = np.append(self.lower, 0.0), np.append(self.upper, 1.0)
-        return self.torque.excess, lower, upper, np.append(self.scales, 1.0)
+        return lower, upper, np.append(self.scales, 1.0)
 
     def sample(self, seed: int, count: int) -> np.ndarray:
         """Random points (t, s, z), (count, 1 + terms + m); every second one has its parameters at a
@@ -244,7 +268,7 @@ class LevelSetProblem(abc.ABC):
         """The scenario whose run starts at a point, with its parameters and moved in time.
 
         Raises:
-          ValueError: a part that cannot be moved in time.
+          ValueError: a part that cannot be moved in time, unless the time is 0.
         """
         state = self.state_of(point, constants)
         scenario = paths.with_parameters(self.scenario, state.parameters)

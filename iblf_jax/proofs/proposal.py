@@ -21,9 +21,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.core.linalg import inner, matvec
-from iblf_jax.core.pytree import unwrapped
+from iblf_jax.core import programs
 from iblf_jax.proofs.problem import LevelSetProblem
+from iblf_jax.proofs.sampled_values import before_sampling, terms
 from iblf_jax.simulation import closed_loop, paths
 from iblf_jax.simulation.scenario import Scenario
 
@@ -78,22 +78,16 @@ def start_of(problem: LevelSetProblem) -> Start:
     energies, squares = [], []
     for corner in itertools.product(*zip(uncertain.low, uncertain.high, strict=True)):
         with_plant = paths.with_parameters(problem.scenario, uncertain.values(corner))
-        energy, square = _terms(with_plant)
+        energy, square = _terms_of_start(before_sampling(with_plant))
         energies.append(float(energy))
         squares.append(float(square))
     return Start(max(energies), max(squares))
 
 
-@jax.jit
-def _terms(scenario: Scenario) -> tuple[jax.Array, jax.Array]:
+@programs.jit
+def _terms_of_start(scenario: Scenario) -> tuple[jax.Array, jax.Array]:
     """V_w without the term of f_tilde, and |f_tilde|^2/2, at the start."""
-    t, state = jnp.zeros(()), closed_loop.initial_state(scenario)
-    _, sample = closed_loop.evaluate(scenario, t, state)
-    law = unwrapped(scenario.controller)
-    V1 = law.weight * law.barrier.value(scenario.context.tube(t), state.q)
-    kinetic = inner(sample.e2, matvec(scenario.model.mass_matrix(state.q), sample.e2))
-    f_tilde = sample.disturbance - sample.disturbance_estimate
-    return jnp.sum(V1) + 0.5 * kinetic, 0.5 * inner(f_tilde, f_tilde)
+    return terms(scenario, jnp.zeros(()), closed_loop.initial_state(scenario))
 
 
 def proposed_level(

@@ -21,7 +21,9 @@ from iblf_jax.core.pytree import astype, unwrapped
 from iblf_jax.engine.simulate import simulate
 from iblf_jax.proofs.problem import LevelSetProblem
 from iblf_jax.proofs.proposal import LevelChoice
+from iblf_jax.proofs.support import step_within
 from iblf_jax.proofs.torque import TorqueRange, without_limits
+from iblf_jax.proofs.undecided import REACHED, SMALLER_LEVEL
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.distributions import Perturbation
@@ -31,9 +33,6 @@ INSTANTS = 512
 """Times of a guaranteed tube."""
 CONSTANT = 1e-9
 """Relative variation of the bound of |xi| below which it does not depend on the time."""
-REACHED = 2.0**-6
-"""Width of boxes, in parts of each coordinate, that a search of two links reaches with some million
-boxes."""
 AT_REST = 5.0
 """Time that is shown if reference and bounds are constant, so that there is no period [s]."""
 
@@ -48,7 +47,8 @@ class Verdict(enum.StrEnum):
     """Every weight that was tried has a point of the level set with V_w' > 0, or with a torque of
     the law beyond a limit."""
     REFUTED = "refuted"
-    """A run that starts in the set violates the bounds."""
+    """A run that starts in the set violates the bounds or, of a sampled loop, has V_w > level at a
+    sample."""
     UNDECIDED = "undecided"
     """Neither a proof nor a counterexample was found with the given number of boxes."""
 
@@ -113,14 +113,14 @@ class Attempt(NamedTuple):
     """One proof of a bisection."""
 
     value: float
-    """Level, or factor of the widths of the intervals."""
+    """Level, factor of the widths of the intervals, or period [s]."""
     verdict: Verdict
     boxes: int
     seconds: float
 
 
 class Violation(NamedTuple):
-    """A run that starts in the level set and violates the bounds."""
+    """A run that starts in the level set and violates the bounds, or leaves the set."""
 
     scenario: Scenario
     """With the start and the parameters in it; its time 0 is the time of the start."""
@@ -132,6 +132,21 @@ class Violation(NamedTuple):
     """[s]."""
     margin: float
     """Least distance from the bounds, in the unit of the position; negative outside."""
+    value: float | None = None
+    """The largest V_w at a sample [N m rad], of a run that leaves the set and not the bounds; None
+    otherwise."""
+
+    @property
+    def statement(self) -> str:
+        """What it refutes, in words."""
+        return "not inside the bounds forever" if self.value is None else "not invariant"
+
+    @property
+    def found(self) -> str:
+        """What the run does, in words."""
+        if self.value is None:
+            return f"violates the bounds by {-self.margin:.3g}"
+        return f"has V_w = {self.value:.6g} at a sample, and stays inside the bounds"
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -165,6 +180,10 @@ class Proof(Result):
     torque: TorqueRange | None = None
     """The torque of the law on the set, with bounds if the verdict is PROVED; None for a plant in
     strict-feedback form, with `disturbance_rate`, and where V_w' > 0 at each weight."""
+    held_rates: np.ndarray | None = None
+    """Of a sampled loop, proved bounds on the set of the rates of the law's torque, of the lag of
+    the observer, and of f of the law's torque, (3, n) [N m/s]; None without a proof of them, and of
+    a continuous loop."""
     boxes: int = 0
     """Number of boxes that were evaluated for V_w'."""
     done: float = 0.0
@@ -188,12 +207,17 @@ class Proof(Result):
     shown."""
     left_value: float | None = None
     """The largest upper bound of V_w' at the random points."""
+    smaller_level_share: float | None = None
+    """Share of boxes of the width 1/64 at the random points on which V_w' < 0 is shown at a quarter
+    of the level."""
     level_choice: LevelChoice | None = None
     """Between which levels `prove` chose; None if the caller gave the level."""
     disturbance_rate: Any = None
     """Bound of the rate of a further disturbance, () or (n,) [N m/s]; None without one."""
     history: tuple[Attempt, ...] = ()
     """The proofs of a bisection, in their order; () for a single one."""
+    searched: str = "values"
+    """What the bisection varied, in words with the unit."""
 
     @property
     def proved(self) -> bool:
@@ -227,7 +251,7 @@ class Proof(Result):
         return tube_of_level(self.scenario, self.level, self.duration)
 
     def replay(self, record_every: int = 1) -> Rollout:
-        """The run that refutes the bounds.
+        """The run that refutes the statement.
 
         Args:
           record_every: steps between two records.
@@ -236,7 +260,7 @@ class Proof(Result):
           ValueError: the verdict is not REFUTED.
         """
         if self.violation is None:
-            remedy = "Only a refuted statement has a run that violates the bounds."
+            remedy = "Only a refuted statement has a run that contradicts it."
             raise checks.fail("verdict", str(self.verdict), str(Verdict.REFUTED), remedy)
         found = self.violation
         with jax.enable_x64(True):
@@ -253,10 +277,11 @@ class Proof(Result):
         Args:
           count: number of runs.
           duration: length of each run [s]; the time interval of the proof if not given.
-          dt: time step [s].
+          dt: time step [s]; a shorter one, where a period of samples is no multiple of it.
           seed: of the random points.
         """
         count = checks.positive_integer("count", count, least=0)
+        dt = step_within(self.scenario, dt)
         steps = math.ceil((duration or self.duration or AT_REST) / dt)
         constants = self.problem.constants(self.weight, self.level)
         points = self.problem.sample(seed, 2 * count)[::2]
@@ -295,9 +320,15 @@ class Proof(Result):
         within = ""
         if self.proved and self.torque_limits is not None:
             within = ", and the torque stays within its limits"
+        sampled = ""
+        if self.scenario.sampling is not None:
+            sampled = f" of the loop sampled every {float(self.scenario.sampling.period):.4g} s"
+        statement = _STATEMENTS.get(self.verdict)
+        if self.violation is not None:
+            statement = self.violation.statement
         return (
-            f"{self.verdict.upper()}: {{V_w <= {self.level:.4g}}} is"
-            f" {_STATEMENTS[self.verdict]} for {times} and {uncertain}{within}."
+            f"{self.verdict.upper()}: {{V_w <= {self.level:.4g}}}{sampled} is"
+            f" {statement} for {times} and {uncertain}{within}."
         )
 
     def details(self) -> list[str]:
@@ -328,8 +359,8 @@ class Proof(Result):
             entries = found.state._asdict().items()
             named = (f"{name} = {_numbers(value)}" for name, value in entries if np.size(value))
             lines.append(
-                f"The run of {found.duration:.4g} s from {', '.join(named)} violates the bounds by"
-                f" {-found.margin:.3g}; replay() returns it."
+                f"The run of {found.duration:.4g} s from {', '.join(named)} {found.found};"
+                " replay() returns it."
             )
         if self.verdict == Verdict.UNDECIDED:
             lines += self._why_undecided()
@@ -341,10 +372,28 @@ class Proof(Result):
             f"w = {self.weight:.3g}, {self.boxes:,} boxes{expected}, {self.seconds:.3g} s."
         )
         if self.history:
-            levels = ", ".join(f"{x.value:.4g} {x.verdict}" for x in self.history)
-            lines.append(f"Tried: {levels}.")
+            lines += self._about_search()
         lines += [f"Assumed: {sentence}" for sentence in self.assumptions if self.proved]
         return lines
+
+    def _about_search(self) -> list[str]:
+        """Which values a bisection tried, and of which others nothing is known."""
+        values = ", ".join(f"{x.value:.4g} {x.verdict}" for x in self.history)
+        tried = f"Tried {self.searched}: {values}."
+        proved = [x.value for x in self.history if x.verdict == Verdict.PROVED]
+        if not proved:
+            return [tried, "The least value of the range is not proved; no greater one was tried."]
+        largest = max(proved)
+        beyond = [x for x in self.history if x.value > largest]
+        if not beyond:
+            return [tried, "The greatest value of the range is proved; none beyond it was tried."]
+        next_one = min(beyond, key=lambda x: x.value)
+        return [
+            tried,
+            f"The greatest value with a proof is {largest:.4g}, the next one that was tried is"
+            f" {next_one.value:.4g} ({next_one.verdict}). Nothing is claimed of values that were"
+            " not tried.",
+        ]
 
     def _about_torque(self) -> list[str]:
         """The torque on the set, and what it means for limits."""
@@ -374,6 +423,11 @@ class Proof(Result):
         return lines
 
     def _why_undecided(self) -> list[str]:
+        if self.scenario.sampling is not None and self.held_rates is None:
+            return [
+                "The rate of the law's torque on the set has no proved bound, which the statement"
+                " needs: a shorter period, a smaller level, more boxes or other gains help."
+            ]
         lines = [f"V_w' < 0 is proved on {100.0 * self.done:.3g} % of the volume."]
         lines += self._what_is_left()
         box = self.worst_box
@@ -420,14 +474,28 @@ class Proof(Result):
             return f"All of width 1/{1.0 / widest:.0f} are negative: increase max_boxes."
         return (
             f"Some of width 1/{1.0 / REACHED:.0f} are not negative, which takes many more boxes."
-            f" {narrower}"
+            f" {self._about_smaller_level()}"
+        )
+
+    def _about_smaller_level(self) -> str:
+        """Whether a smaller level is likely to help, from the same boxes at such a level."""
+        share, now = self.smaller_level_share, self.negative_shares[REACHED]
+        at = f"level={SMALLER_LEVEL * self.level:.4g}"
+        if share == 1.0:
+            return f"All of them are negative with {at}, which is likely to be proved."
+        if share is None or share <= now:
+            return (
+                f"No more of them are negative with {at}: narrower intervals or other gains help."
+            )
+        return (
+            f"With {at}, {_percent(share)} of them are negative: a level below it, narrower"
+            " intervals or other gains help."
         )
 
 
 _STATEMENTS = {
     Verdict.PROVED: "invariant",
     Verdict.NOT_PROVED: "not shown to be invariant by V_w",
-    Verdict.REFUTED: "not inside the bounds forever",
     Verdict.UNDECIDED: "neither proved nor refuted to be invariant",
 }
 

@@ -35,7 +35,12 @@ REAL_NUMBERS = (
     "The equations hold in real numbers: the loop is continuous, and its parameters are the stored"
     " double-precision numbers."
 )
-"""The assumption of every proof."""
+"""The assumption of every proof of a continuous loop."""
+SAMPLED_REAL_NUMBERS = (
+    "The equations hold in real numbers: the robot moves in continuous time, and the parameters of"
+    " the loop are the stored double-precision numbers."
+)
+"""The same of a sampled loop."""
 CONTINUOUS = "The proof is one of the continuous loop, with an ideal sensor."
 
 
@@ -109,6 +114,16 @@ def claim_sentences(barriers: Sequence[Any]) -> list[str]:
         " points)."
         for name in sorted(names)
     ]
+
+
+def step_within(scenario: Scenario, longest: float) -> float:
+    """The longest time step of a run up to `longest`, both in [s]: a period of samples is a whole
+    number of steps.
+    """
+    if scenario.sampling is None:
+        return longest
+    period = float(scenario.sampling.period)
+    return period / math.ceil(period / longest * (1.0 - 1e-9))
 
 
 def time_interval(

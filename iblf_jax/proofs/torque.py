@@ -138,7 +138,8 @@ def proved_torque(
       max_boxes: of the last search, if there are limits.
     """
     size = np.maximum(np.abs(found.found_lowest), np.abs(found.found_highest))
-    function, lower, upper, scales = problem.torque_search
+    assert problem.torque is not None
+    lower, upper, scales = problem.whole_set
     for margin in MARGINS:
         ends = np.stack([found.found_lowest - margin * size, found.found_highest + margin * size])
         most = min(BOXES, max_boxes)
@@ -146,7 +147,12 @@ def proved_torque(
             ends = np.clip(ends, *limits)
             most = max_boxes if margin == MARGINS[-1] else most
         result = searched(
-            function, lower, upper, [*constants, *ends], scales=scales, max_boxes=most
+            problem.torque.excess,
+            lower,
+            upper,
+            [*constants, *ends],
+            scales=scales,
+            max_boxes=most,
         )
         found = found._replace(boxes=result.boxes)
         if result.proved:

@@ -23,12 +23,17 @@ from iblf_jax.simulation.signals import Signals
 from iblf_jax.simulation.units import status_words
 from iblf_jax.world import plants
 
+NUMBERED = tuple(f"violation_{what}" for what in ("joint", "region", "level", "component"))
+"""Ends of the names of metrics that are a number of something, -1 for none."""
+
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, eq=False)
 class Metrics(Mapping):
     """Named results of the folds: `metrics.rmse` or `metrics["rmse"]`; `list(metrics)` names them,
-    `units` has their units.
+    `units` has their units.  The text has "none" for what did not happen or is not there: a time of
+    a violation, of settling, or a margin to no bound (infinite), and the joint of no violation
+    (-1).
     """
 
     values_by_name: dict[str, jax.Array]
@@ -69,11 +74,15 @@ class Metrics(Mapping):
         order = [*self.units, *self.values_by_name]  # as the metrics were given, then further ones
         for name in dict.fromkeys(name for name in order if name in self.values_by_name):
             value = self.values_by_name[name]
-            shown = str(value)
+            shown, unit = str(value), self.units.get(name, "")
             if checks.is_concrete(value):
                 shown = np.array2string(np.asarray(value), precision=4, threshold=8)
-                shown = " ".join(shown.split("\n "))
-            rows.append(f"  {name:22s} {shown} {self.units.get(name, '')}".rstrip())
+                shown = " ".join(shown.split("\n ")).replace("inf", "none")
+                if name.endswith(NUMBERED):
+                    shown = shown.replace("-1", "none")
+            if shown == "none":
+                unit = ""
+            rows.append(f"  {name:22s} {shown} {unit}".rstrip())
         return "Metrics(\n" + "\n".join(rows) + "\n)"
 
 

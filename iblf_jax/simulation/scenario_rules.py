@@ -462,7 +462,7 @@ class InitialValues(NamedTuple):
     region_margins: jax.Array
 
 
-@programs.jit
+@programs.jit(kept=True)
 def _initial_values(scenario: Scenario) -> InitialValues:
     """The values at the start. Their shapes are checked while this is traced, once per
     structure.
@@ -687,7 +687,7 @@ def _check_levels(scenario: Scenario) -> None:
             plants.check_dependence(name, _dependence_near(part, t, levels))
 
 
-@programs.jit
+@programs.jit(kept=True)
 def _dependence_near(plant: Plant, t: jax.Array, x: jax.Array) -> plants.Dependence:
     """The dependence of drift and gain on the levels at the start and at a state near it, where
     even functions of a level that starts at 0 have a slope.

@@ -111,26 +111,32 @@ def growth_rate(growth: PowerIteration) -> jax.Array:
 
 @jax.jit
 def growth_rate_of_matrix(jacobian: jax.Array) -> jax.Array:
-    """The `growth_rate` of a power iteration with a Jacobian J, () [1/s].
+    """The `growth_rate` of a power iteration with Jacobians J, (...) [1/s].
 
     It is (|J^48 v| / |J^32 v|)^(1/16) for the direction v at the start; repeated squaring gives the
     powers of J.
+
+    Args:
+      jacobian: (m, m, ...) [1/s]; the runs are the last axis, because a processor computes
+        neighbours in memory together.
     """
     tiny = jnp.finfo(jacobian.dtype).tiny
+    start = power_iteration_start(jacobian.ravel()[: len(jacobian)]).direction
 
     def squared(_, powers):
         _, power, log_factor = powers
-        size = jnp.maximum(jnp.max(jnp.abs(power)), tiny)
+        size = jnp.maximum(jnp.max(jnp.abs(power), axis=(0, 1)), tiny)
         power = power / size
         return power, matmul_in_order(power, power), 2.0 * (log_factor + jnp.log(size))
 
     def log_length(w):
-        return jnp.log(jnp.maximum(jnp.sqrt(matmul_in_order(w.T, w)[0, 0]), tiny))
+        squares = matmul_in_order(jnp.swapaxes(w, 0, 1), w)[0, 0]
+        return jnp.log(jnp.maximum(jnp.sqrt(squares), tiny))
 
     # J^16 and J^32, each up to a factor, and the logarithm of the factor of J^32.
-    powers = (jacobian, jacobian, jnp.zeros((), jacobian.dtype))
+    powers = (jacobian, jacobian, jnp.zeros_like(jacobian[0, 0]))
     J16, J32, log_factor = jax.lax.fori_loop(0, AVERAGED_STEPS.bit_length(), squared, powers)
-    before = matmul_in_order(J32, power_iteration_start(jacobian[0]).direction[:, None])
+    before = matmul_in_order(J32, start.reshape(-1, *[1] * (jacobian.ndim - 1)))
     after = matmul_in_order(J16, before)
     growth = log_factor / 2.0 + log_length(after) - log_length(before)
     return jnp.exp(growth / AVERAGED_STEPS)

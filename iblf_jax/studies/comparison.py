@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from iblf_jax.control.barriers import Integral
+from iblf_jax.control.barriers import Integral, Log
 from iblf_jax.core.presentation import Content, Result, present
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.status import FAILED, describe
@@ -215,11 +215,13 @@ class Comparison(Result):
         for name, gains in self.gains.items():
             groups.setdefault(gains, []).append(name)
         in_words = "; ".join(f"{gains} ({', '.join(names)})" for gains, names in groups.items())
-        barriers = [unwrapped(run.scenario.controller).barrier for run in self.rollouts.values()]
+        barriers = {
+            type(unwrapped(run.scenario.controller).barrier) for run in self.rollouts.values()
+        }
         notes = {"gains": [f"Held equal: the scenario. Gains: {in_words}."]}
         if len(groups) > 1:
             notes["gains"].append(OWN_GAINS)
-        if any(isinstance(barrier, Integral) for barrier in barriers):
+        if {Integral, Log} <= barriers:
             notes["gains"].append(FACTOR_TWO)
         if any(_is_settled_by_bounds(run, self.settling) for run in self.rollouts.values()):
             notes["gains"].append(self._settling_in_words)

@@ -122,6 +122,13 @@ DISAGREE = (
     "Importance sampling around the design points gave {other:.2g}, which is larger, but from"
     " degenerate weights: one of the two misses failures. Take more runs."
 )
+UNSAMPLED = (
+    "None of the sampled failures is near the design point at distance {distance:.2f}, which has"
+    " about {share:.0%} of the probability if the limits are planes: the samples may miss these"
+    " failures. Compare with estimator='importance'."
+)
+LARGE_SHARE = 0.1
+"""Share of the probability from which on a design point without sampled failures is named."""
 NOT_REACHED = (
     "Subset simulation reached no failure (upper bound {subset:.2g}); importance sampling around"
     " the design points is reported instead."
@@ -245,10 +252,20 @@ def _checked(
     return FailureOptions(estimator, margin, number, confidence, runs)
 
 
+class _Checked(NamedTuple):
+    """An estimate with what its check saw."""
+
+    estimate: Estimate
+    points: np.ndarray
+    """The design points, nearest first, (K, d)."""
+    check: str
+    """What a second method found, in a sentence."""
+
+
 class _Found(NamedTuple):
     """The estimate and what was found with it."""
 
-    estimate: Estimate
+    checked: _Checked
     nominal: float
     """Margin at z = 0."""
     likely: np.ndarray | None
@@ -264,21 +281,21 @@ def _found(space: NormalSpace, options: FailureOptions) -> _Found:
     origin = np.zeros((1, space.size))
     nominal = float(space(origin)[0])
     pieces = PiecesOfMargin(space, options)
-    points = np.zeros((0, space.size))
     if options.estimator == "importance":
-        estimate, points = _by_importance(space, options, pieces, nominal)
+        checked = _by_importance(space, options, pieces, nominal)
     elif options.estimator == "subset":
         estimate = _by_subset(space, options, options.runs)
-        estimate, points = _checked_by_importance(space, options, pieces, estimate, nominal)
+        checked = _checked_by_importance(space, options, pieces, estimate, nominal)
     else:
         estimate = crude_monte_carlo(
             space, space.size, runs=options.runs, seed=seed, confidence=options.confidence
         )
+        checked = _Checked(estimate, np.zeros((0, space.size)), "Independent draws need no check.")
     if nominal <= 0:
         likely, margin, status = origin[0], nominal, int(space.status[0][0])
-        return _Found(estimate, nominal, likely, margin, status, pieces.runs)
-    likely, margin, status = _most_likely(space, estimate.failures, points)
-    return _Found(estimate, nominal, likely, margin, status, pieces.runs)
+        return _Found(checked, nominal, likely, margin, status, pieces.runs)
+    likely, margin, status = _most_likely(space, checked.estimate.failures, checked.points)
+    return _Found(checked, nominal, likely, margin, status, pieces.runs)
 
 
 class PiecesOfMargin:
@@ -325,27 +342,70 @@ class PiecesOfMargin:
 
 def _by_importance(
     space: NormalSpace, options: FailureOptions, pieces: PiecesOfMargin, nominal: float
-) -> tuple[Estimate, np.ndarray]:
-    """The estimate by importance sampling, and the design points.
+) -> _Checked:
+    """The estimate by importance sampling, with the subset simulation that checks it.
 
     The searches start at the origin and at the nearest failures of a subset simulation with few
     samples: gradients at the origin alone miss failures where a margin saturates on the way.
     """
-    points = np.zeros((1, space.size))
+    origin, points = np.zeros((1, space.size)), np.zeros((0, space.size))
     notes: tuple[str, ...] = ()
     coarse: Estimate | None = None
     if not nominal <= 0:  # also for NaN, a median draw that cannot be run
         coarse = _by_subset(space, options, COARSE_RUNS)
         points, _ = design_points(pieces, _nearest(coarse.failures))
-    if not len(points):
-        points, notes = np.zeros((1, space.size)), (NO_DESIGN_POINT,)
-    estimate = _importance_estimate(space, options, points, options.runs)
-    if coarse is not None and not coarse.is_upper_bound:
+        notes = () if len(points) else (NO_DESIGN_POINT,)
+    centres = points if len(points) else origin
+    estimate = _importance_estimate(space, options, centres, options.runs)
+    if coarse is None:
+        check = "Not checked: the run at the medians of all draws fails."
+        return _Checked(estimate._replace(notes=(*notes, *estimate.notes)), points, check)
+    place = _points_in_words(points) if len(points) else "the medians of all draws"
+    check = (
+        f"The samples are around {place}. Check: a subset simulation with"
+        f" {COARSE_RUNS} samples a level gave {_in_words(coarse, options)}."
+    )
+    if not coarse.is_upper_bound:
         if estimate.is_upper_bound and NO_RUN not in estimate.notes:
             notes = (NOT_REACHED_BY_IMPORTANCE, *notes, *coarse.notes)
-            return coarse._replace(notes=notes), points
+            return _Checked(coarse._replace(notes=notes), points, check)
         notes = (*notes, *_missed_by_importance(estimate, coarse))
-    return estimate._replace(notes=(*notes, *estimate.notes)), points
+    return _Checked(estimate._replace(notes=(*notes, *estimate.notes)), points, check)
+
+
+def _points_in_words(points: np.ndarray) -> str:
+    """How many design points there are, and how far."""
+    radius = np.linalg.norm(points, axis=1)
+    if len(radius) == 1:
+        return f"one design point at distance {radius[0]:.2f}"
+    return f"{len(radius)} design points at distances {radius[0]:.2f} to {radius[-1]:.2f}"
+
+
+def _in_words(estimate: Estimate, options: FailureOptions) -> str:
+    """The probability of an estimate with its interval."""
+    if estimate.is_upper_bound:
+        return f"no failure, a probability of at most {estimate.probability:.2g}"
+    interval = f"{100 * options.confidence:g}% interval {estimate.low:.2g} to {estimate.high:.2g}"
+    return f"{estimate.probability:.2g} ({interval})"
+
+
+def _unsampled(points: np.ndarray, failures: Samples) -> tuple[str, ...]:
+    """A note for each design point with a large share of the probability to which no sampled
+    failure is the nearest.
+    """
+    from scipy.special import ndtr
+
+    if not len(failures.z):
+        return ()
+    radius = np.linalg.norm(points, axis=1)
+    shares = ndtr(-radius) / np.sum(ndtr(-radius))
+    # Failures beyond the limit of a design point are those whose direction is most like its own.
+    nearest = np.argmax(failures.z @ (points / radius[:, None]).T / radius, axis=1)
+    return tuple(
+        UNSAMPLED.format(distance=radius[k], share=shares[k])
+        for k in range(len(points))
+        if shares[k] >= LARGE_SHARE and not np.any(nearest == k)
+    )
 
 
 def _missed_by_importance(estimate: Estimate, coarse: Estimate) -> tuple[str, ...]:
@@ -398,28 +458,42 @@ def _checked_by_importance(
     pieces: PiecesOfMargin,
     estimate: Estimate,
     nominal: float,
-) -> tuple[Estimate, np.ndarray]:
+) -> _Checked:
     """The estimate of subset simulation, or one of importance sampling if that shows that failures
-    were missed; and the design points.
+    were missed.
 
     Samples of intermediate levels go where most margins are small, which need not be where most
     failures are.  Nothing in the samples shows this; design points do.
     """
-    if nominal <= 0 or not pieces.is_available:
-        return estimate, np.zeros((0, space.size))
+    none = np.zeros((0, space.size))
+    if nominal <= 0:
+        return _Checked(estimate, none, "Not checked: the run at the medians of all draws fails.")
+    if not pieces.is_available:
+        check = "Not checked: the margin has no gradient by the draws, as those of a choice."
+        return _Checked(estimate, none, check)
     points, _ = design_points(pieces, _nearest(estimate.failures))
-    if not len(points) or estimate.estimator != "subset":
-        return estimate, points
+    if not len(points):
+        check = "Not checked: searches by gradients for the nearest failures found none."
+        return _Checked(estimate, points, check)
+    if estimate.estimator != "subset":
+        check = f"The searches by gradients found {_points_in_words(points)}."
+        return _Checked(estimate, points, check)
     second = _importance_estimate(space, options, points, CHECK_RUNS)
+    check = (
+        f"Check: {CHECK_RUNS} samples around {_points_in_words(points)} gave"
+        f" {_in_words(second, options)}."
+    )
+    notes = (*estimate.notes, *_unsampled(points, estimate.failures))
+    estimate = estimate._replace(notes=notes)
     if second.is_upper_bound or (not estimate.is_upper_bound and second.low <= estimate.high):
-        return estimate, points
+        return _Checked(estimate, points, check)
     note = MISSED.format(subset=estimate.probability)
     if estimate.is_upper_bound:
         note = NOT_REACHED.format(subset=estimate.probability)
     elif second.notes:
         note = DISAGREE.format(other=second.probability)
-        return estimate._replace(notes=(*estimate.notes, note)), points
-    return second._replace(notes=(note, *second.notes)), points
+        return _Checked(estimate._replace(notes=(*estimate.notes, note)), points, check)
+    return _Checked(second._replace(notes=(note, *second.notes)), points, check)
 
 
 def _most_likely(
@@ -455,7 +529,7 @@ def _most_likely(
 def _result(
     space: NormalSpace, options: FailureOptions, found: _Found, arguments: dict[str, Any]
 ) -> FailureProbability:
-    estimate = found.estimate
+    estimate = found.checked.estimate
     unit = unit_text(space.prepared.scenario, DEFICITS[SIGNAL_OF_MARGIN[options.margin]])
     notes = list(estimate.notes)
     if found.nominal <= 0:
@@ -483,6 +557,8 @@ def _result(
         diverged=int(np.sum(has_flag(status, Status.NOT_FINITE))),
         started_outside=_started_outside(space, failures),
         notes=tuple(notes),
+        check=found.checked.check,
+        design_points=found.checked.points,
         estimator=estimate.estimator,
         unit=unit,
         arguments=arguments,

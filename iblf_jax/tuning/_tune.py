@@ -8,6 +8,7 @@ import dataclasses
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,13 +27,14 @@ from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.tuning.checkpoints import fingerprint, load_checkpoint, save_checkpoint
 from iblf_jax.tuning.confirmation import Confirmation, confirmation_of
 from iblf_jax.tuning.conflicts import conflicts_in_words
-from iblf_jax.tuning.evaluation import Evaluator, values
+from iblf_jax.tuning.evaluation import Evaluator, objective_at_quarter_step, values
 from iblf_jax.tuning.objectives import Objective, tighter
 from iblf_jax.tuning.options import Effort, Report, SearchOptions, chosen_solver, options_of
 from iblf_jax.tuning.parameters import Tunable, in_units, names_of, values_at
 from iblf_jax.tuning.problem import TuningProblem
 from iblf_jax.tuning.result import (
     AT_KINK,
+    FEW_STARTS_NEAR,
     INFEASIBLE,
     NO_GRADIENT,
     NOT_FOUND_FEASIBLE,
@@ -43,7 +45,14 @@ from iblf_jax.tuning.result import (
 from iblf_jax.tuning.robust import Risk
 from iblf_jax.tuning.runs import NUMBERS_A_RUN
 from iblf_jax.tuning.samples import SampleRequest
-from iblf_jax.tuning.search import REPAIR, REPAIR_STARTS, SECOND_SEARCH, Search, Strategy
+from iblf_jax.tuning.search import (
+    REPAIR,
+    REPAIR_STARTS,
+    SAME_OBJECTIVE,
+    SECOND_SEARCH,
+    Search,
+    Strategy,
+)
 from iblf_jax.tuning.solvers import Solver
 from iblf_jax.tuning.solvers.sqp import SQP
 from iblf_jax.tuning.starts import (
@@ -98,7 +107,9 @@ def tune(
     gains without derivatives.  It begins searches at up to 32 of these points, of which those that
     differ continue after five steps, and the better third of these after every five further ones.
     This takes about 350 evaluations with derivatives, and more if the search finds no gains that
-    keep the requirements, or if it does not converge.
+    keep the requirements, if it does not converge, or if only one start came within 0.5 % of the
+    best objective.  Starts whose objective changes by more than 0.5 % at a quarter of the time step
+    do not count.
 
     The requirements of the result are evaluated again at half the time step.  If one of them is
     then broken by more than `step_check.STEP_TOLERANCE`, a short search at dt / 2 follows, and its
@@ -215,6 +226,9 @@ def search_of(
         z = starting_points(problem.box, starts, seed)
         z = usable_starts(problem, seed, z, values(problem, problem.box.z[None]))
     problem = problem.for_solver(solver)
+    has_constraints = solver.handles_requirements and mode == "forward"
+    if strategy is not None and effort.values and has_constraints:
+        strategy = strategy._replace(at_quarter_step=partial(objective_at_quarter_step, problem))
     space = problem.search_space(effort.iterations)
     starts_used = len(z)
     rows = starts_used
@@ -329,6 +343,8 @@ def _outcome(search: Search, stopped: str) -> Outcome:
             # Without phases the search itself minimised the violation.
             is_minimised = search.strategy is None or search.state.repair_ended
             stopped = INFEASIBLE if is_minimised and found.hold else NOT_FOUND_FEASIBLE
+        elif found.hold and search.reached_by_few_starts:
+            stopped = FEW_STARTS_NEAR
         elif found.at_kink:
             stopped = AT_KINK
         else:
@@ -344,16 +360,23 @@ def _tried(search: Search) -> tuple[str, ...]:
     """What a search in phases did, in words; empty for a search without phases."""
     if search.strategy is None:
         return ()
-    valleys, reached = search.state.valleys.tolist()
+    valleys, reached, confirming = search.state.valleys.tolist()
     starts = search.strategy.starts
     lines = []
+    if search.state.unresolved:
+        lines.append(
+            f"{search.state.unresolved} searches came to gains whose objective changes by more than"
+            f" {100 * float(search.state.largest_change):.2g} % at a quarter of the time step: they"
+            " do not count"
+        )
     if starts > 1:
         noun = "valley"
         if valleys != 1:
             noun = "valleys"
         lines.append(
             f"searches from {starts} of {len(search.strategy.screening.points)} points: they were"
-            f" in {valleys} {noun} when they ended or were dropped, {reached} in the best one"
+            f" in {valleys} {noun} when they ended or were dropped, {reached} in the best one, and"
+            f" {confirming} within {100 * SAME_OBJECTIVE:g} % of the best objective"
         )
     phase = search.state.phase
     if phase == REPAIR or search.state.repair_ended:
@@ -365,8 +388,8 @@ def _tried(search: Search) -> tuple[str, ...]:
         )
     elif phase == SECOND_SEARCH:
         text = "a second search followed, from the best gains"
-        if search.strategy.second_points:
-            text += f" and the best of {search.strategy.second_points} points around them"
+        if search.strategy.second_points or search.reached_by_one_start:
+            text += " and the best points around them"
         lines.append(text)
     return tuple(lines)
 
@@ -427,7 +450,10 @@ def _continued(
     stopped = search.run(iterations)
     if search.is_violated:
         return None
-    return _outcome(search, stopped)
+    found = _outcome(search, stopped)
+    if outcome.stopped == FEW_STARTS_NEAR and found.stopped in ("converged", AT_KINK):
+        return found._replace(stopped=FEW_STARTS_NEAR)
+    return found
 
 
 def _confirmed(

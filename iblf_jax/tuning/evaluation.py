@@ -39,7 +39,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import programs
-from iblf_jax.core.status import UNTRUSTED
+from iblf_jax.core.status import UNTRUSTED, Status
 from iblf_jax.engine import run_batch_vjp, starts_per_batch
 from iblf_jax.simulation.noise import NOISE_NAME
 from iblf_jax.studies.draws import paths_overlap
@@ -203,10 +203,33 @@ def values(
     return in_groups(of_rows, len(z), group, advance)
 
 
+def objective_at_quarter_step(problem: TuningProblem, z: np.ndarray) -> np.ndarray:
+    """The objective at a quarter of the time step at points z, (S, p); NaN where a run is invalid
+    or its estimated error too large even there, (S,).
+    """
+    fine = problem.at_half_the_step().at_half_the_step()
+
+    def of_rows(rows: np.ndarray) -> jax.Array:
+        candidates = fine.candidates(z[rows])
+        return _accurate_objective(fine, candidates, fine.rollouts(candidates))
+
+    # Many points follow one another, so that one program serves them all.
+    return in_groups(of_rows, len(z), fine.points_together(2))
+
+
 @programs.jit
 def _values(problem: TuningProblem, candidates: Candidate, found: Rollouts) -> Value:
     by_start = _by_start((found.smooth, found.exact, found.status), candidates)
     return jax.vmap(partial(value_of_start, problem))(candidates, *by_start)
+
+
+@programs.jit
+def _accurate_objective(
+    problem: TuningProblem, candidates: Candidate, found: Rollouts
+) -> jax.Array:
+    value = _values(problem, candidates, found)
+    is_inaccurate = _by_start(found.status & int(Status.INACCURATE) > 0, candidates)
+    return jnp.where(value.valid & ~jnp.any(is_inaccurate, axis=1), value.objective, jnp.nan)
 
 
 @programs.jit

@@ -105,8 +105,9 @@ class Effort:
       selection: number of steps after which starts near better ones end, and from the second time
         on all but the better third.
       second_starts: number of starts of a second search around the best gains of the first one,
-        chosen from a third as many points; none if not given.  In problems of many gains the best
-        optimum is often near a good one.
+        chosen from a third as many points; if not given, 12 where only one of more than six starts
+        came within 0.5 % of the best objective.  In problems of many gains the best optimum is
+        often near a good one.
     """
 
     values: int = 1024

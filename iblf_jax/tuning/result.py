@@ -36,6 +36,9 @@ LARGE_CHANGE = 100.0
 AT_KINK = "converged at a kink: the slope of a requirement jumps from one peak to another here"
 """`TuneResult.stopped` where the conditions of an optimum hold only if the gradients of peaks at
 nearby gains are added."""
+FEW_STARTS_NEAR = "an optimum that few starts came near: better ones may exist"
+"""`TuneResult.stopped` where the conditions of an optimum hold as for "converged", and fewer than a
+quarter of many starts came within 0.5 % of the objective."""
 STUCK = "the solver ended at gains where the conditions of an optimum do not hold"
 """`TuneResult.stopped` where the solver has converged by its own criterion at gains that keep the
 requirements, but the conditions of an optimum do not hold."""
@@ -124,7 +127,8 @@ class TuneResult(Result):
     "converged" means that the gains keep the requirements and satisfy the conditions of an optimum
     (`optimality.Conditions.hold`).  "iterations used up" and "no improvement in N steps" mean that
     the gains keep the requirements, but do not satisfy these conditions.  The other values are
-    AT_KINK, STUCK, INFEASIBLE, NOT_FOUND_FEASIBLE and NO_GRADIENT of this module."""
+    FEW_STARTS_NEAR, AT_KINK, STUCK, INFEASIBLE, NOT_FOUND_FEASIBLE and NO_GRADIENT of this
+    module."""
     optimiser: str
     """Name of the solver."""
     mode: str
@@ -144,7 +148,8 @@ class TuneResult(Result):
     optimum.  Where a requirement is violated, the conditions are those of the smallest largest
     excess."""
     probes: int = 0
-    """Number of evaluations without derivatives, each of `setup.runs` rollouts."""
+    """Number of evaluations without derivatives, each of `setup.runs` rollouts, those at a quarter
+    of the time step included."""
     tried: tuple[str, ...] = ()
     """What the search did, in words: number of starts, number of valleys (regions around one local
     minimum) and further phases; if no evaluated gains keep the requirements, also which of them are

@@ -38,7 +38,7 @@ def in_groups(
     """What a function of row numbers returns for rows 0 to `count` - 1, as NumPy arrays.
 
     It is called with `size` rows at a time, so that one shape is compiled; the last group is filled
-    up with rows that it already has.
+    up with its last row, and a kernel of a CPU computes copies at the end of a batch once.
 
     Args:
       function: of row numbers, (size,).
@@ -49,7 +49,7 @@ def in_groups(
     parts = []
     for first in range(0, count, size):
         own = min(size, count - first)
-        rows = np.resize(np.arange(first, first + own), size)
+        rows = np.minimum(np.arange(first, first + size), count - 1)
         parts.append(jax.tree.map(np.asarray, function(rows)))
         advance(own)
     return jax.tree.map(lambda *x: np.concatenate(x)[:count], *parts)

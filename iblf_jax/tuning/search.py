@@ -12,7 +12,19 @@ so that a start that violates requirements becomes feasible while the penalty st
 
 Comparison.  Points are compared by their violation, the largest excess G of a requirement or bound,
 and at equal violation by the objective without smoothing.  A feasible point has the violation 0.
-Every point that was evaluated, with derivatives or without, is a candidate for the incumbent.
+Every point that was evaluated, with derivatives or without, is a candidate for the incumbent,
+unless its objective depends on the time step.
+
+Time step.  Gains may be good at the time step of the runs only: it stabilises a motion that runs
+away at a shorter one, or it passes a bound between two instants.  A search with
+`Strategy.at_quarter_step` therefore evaluates the best points of the starts at a quarter of the
+step as well, after the first step of a phase, after every `selection` steps and at the end of the
+phase.  (At half of it many such gains are still good.)  A start is retired, and its points do not
+count, where the objective changes by more than `largest_change` or the run is inaccurate even
+there.  This limit is SAME_OBJECTIVE, as objectives are compared to that difference, or STEP_FACTOR
+times the median change of the starts where that is larger: an objective with noise or with the rate
+of a held torque depends on the step itself.  Points without derivatives are compared before one of
+them becomes the incumbent.
 
 Stages.  A peak over time in the objective is replaced by a smooth maximum, which lies above the
 maximum by the smoothing times a logarithm.  The smooth objective has its minimum at other gains,
@@ -33,7 +45,9 @@ Phases.  A search with a `Strategy` has up to three phases:
    It begins at the incumbent and at the best screened point that is far from all earlier starts.
    With `Strategy.second_points` it always follows a feasible point, and begins at the best of so
    many further points instead, which are spread around the incumbent as those of phase 1 around the
-   scenario's gains: the best optimum is often near a good one.
+   scenario's gains: the best optimum is often near a good one.  Where only one of many starts came
+   within SAME_OBJECTIVE of the best objective (`reached_by_one_start`), such a search follows too,
+   from STARTS_IF_SINGLE of a third as many points as before.
 
 Every phase also ends after `patience` steps without a better result.  A search without a strategy
 has phase 1 only.
@@ -76,6 +90,7 @@ from iblf_jax.tuning.solvers._base import EXCESS_WEIGHT, violations
 from iblf_jax.tuning.solvers.sqp import STATIONARITY_TOLERANCE, Point
 from iblf_jax.tuning.starts import (
     FEW_POINTS,
+    FEW_STARTS,
     WEIGHTS,
     Screening,
     distinct,
@@ -124,6 +139,21 @@ SAME_VALLEY = 0.5
 """Two points whose distance in every coordinate z is at most this are in the same valley, the
 region around one local minimum."""
 
+SAME_OBJECTIVE = 0.005
+"""Largest difference from the best objective, relative to it, of a start that confirms it."""
+CONFIRMING_SHARE = 0.25
+"""Smallest share of the starts that come within SAME_OBJECTIVE of the best objective for which the
+search has converged.  Of one tuning of a sampled computed torque, four of 32 starts ended in a
+valley 3.7 % above the best."""
+STARTS_IF_SINGLE = 12
+"""Number of starts of the second search where no other start confirms the best objective."""
+STEP_FACTOR = 4.0
+"""Change of the objective at a quarter of the time step, relative to the median of the starts,
+above which a point does not count."""
+MOST_COMPARED = 32
+"""Largest number of points without derivatives that are evaluated again at a quarter of the time
+step."""
+
 
 class Strategy(NamedTuple):
     """What a search in phases needs besides its starts."""
@@ -140,6 +170,10 @@ class Strategy(NamedTuple):
     second_starts: int = 0
     """Number of starts of this phase besides the best gains.  If it is 0, the phase follows only
     where the first one did not converge."""
+    at_quarter_step: Callable[[np.ndarray], np.ndarray] | None = None
+    """The objective at a quarter of the time step at points z, (N, p), as
+    `objective_at_quarter_step`.
+    Without it the time step is not examined."""
 
 
 @dataclasses.dataclass
@@ -170,8 +204,8 @@ class SearchState:
     """See the head of this module, (S,) bool."""
     incumbent_key: np.ndarray = dataclasses.field(default_factory=lambda: np.full(2, np.inf))
     """Violation and objective of the incumbent, (2,)."""
-    valleys: np.ndarray = dataclasses.field(default_factory=lambda: np.asarray([1, 1]))
-    """See `Search._valleys`, (2,)."""
+    valleys: np.ndarray = dataclasses.field(default_factory=lambda: np.asarray([1, 1, 1]))
+    """See `Search._valleys`, (3,)."""
     iteration: int = 0
     """Steps in all."""
     phase: int = OPTIMISE
@@ -188,6 +222,13 @@ class SearchState:
     """Points that were evaluated with derivatives."""
     plain_values: int = 0
     """Points that were evaluated without derivatives."""
+    first_objective: np.ndarray = dataclasses.field(default_factory=lambda: np.asarray(np.inf))
+    """The objective of the incumbent at the end of the first phase, ()."""
+    unresolved: int = 0
+    """Starts that were retired because their objective depends on the time step."""
+    largest_change: np.ndarray = dataclasses.field(default_factory=lambda: np.asarray(np.nan))
+    """Largest relative change of the objective at a quarter of the time step of points that count;
+    NaN before the first comparison, (); see the head of this module."""
     repair_ended: bool = False
     """Whether REPAIR ended at a stationary point of the largest excess."""
     least_excess: np.ndarray = dataclasses.field(default_factory=lambda: np.full((1, 1), np.inf))
@@ -259,7 +300,7 @@ class Search:
         self.state = SearchState.first(solver.init(evaluate.space, z), z, requirements)
         evaluate.on_values = self.consider_values
         if strategy is not None:
-            self.consider_values(strategy.screening.points, strategy.screening.found)
+            self._count(strategy.screening.found)
 
     def retire(self, starts: slice | np.ndarray | list[int]) -> None:
         """Ends some starts for the rest of the phase."""
@@ -279,19 +320,85 @@ class Search:
         """
         return bool(self.state.incumbent_key[0] > 0)
 
+    @property
+    def reached_by_one_start(self) -> bool:
+        """Whether the search had many starts, and one of them only came within SAME_OBJECTIVE of
+        the best objective, so that a better one may well exist.
+        """
+        return self._reached_by_fewer_than(2)
+
+    @property
+    def reached_by_few_starts(self) -> bool:
+        """Whether the search had many starts, and fewer than CONFIRMING_SHARE of them came within
+        SAME_OBJECTIVE of the best objective.
+        """
+        return self.strategy is not None and self._reached_by_fewer_than(
+            CONFIRMING_SHARE * self.strategy.starts
+        )
+
+    def _reached_by_fewer_than(self, count: float) -> bool:
+        if self.strategy is None or self.strategy.starts <= FEW_STARTS:
+            return False
+        return bool(self.state.valleys[2] < count)
+
     def consider_values(self, z: np.ndarray, found: Value) -> None:
         """Counts points, (N, p), that were evaluated without derivatives, and replaces the
         incumbent where one of them is better.
         """
-        self.state.plain_values += len(z)
+        self._count(found)
+        self._consider_points(z, found)
+
+    def _count(self, found: Value) -> None:
+        """Counts points that were evaluated without derivatives."""
+        self.state.plain_values += len(found.valid)
         self.state.note_excess(found)
+
+    def _consider_points(self, z: np.ndarray, found: Value) -> None:
+        """Replaces the incumbent by the best of some points, (N, p), that the time step resolves,
+        if that is better.
+        """
         keys = _keys(found)
-        for i in np.flatnonzero(found.valid).tolist():
+        best = tuple(self.state.incumbent_key)
+        valid = np.flatnonzero(found.valid & np.isfinite(found.objective)).tolist()
+        better = sorted((i for i in valid if keys[i] < best), key=keys.__getitem__)[:MOST_COMPARED]
+        for i in np.array(better, int)[self._are_resolved(z[better], found.objective[better])]:
             self._consider(z[i], keys[i])
+
+    def _consider_starts(self) -> None:
+        """Replaces the incumbent by the best point of a start, and retires the starts whose best
+        point the time step does not resolve.
+        """
+        state = self.state
+        starts = np.flatnonzero(~state.retired & np.isfinite(state.best_key[:, 1]))
+        resolved = self._are_resolved(state.best_z[starts], state.best_key[starts, 1])
+        for s in starts[resolved]:
+            self._consider(state.best_z[s], tuple(state.best_key[s]))
+        lost = starts[~resolved]
+        if len(lost):
+            self.retire(lost)
+            state.best_key[lost] = np.inf
+            state.unresolved += len(lost)
+            state.steps_without_better = 0
+
+    def _are_resolved(self, z: np.ndarray, objective: np.ndarray) -> np.ndarray:
+        """Whether the objective, (N,), at points, (N, p), is about the same at a quarter of the
+        time step, (N,).
+        """
+        state = self.state
+        if self.strategy is None or self.strategy.at_quarter_step is None or not len(z):
+            return np.ones(len(z), bool)
+        fine = self.strategy.at_quarter_step(z)
+        state.plain_values += len(z)
+        change = np.abs(fine - objective) / np.maximum(1e-3, np.abs(objective))
+        change[~np.isfinite(change)] = np.inf
+        if np.isnan(state.largest_change):
+            typical = STEP_FACTOR * float(np.median(change))
+            state.largest_change = np.asarray(max(SAME_OBJECTIVE, typical))
+        return change <= state.largest_change
 
     def _consider(self, z: np.ndarray, key: tuple[float, float]) -> None:
         """Replaces the incumbent by a point, (p,), where that is better."""
-        if np.isfinite(key[1]) and key < tuple(self.state.incumbent_key):
+        if key < tuple(self.state.incumbent_key):
             self.state.incumbent_key = np.array(key)
             self.state.incumbent_z = np.array(z)
 
@@ -304,6 +411,7 @@ class Search:
         """
         while True:
             stopped = self._run_phase(iterations, on_step)
+            self._consider_starts()
             if not self._next_phase(stopped):
                 return stopped
 
@@ -337,13 +445,20 @@ class Search:
     def _next_phase(self, stopped: str) -> bool:
         """Begins a further phase where one is needed; returns whether it has."""
         state = self.state
-        if self.strategy is None or state.phase == SECOND_SEARCH:
+        if self.strategy is None:
+            return False
+        if state.phase == SECOND_SEARCH:
+            if not self._are_near_best(state.first_objective):
+                # No start of the first phase came near the better gains of this one.
+                state.valleys[2] = self._starts_near_best()
             return False
         if state.phase == REPAIR and self.is_violated:
             state.repair_ended = bool(self.conditions().hold)
             return False
         if state.phase == OPTIMISE:
+            self._consider_points(self.strategy.screening.points, self.strategy.screening.found)
             state.valleys = self._valleys()
+            state.first_objective = np.asarray(state.incumbent_key[1])
             # A sampling period is a whole number of steps and has no derivative, so that the values
             # with other periods than that of the incumbent are compared.
             problem = self.evaluate.problem
@@ -356,26 +471,30 @@ class Search:
             # Only screened points or retired starts may be known in the valley of the incumbent.
             distance = np.max(np.abs(state.best_z - state.incumbent_z), axis=1)
             is_explored = bool(np.any((distance <= SAME_VALLEY) & ~state.retired))
-            is_last = self.strategy.second_starts == 0
+            is_last = self.strategy.second_starts == 0 and not self.reached_by_one_start
             if is_last and stopped == "converged" and is_explored and self.conditions().hold:
                 return False
-        self._begin_phase(SECOND_SEARCH, self._second_starts())
+        points, starts = self.strategy.second_points, self.strategy.second_starts
+        has_ended = state.phase == OPTIMISE and stopped != "iterations used up"
+        if not points and has_ended and self.reached_by_one_start:
+            points = len(self.strategy.screening.points) // 3
+            starts = min(STARTS_IF_SINGLE, len(state.finished) - 1)
+        self._begin_phase(SECOND_SEARCH, self._second_starts(points, starts))
         return True
 
-    def _second_starts(self) -> np.ndarray:
-        """The incumbent, and the best of the points around it that differ; without such points, the
-        best screened point that is far from all earlier starts, (k, p).
+    def _second_starts(self, count_of_points: int, count: int) -> np.ndarray:
+        """The incumbent, and the best of so many points around it that differ; without such points,
+        the best screened point that is far from all earlier starts, (k, p).
         """
         assert self.strategy is not None
         problem = self.evaluate.problem
         best = self.state.incumbent_z[None]
-        if self.strategy.second_points:
+        if count_of_points:
             box = dataclasses.replace(problem.box, z=best[0])
             seed = int(problem.options.seed) + SECOND_SEED_OFFSET
-            points = spread_points(box, self.strategy.second_points, seed)
+            points = spread_points(box, count_of_points, seed)
             screening = ranked(points, self.evaluate.values(points))
             orders = [screening.order(weight) for weight in WEIGHTS]
-            count = self.strategy.second_starts
             explored = best
         else:
             screening = self.strategy.screening
@@ -470,9 +589,7 @@ class Search:
         for first in range(0, len(z), rows):
             some = z[first : first + rows]
             derivatives = self._derivatives_at(np.arange(len(some)), some)
-            keys = _keys(derivatives.value)
-            for s in np.flatnonzero(derivatives.value.valid).tolist():
-                self._consider(some[s], keys[s])
+            self._consider_points(some, Value(*(x[: len(some)] for x in derivatives.value)))
             found += [Point.of(self.evaluate.space, derivatives, s) for s in range(len(some))]
         return found
 
@@ -489,7 +606,8 @@ class Search:
         distances = {}
         for s, own in enumerate(self.state.solver):
             distance = float(np.max(np.abs(own.z - z)))
-            if own.done and distance <= SAME_VALLEY:
+            is_resolved = np.isfinite(self.state.best_key[s, 1])
+            if own.done and is_resolved and distance <= SAME_VALLEY:
                 converged[s] = own.z
                 distances[s] = distance
         if not converged:
@@ -560,8 +678,9 @@ class Search:
         return np.concatenate([best, further])
 
     def _valleys(self) -> np.ndarray:
-        """Number of valleys in which the starts ended or were retired, and number of starts in the
-        best valley, (2,).
+        """Number of valleys in which the starts ended or were retired, number of starts in the best
+        valley, and number of starts that kept the requirements within SAME_OBJECTIVE of the best
+        objective, (3,).
         """
         reached = np.flatnonzero(np.isfinite(self.state.best_key[:, 1]))
         z = self.state.best_z[reached]
@@ -572,7 +691,19 @@ class Search:
             near = near.astype(int) @ near.astype(int) > 0
         count = len(np.unique(near, axis=0))
         of_best = near[np.flatnonzero(reached == self.best)].sum() if len(z) else 0
-        return np.asarray([count, of_best])
+        return np.asarray([count, of_best, self._starts_near_best()])
+
+    def _starts_near_best(self) -> int:
+        """Number of starts that kept the requirements within SAME_OBJECTIVE of the best
+        objective.
+        """
+        violation, objective = self.state.best_key.T
+        return int(np.sum((violation <= 0) & self._are_near_best(objective)))
+
+    def _are_near_best(self, objective: np.ndarray) -> np.ndarray:
+        """Whether objectives are at most SAME_OBJECTIVE above that of the incumbent."""
+        best = float(self.state.incumbent_key[1])
+        return objective <= best + SAME_OBJECTIVE * abs(best)
 
     def _select(self) -> None:
         """Retires starts after every `selection` steps of the phase: those that have come near a
@@ -652,7 +783,18 @@ class Search:
         state.iteration += 1
         state.phase_steps += 1
         state.stage_steps += 1
+        if self._is_due:
+            self._consider_starts()
         self._select()
+
+    @property
+    def _is_due(self) -> bool:
+        """Whether the best points of the starts are considered after this step."""
+        if self.strategy is None or self.strategy.at_quarter_step is None:
+            return True
+        steps = self.state.phase_steps
+        is_selection = steps == 1 or steps % self.strategy.selection == 0
+        return self.state.phase == REPAIR or is_selection
 
     def _prepare_evaluation(self) -> None:
         """Sets smoothing, run numbers, multipliers and active starts of the next step."""
@@ -683,7 +825,6 @@ class Search:
         keys = _keys(found.value)
         for s in np.flatnonzero(found.value.valid).tolist():
             key = keys[s]
-            self._consider(z[s], key)
             if not np.isfinite(key[1]) or key >= tuple(state.best_key[s]):
                 continue
             overall = tuple(min(map(tuple, state.best_key)))

@@ -18,16 +18,12 @@ from iblf_jax.simulation.scenario import canonical
 STATES = 4096
 
 
-def loop(
-    variant: str = "corrected", observer: str = "momentum", barrier=None, wall: float = 1e-3
-) -> ij.Scenario:
+def loop(variant: str = "corrected", observer: str = "momentum", barrier=None) -> ij.Scenario:
     """The paper's loop with one law and one observer, to be varied by `random_loops`."""
-    barrier = ij.barriers.Integral(guard=wall) if barrier is None else barrier
+    barrier = ij.barriers.Integral(guard=1e-3) if barrier is None else barrier
     law = ij.controllers.Backstepping(k1=2.0, K2=20.0, barrier=barrier, variant=variant)
-    paper = ij.presets.zhang_yan_2024()
-    return canonical(
-        dataclasses.replace(paper, controller=law, observer=ij.observers.MEMBERS[observer](kf=20.0))
-    )
+    parts = {"controller": law, "observer": ij.observers.MEMBERS[observer](kf=20.0)}
+    return canonical(dataclasses.replace(ij.presets.zhang_yan_2024(), **parts))
 
 
 def random_loops(
@@ -51,28 +47,24 @@ def random_loops(
         return rng.uniform(low, high, (states, *shape)).astype(dtype)
 
     every = jax.tree.map(lambda x: np.broadcast_to(x, (states, *np.shape(x))), scenario)
-    o = {} if scenario.controller.o is None else {"o": 10 ** uniform(-3, 0, n)}
+    gains = {} if scenario.controller.o is None else {"o": 10 ** uniform(-3, 0, n)}
+    gains |= {"k1": 10 ** uniform(-1, 1, n), "K2": 0.5 + 10 ** uniform(-2, 1.7, n)}
+    kf, phase = 1.0 + 10 ** uniform(-2, 1.7, n), uniform(0.0, 6.28)
+    load = {"mass": every.plant.mass * uniform(0.5, 1.5, n), "payload": uniform(0.0, 0.5)}
     batch = _rebuilt(
         every,
-        controller=_rebuilt(
-            every.controller, k1=10 ** uniform(-1, 1, n), K2=0.5 + 10 ** uniform(-2, 1.7, n), **o
-        ),
-        observer=_rebuilt(every.observer, kf=1.0 + 10 ** uniform(-2, 1.7, n)),
-        disturbance=_rebuilt(every.disturbance, phase=uniform(0.0, 6.28)),
-        plant=_rebuilt(
-            every.plant, mass=every.plant.mass * uniform(0.5, 1.5, n), payload=uniform(0.0, 0.5)
-        ),
+        controller=_rebuilt(every.controller, **gains),
+        observer=_rebuilt(every.observer, kf=kf),
+        disturbance=_rebuilt(every.disturbance, phase=phase),
+        plant=_rebuilt(every.plant, **load),
         model=_rebuilt(every.model, mass=every.model.mass * uniform(0.5, 1.5, n)),
     )
     t, dq = uniform(0.0, 20.0), uniform(-speed, speed, n)
     q, momentum = _position(batch, t, uniform(-nearest, nearest, n), dq)
     if weighted:
-        law = _rebuilt(
-            batch.controller, weight=10 ** uniform(-3, 1.5, n), K2=10 ** uniform(-3, 1.7, n)
-        )
-        batch = _rebuilt(
-            batch, controller=law, observer=_rebuilt(batch.observer, kf=10 ** uniform(-3, 1.7, n))
-        )
+        light = {"weight": 10 ** uniform(-3, 1.5, n), "K2": 10 ** uniform(-3, 1.7, n)}
+        law, kf = _rebuilt(batch.controller, **light), 10 ** uniform(-3, 1.7, n)
+        batch = _rebuilt(batch, controller=law, observer=_rebuilt(batch.observer, kf=kf))
     eta = uniform(-5.0, 5.0, n) - batch.observer.kf * momentum
     return batch, t, LoopState(jnp.stack([q, dq], axis=-2), (), eta)
 

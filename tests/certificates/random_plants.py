@@ -32,12 +32,10 @@ class RandomPlant:
         return jnp.tensordot(numbers[i, ..., : i + 1, :], x[: i + 1], axes=2)
 
     def drift(self, t, x):
-        """f, (order, n)."""
         rows = [jnp.sin(self._inner(self.A, i, x) + 0.3 * t) for i in range(self.order)]
         return jnp.stack(rows)
 
     def gain(self, t, x):
-        """G, (order, n, n)."""
         rows = [jnp.sin(self._inner(self.B, i, x) + 0.2 * t) for i in range(self.order)]
         return jnp.eye(N) + 0.3 * jnp.stack(rows)
 
@@ -66,46 +64,38 @@ def energy_scales(barriers, widths):
     return np.stack(ratios)
 
 
-def random_scenario(
-    order: int, barriers: Any, seed: int = 0, *, observer: bool = True, **law: Any
-) -> ij.Scenario:
+def random_scenario(order: int, barriers: Any, seed: int) -> ij.Scenario:
     """A loop with a random plant, weights, gains, disturbances and estimates."""
     rng, widths = np.random.default_rng(seed), tube_widths(order)
-    plant = RandomPlant(
-        A=rng.normal(0.0, 0.5, (order, N, order, N)),
-        B=rng.normal(0.0, 0.3, (order, N, N, order, N)),
-        order=order,
-    )
+    A = rng.normal(0.0, 0.5, (order, N, order, N))
+    plant = RandomPlant(A, B=rng.normal(0.0, 0.3, (order, N, N, order, N)), order=order)
     controller = ij.controllers.BarrierBackstepping(
         k=rng.uniform(1.0, 3.0, (order, N)),
         barriers=barriers,
         c=rng.uniform(0.0, 0.3, (order, N)),
         weights=10 ** rng.uniform(-1.0, 0.5, (order, N)) * energy_scales(barriers, widths),
-        **law,
     )
     parts = tuple(
         ij.disturbances.Sinusoids(rng.normal(0.0, 0.5, N), rng.uniform(0.5, 2.0, N))
         for _ in range(order)
     )
-    estimator = ij.observers.LevelObserver(gain=rng.uniform(1.0, 5.0, (order, N)))
-    return canonical(
-        ij.Scenario(
-            plant=plant,
-            reference=ij.references.Sinusoid(offset=[0.2, -0.1], amplitude=[0.3, 0.2]),
-            bounds=tuple(bounds_between(*sides) for sides in widths),
-            controller=controller,
-            observer=estimator if observer else ij.observers.NoObserver(),
-            disturbance=ij.disturbances.Levels(parts),
-            initial=ij.Initial(x=np.zeros((order, N))),
-        )
+    scenario = ij.Scenario(
+        plant=plant,
+        reference=ij.references.Sinusoid(offset=[0.2, -0.1], amplitude=[0.3, 0.2]),
+        bounds=tuple(bounds_between(*sides) for sides in widths),
+        controller=controller,
+        observer=ij.observers.LevelObserver(gain=rng.uniform(1.0, 5.0, (order, N))),
+        disturbance=ij.disturbances.Levels(parts),
+        initial=ij.Initial(x=np.zeros((order, N))),
     )
+    return canonical(scenario)
 
 
-def random_states(scenario: ij.Scenario, seed: int = 0, *, nearest: float = 0.6):
+def random_states(scenario: ij.Scenario, seed: int):
     """Times, (STATES,), and states of the loop inside the tubes of all levels, batched."""
     rng, order = np.random.default_rng(seed), scenario.model.order
     t = rng.uniform(0.0, 10.0, STATES)
-    xi = rng.uniform(-nearest, nearest, (STATES, order, N))
+    xi = rng.uniform(-0.6, 0.6, (STATES, order, N))
     d_hat = rng.normal(0.0, 0.5, (STATES, order, N))
 
     @jax.jit
@@ -113,12 +103,8 @@ def random_states(scenario: ij.Scenario, seed: int = 0, *, nearest: float = 0.6)
     def states(t, xi, d_hat):
         law, x = scenario.controller, jnp.zeros((order, N))
         for i in range(order):
-            _, tubes = law.levels(t, x, d_hat, scenario.context, ())
-            tube = tubes[i]
+            tube = law.levels(t, x, d_hat, scenario.context, ())[1][i]
             x = x.at[i].set(tube.q_d + xi[i] * jnp.where(xi[i] > 0, tube.k_u, tube.k_l))
-        eta = ()
-        if isinstance(scenario.observer, ij.observers.LevelObserver):
-            eta = d_hat - scenario.observer.gain * x
-        return LoopState(x, (), eta)
+        return LoopState(x, (), d_hat - scenario.observer.gain * x)
 
     return t, states(t, xi, d_hat)

@@ -11,7 +11,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import random_plants
 from claim_terms import terms_at
 from random_plants import random_scenario, random_states
 
@@ -83,7 +82,6 @@ def right_side(scenario, t, state):
 
 def both_sides(scenario, seed):
     """Left and right side of (S.3) at random states, and the terms of the certificate there."""
-    t, state = random_states(scenario, seed)
 
     @jax.jit
     @jax.vmap
@@ -91,9 +89,11 @@ def both_sides(scenario, seed):
         terms = terms_at(scenario, t, state)
         return rate_along_the_flow(scenario, t, state), right_side(scenario, t, state), terms
 
-    left, right, terms = jax.tree.map(np.asarray, at(t, state))
-    assert not np.any(terms.excluded)
-    return left, right, terms
+    found = jax.tree.map(np.asarray, at(*random_states(scenario, seed)))
+    # The claim excludes states at which alpha leaves its bounds.
+    claimed = ~found[2].excluded
+    assert np.mean(claimed) > 0.9
+    return jax.tree.map(lambda x: x[claimed], found)
 
 
 @pytest.mark.parametrize(
@@ -103,69 +103,29 @@ def both_sides(scenario, seed):
 )
 def test_both_sides_of_the_claim_are_equal(order):
     barriers = (MAPPING, PERFORMANCE, MAPPING, PERFORMANCE)[:order]
-    scenario = random_scenario(order, barriers, seed=order)
-    left, right, terms = both_sides(scenario, order)
+    left, right, terms = both_sides(random_scenario(order, barriers, seed=order), order)
     claim, estimate = terms.claims["levels"], terms.claims["estimate"]
     assert np.all(np.abs(left - right) <= 1e-10 * np.max(np.abs(left)))
     # Every state has terms of its own size: the terms of V' are the scale of rounding.
     assert np.all(np.abs(left - right) <= 1e-13 * terms.size)
-    tolerance = LEVEL_ROUNDING * rounding("float64") * terms.size
-    assert np.median(tolerance / np.abs(left)) < 1e-10
+    share = LEVEL_ROUNDING * rounding("float64")
+    assert np.median(share * terms.size / np.abs(left)) < 1e-10
     certified = claim.disturbance_terms - claim.dissipation - claim.by_slopes
     assert np.all(np.abs(right - certified) <= 1e-13 * terms.size)
     assert np.all(np.abs(left - terms.dV) <= 1e-13 * terms.size)
-    assert np.all(np.abs(terms.dV - certified) <= 0.2 * tolerance)
+    assert np.all(np.abs(terms.dV - certified) <= 0.2 * share * terms.size)
     # The disturbance terms decide: without them nothing is equal.
-    assert np.median(np.abs(claim.disturbance_terms) / tolerance) > 1e6
-    assert np.all(
-        np.abs(estimate.error) <= 0.2 * LEVEL_ROUNDING * rounding("float64") * estimate.size
-    )
+    assert np.median(np.abs(claim.disturbance_terms) / (share * terms.size)) > 1e6
+    assert np.all(np.abs(estimate.error) <= 0.2 * share * estimate.size)
+
+
+STATE = ij.barriers.StateBarrier()
 
 
 @pytest.mark.slow
-def test_an_alpha_outside_its_bounds_is_the_only_cause_of_wrong_digits(monkeypatch):
-    """A width of 1e-6 replaces that of the tube there, and rounding decides the derivative: a
-    compiled one and that of single operations differ, as was once reported for 12 of 400 points.
-    Elsewhere both are those of the claim, which for this barrier has the exact decay k e s.
-    """
-    narrow = np.array([(1.5, 2.5), (4.0, 6.0)])
-    monkeypatch.setattr(random_plants, "tube_widths", lambda order: narrow)
-    monkeypatch.setattr(random_plants, "STATES", 2000)
-    scenario = random_scenario(2, (ij.barriers.StateBarrier(),) * 2, seed=2)
-    t, state = random_states(scenario, 2, nearest=0.6)
-    law = scenario.controller
-
-    def exact(t, state):
-        d_hat = scenario.observer.estimate(t, state.x, scenario.model, state.observer)
-        _, tubes = law.levels(t, state.x, d_hat, scenario.context, ())
-        correction, outside = 0.0, False
-        for i, tube in enumerate(tubes):
-            barrier, e = law.barriers[i], state.x[i] - tube.q_d
-            stated = law.k[i] * barrier.value(tube, state.x[i])
-            decay = law.k[i] * e * barrier.slope(tube, state.x[i])
-            correction += jnp.sum(law.weights[i] * (stated - decay))
-            outside |= jnp.any((tube.lower >= tube.q_d) | (tube.q_d >= tube.upper))
-        return right_side(scenario, t, state) + correction, outside
-
-    def derivative(t, state):
-        return rate_along_the_flow(scenario, t, state)
-
-    compiled = np.asarray(jax.jit(jax.vmap(derivative))(t, state))
-    claim, outside = jax.tree.map(np.asarray, jax.jit(jax.vmap(exact))(t, state))
-    with jax.disable_jit():
-        one_by_one = np.asarray(jax.vmap(derivative)(t, state))
-    assert 10 < np.sum(outside) < 1900
-    difference = np.abs(compiled - one_by_one) / np.abs(one_by_one)
-    assert np.max(difference[~outside]) < 1e-9
-    assert np.max(difference[outside]) > 1e-9
-    size = np.abs(claim) + np.median(np.abs(claim[~outside]))
-    assert np.max((np.abs(compiled - claim) / size)[~outside]) < 1e-9
-
-
-@pytest.mark.slow
-def test_an_integral_barrier_gives_an_inequality():
-    scenario = random_scenario(2, (ij.barriers.Integral(), MAPPING), seed=5)
-    left, right, _ = both_sides(scenario, 5)
+@pytest.mark.parametrize("barriers", [(ij.barriers.Integral(), MAPPING), (STATE, STATE)])
+def test_other_barriers_give_an_inequality(barriers):
+    left, right, _ = both_sides(random_scenario(2, barriers, seed=5), 5)
     assert np.all(left < right)
 
 
@@ -178,25 +138,17 @@ def drift(t, x):
 
 
 def gain(t, x):
-    """Diagonal."""
     return jnp.ones_like(x) * jnp.array([[1.0], [1.0], [4.0]])
 
 
 def between(lower, upper):
-    """Constant bounds."""
     return ij.bounds.Bounds(lower=ij.bounds.Constant(lower), upper=ij.bounds.Constant(upper))
 
 
-PENDULUM = ij.plants.StrictFeedback(
-    drift=drift, gain=gain, n=1, order=3, units=("rad", "rad/s", "A", "V")
-)
-DISTURBANCES = ij.disturbances.Levels(
-    (
-        ij.disturbances.Sinusoids(0.1, 1.0),
-        ij.disturbances.Sinusoids(0.3, 2.0),
-        ij.disturbances.Sinusoids(1.0, 1.5),
-    )
-)
+UNITS = ("rad", "rad/s", "A", "V")
+PENDULUM = ij.plants.StrictFeedback(drift=drift, gain=gain, n=1, order=3, units=UNITS)
+WAVES = ((0.1, 1.0), (0.3, 2.0), (1.0, 1.5))
+DISTURBANCES = ij.disturbances.Levels(tuple(ij.disturbances.Sinusoids(*wave) for wave in WAVES))
 GAINS = {"k": (2.0, 5.0, 10.0), "barriers": (MAPPING,) * 3, "c": 0.1}
 
 
@@ -212,14 +164,9 @@ def pendulum(law=None, **parts):
     return ij.Scenario(**(chosen | parts))
 
 
-@pytest.fixture(scope="module")
-def undisturbed():
-    """The certificate of a run without disturbance."""
-    return certify(pendulum(), duration=2.0, dt=2e-3)
-
-
 @pytest.mark.slow
-def test_without_disturbance_V_decays_at_its_rate(undisturbed):
+def test_without_disturbance_V_decays_at_its_rate():
+    undisturbed = certify(pendulum(), duration=2.0, dt=2e-3)
     assert undisturbed.holds
     assert undisturbed.numbers["rho"] == 4.0
     assert undisturbed.numbers["rho2"] == 0.0
@@ -235,6 +182,12 @@ def test_without_disturbance_V_decays_at_its_rate(undisturbed):
     text = repr(undisturbed)
     assert "(S.3)" in text
     assert "of the claim (S.3) does not apply" in undisturbed.omitted
+    figure = undisturbed.plot(until=1.5)
+    labels = [axes.get_ylabel() for axes in figure.axes]
+    assert sum(r"$\xi_" in label for label in labels) == 3
+    assert any("Lyapunov" in label for label in labels)
+    shown = [text.get_text() for axes in figure.axes for text in axes.texts]
+    assert "equality" in shown
 
 
 @pytest.mark.slow
@@ -265,28 +218,12 @@ def test_a_disturbed_run_has_the_true_terms():
     assert certificate["envelope"].verdict == "holds"
 
 
-@pytest.mark.slow
-def test_an_observer_states_kappa_and_a_wrong_one_fails():
-    observer = ij.observers.LevelObserver(gain=(20.0, 20.0, 20.0))
-    certificate = certify(pendulum(disturbance=DISTURBANCES, observer=observer), **RUN)
-    assert certificate.holds
-    assert certificate["estimate"].verdict == "holds"
-    assert np.all(certificate.numbers["d_tilde_largest"] < certificate.numbers["d_largest"])
-    wrong = pendulum(disturbance=DISTURBANCES, observer=WrongObserver(gain=20.0))
-    certificate = certify(wrong, **RUN)
-    assert certificate["estimate"].verdict == "fails"
-    assert not certificate.holds
-    # (S.3) is evaluated with the true rate of the estimate.
-    assert certificate["inequality, levels"].verdict == "holds"
-
-
 @ij.component
 class WrongObserver(ij.observers.LevelObserver):
     """States twice the gain with which it estimates."""
 
     @property
     def error_gain(self):
-        """Not kappa."""
         return 2.0 * self.gain
 
 
@@ -309,26 +246,6 @@ class WithoutExchange(ij.controllers.BarrierBackstepping):
         return [*levels[:-1], levels[-1]._replace(alpha=u)], tubes
 
 
-@pytest.mark.slow
-def test_a_wrong_law_fails():
-    certificate = certify(pendulum(WithoutExchange(**GAINS)), **RUN)
-    assert certificate["inequality, levels"].verdict == "fails"
-    assert certificate["inequality, levels"].margin < -1e-3
-    assert certificate["equality"].verdict == "fails"
-    assert certificate.verdict == "fails"
-
-
-@pytest.mark.slow
-def test_a_dynamic_surface_claims_ultimate_boundedness():
-    law = ij.controllers.BarrierBackstepping(filter=0.01, **GAINS)
-    certificate = certify(pendulum(law, disturbance=DISTURBANCES), **RUN)
-    assert certificate.holds
-    assert certificate["equality"].verdict == "holds"
-    assert "ultimate boundedness" in certificate["envelope"].note
-    assert certificate["lag of the filters"].value > 0
-    assert certificate["smooth"].verdict == "not applicable"
-
-
 @ij.component
 class TwoLevels:
     """u = -x_1 - x_2 for a double integrator around 0, with V = 3/2 x_1^2 + x_1 x_2 + x_2^2."""
@@ -339,11 +256,9 @@ class TwoLevels:
     includes_e2: ClassVar[bool] = True
 
     def init(self, x, context):
-        """No state."""
         return ()
 
     def command(self, t, x, d_hat, context, state):
-        """u."""
         zero = jnp.zeros_like(x[0])
         no = zero > 1.0
         return ij.controllers.Command(-x[0] - x[1], zero, 0.0 * zero, no, no), ()
@@ -351,22 +266,27 @@ class TwoLevels:
 
 @ij.component
 class WithClaim(TwoLevels):
-    """`TwoLevels` with its Lyapunov function: V' = -x_1^2 - x_2^2 without disturbance."""
+    """`TwoLevels` with its Lyapunov function: V' = -x_1^2 - x_2^2 without disturbance, of which it
+    states a multiple."""
 
     factor: ij.Leaf = ij.leaf("1", shape="scalar", default=1.0)
 
     def lyapunov(self, t, x, d_tilde, context, state):
-        """V."""
         return 1.5 * x[0] ** 2 + x[0] * x[1] + x[1] ** 2
 
     def decay(self, t, x, d_tilde, context, state):
-        """W, or a multiple of it that is wrong."""
         return self.factor * (x[0] ** 2 + x[1] ** 2)
 
 
-DOUBLE = ij.plants.StrictFeedback(
-    drift=lambda t, x: jnp.zeros_like(x), gain=lambda t, x: jnp.ones_like(x), n=1, order=2
-)
+def no_drift(t, x):
+    return jnp.zeros_like(x)
+
+
+def unit_gain(t, x):
+    return jnp.ones_like(x)
+
+
+DOUBLE = ij.plants.StrictFeedback(drift=no_drift, gain=unit_gain, n=1, order=2)
 
 
 def double_integrator(law, **parts):
@@ -380,25 +300,6 @@ def double_integrator(law, **parts):
         "initial": ij.Initial(x=[[1.0], [0.5]]),
     }
     return ij.Scenario(**(chosen | parts))
-
-
-@pytest.mark.slow
-def test_a_users_law_on_levels_states_its_own_claim():
-    certificate = certify(double_integrator(WithClaim()), **RUN)
-    assert certificate.holds
-    assert certificate.is_of_own_claim
-    assert "dV/dx . d_tilde" in certificate["inequality, own V"].statement
-    assert "TwoLevels" not in certificate.omitted
-    wrong = certify(double_integrator(WithClaim(factor=1.2)), **RUN)
-    assert wrong["inequality, own V"].verdict == "fails"
-
-
-@pytest.mark.slow
-def test_a_law_without_a_claim_is_not_applicable():
-    certificate = certify(double_integrator(TwoLevels()), **RUN)
-    assert certificate.verdict == "not applicable"
-    assert "TwoLevels has no claim of this kind" in certificate["inequality, levels"].note
-    assert certificate["level 1 inside"].margin > 0
 
 
 # --- robots ---------------------------------------------------------------------------------------
@@ -424,8 +325,16 @@ def robot_scenario(plant, order, robot_law=None, **parts):
     return ij.Scenario(**(chosen | parts))
 
 
-def check_torque_observer(plant, order):
-    """The claim with the observer of the robot inside a plant."""
+DRIVE = ij.plants.ElectricDrive(
+    LINK, torque_constant=0.5, inductance=0.01, resistance=0.5, back_emf=0.1
+)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("plant", "order"), [(LINK, 2), pytest.param(DRIVE, 3, marks=pytest.mark.release)]
+)
+def test_a_robot_is_certified_with_its_observer(plant, order):
     certificate = certify(robot_scenario(plant, order), **RUN)
     assert certificate.holds
     assert certificate["equality"].verdict == "holds"
@@ -435,37 +344,12 @@ def check_torque_observer(plant, order):
     assert certificate[f"e, level {order}"].margin > 0
 
 
-@pytest.mark.slow
-def test_a_robot_is_certified_with_its_observer():
-    check_torque_observer(LINK, 2)
-
-
 @pytest.mark.release
-def test_a_robot_with_drives_is_certified_with_the_observer_of_the_robot():
-    drive = ij.plants.ElectricDrive(
-        LINK, torque_constant=0.5, inductance=0.01, resistance=0.5, back_emf=0.1
-    )
-    check_torque_observer(drive, 3)
-
-
-@pytest.mark.slow
-def test_a_disturbance_of_q_has_no_torque_observer():
-    rates = ij.disturbances.Levels((ij.disturbances.Sinusoids(0.1, 2.0),))
-    certificate = certify(robot_scenario(LINK, 2, disturbance=rates), **RUN)
-    assert certificate["estimate"].verdict == "not applicable"
-    assert "without d_1" in certificate["estimate"].note
-    assert certificate["equality"].verdict == "holds"
-    assert certificate.holds
-
-
-@pytest.mark.release
-def test_the_flexible_two_link_arm_is_certified():
-    paper = ij.presets.zhang_yan_2024()
+def test_the_flexible_two_link_arm_is_certified(paper):
     flexible = ij.plants.FlexibleJoint(paper.plant, stiffness=300.0, motor_inertia=0.02)
     law = ij.controllers.BarrierBackstepping(k=(3.0, 20.0, 60.0, 150.0), barriers=MAPPING)
-    scenario = dataclasses.replace(
-        paper, plant=flexible, model=flexible, controller=law, observer=ij.observers.Momentum(kf=20)
-    )
+    loop = {"controller": law, "observer": ij.observers.Momentum(kf=20)}
+    scenario = dataclasses.replace(paper, plant=flexible, model=flexible, **loop)
     certificate = certify(scenario, duration=1.0, dt=5e-4)
     assert certificate.holds
     assert certificate["equality"].verdict == "holds"
@@ -486,28 +370,10 @@ def test_the_rigid_law_on_a_flexible_arm_has_the_flexibility_in_f():
     assert certificate.numbers["F_d"] > 3 * rigid.numbers["F_d"]
 
 
-# --- many runs, other loops -----------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_limits_of_the_input_and_the_guard_are_excluded():
-    law = ij.controllers.BarrierBackstepping(**GAINS)
-    limited = pendulum(ij.controllers.Saturated(law, limit=5.0))
-    certificate = certify(limited, **RUN)
-    assert 0 < certificate.numbers["samples_left_out"] < certificate.numbers["samples"]
-    assert "a limit of the input was active" in certificate["inequality, levels"].note
-    assert certificate["equality"].verdict == "holds"
-    always = pendulum(ij.controllers.Saturated(law, limit=1e-3))
-    certificate = certify(always, **RUN)
-    assert "all the time" in certificate["inequality, levels"].note
-    assert certificate.verdict == "not applicable"
-
-
 @pytest.mark.slow
 def test_alpha_outside_the_bounds_of_its_level_fails():
-    law = ij.controllers.BarrierBackstepping(k=(2.0, 5.0), barriers=(MAPPING, MAPPING))
     scenario = double_integrator(
-        law,
+        ij.controllers.BarrierBackstepping(k=(2.0, 5.0), barriers=(MAPPING, MAPPING)),
         reference=ij.references.Sinusoid(offset=0.0, amplitude=0.4),
         bounds=(between(-3.0, 3.0), between(-0.38, 0.38)),
         initial=ij.Initial(x=[[0.05], [0.0]]),
@@ -522,42 +388,19 @@ def test_alpha_outside_the_bounds_of_its_level_fails():
 
 
 @pytest.mark.slow
-def test_a_sampled_loop_and_an_actuator_have_no_claim():
-    sampled = pendulum(sampling=ij.Sampling(period=4e-3))
-    certificate = certify(sampled, duration=0.1, dt=2e-3)
-    assert certificate.verdict == "not applicable"
-    assert "sampled" in certificate["inequality, levels"].note
-    assert certificate["V2, sampled less continuous"].value is not None
-    certificate.plot()
-    lag = pendulum(actuator=ij.actuators.Motor(bandwidth=100.0))
-    certificate = certify(lag, **RUN)
-    assert certificate.verdict == "not applicable"
-    assert "Motor has no claim" in certificate["inequality, levels"].note
-
-
-@pytest.mark.slow
 def test_a_search_for_counterexamples_finds_one_of_a_wrong_law_only():
     gains = {"k": (0.5, 1.0), "barriers": (MAPPING, ij.barriers.Quadratic())}
-    start = {
-        "initial.q": ij.offset(ij.uniform(-1.0, 1.0)),
-        "initial.dq": ij.offset(ij.uniform(-2.0, 2.0)),
-    }
-    exact = ij.controllers.BarrierBackstepping(**gains)
-    found = counterexample(double_integrator(exact), start, starts=2)
-    assert found.growth == pytest.approx(-1.0, abs=1e-9)
-    found = counterexample(double_integrator(WithoutExchange(**gains)), start, starts=2)
+    ends = {"initial.q": 1.0, "initial.dq": 2.0}
+    start = {path: ij.offset(ij.uniform(-x, x)) for path, x in ends.items()}
+
+    def searched(law):
+        return counterexample(double_integrator(law), start, starts=2)
+
+    exact = searched(ij.controllers.BarrierBackstepping(**gains))
+    assert exact.growth == pytest.approx(-1.0, abs=1e-9)
+    found = searched(WithoutExchange(**gains))
     assert found.growth > 0
     broken = certify(found.scenario, duration=0.01)
     assert broken["inequality, levels"].verdict == "fails"
     with pytest.raises(ValueError, match="TwoLevels has no claim"):
-        counterexample(double_integrator(TwoLevels()), start)
-
-
-@pytest.mark.slow
-def test_the_figure_has_a_panel_for_every_level(undisturbed):
-    figure = undisturbed.plot(until=1.5)
-    labels = [axes.get_ylabel() for axes in figure.axes]
-    assert sum(r"$\xi_" in label for label in labels) == 3
-    assert any("Lyapunov" in label for label in labels)
-    shown = [text.get_text() for axes in figure.axes for text in axes.texts]
-    assert "equality" in shown
+        searched(TwoLevels())

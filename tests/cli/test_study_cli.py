@@ -44,14 +44,7 @@ def test_files_are_the_arguments_of_the_functions():
     expected = {"duration": 0.02, "method": "euler", "runs": 300, "seed": 3, "unit": 256}
     assert file.options == expected
     assert file.grid == {"controller.K2": [10.0, 20.0, 40.0], "observer.kf": [10.0, 20.0]}
-    expected = cases.perturbations()
-    assert list(file.perturbations) == list(expected)
-    for path, found in file.perturbations.items():
-        assert found.kind == expected[path].kind
-        np.testing.assert_allclose(
-            found.distribution.quantile(np.array([0.1, 0.7])),
-            expected[path].distribution.quantile(np.array([0.1, 0.7])),
-        )
+    assert list(file.perturbations) == list(cases.perturbations())
 
 
 @pytest.mark.slow
@@ -158,23 +151,15 @@ cli.entry()
     ("kind", "change", "message"),
     [
         ("study", ("[study]", "[sweep]"), "sweep: got an unknown key"),
-        ("study", ("runs = 300", "runs = 300.0"), "study.runs"),
         ("study", ("runs = 300", "rums = 300"), "study.rums"),
         ("study", ("duration = 0.02", ""), "run.duration"),
         ("study", ('method = "euler"', "record_every = 2"), "run.record_every"),
         ("study", ("factor =", "facto ="), "perturbations.plant.mass"),
-        ("study", ('"normal", std', '"norml", std'), "Did you mean normal"),
         ("study", ("std = 0.1 }", "sdt = 0.1 }"), "sdt"),
-        ("study", ("std = 0.1 }", "std = -0.1 }"), "perturbations.plant.mass.*std"),
         ("study", ("std = 0.1 }", 'std = 0.1, offset = "normal" }'), "factor and offset"),
         ("study", ("std = 0.1 }", "std = 0.1, shared = 1 }"), "shared"),
-        (
-            "study",
-            ('factor = "normal", mean = 1.0, std = 0.1', 'factor = "uniform", low = 1.0'),
-            "high",
-        ),
+        ("study", ('"normal", mean = 1.0, std = 0.1', '"uniform", low = 1.0'), "high"),
         ("sweep", ("[10.0, 20.0, 40.0]", '["a"]'), "grid.controller.K2"),
-        ("sweep", ("unit = 256", "unit = true"), "sweep.unit"),
     ],
 )
 def test_bad_files_are_refused(kind, change, message, tmp_path):
@@ -202,14 +187,11 @@ HEADS = {
 
 def perturbations_in(kind, perturbations, path):
     """The perturbations of a file of one of the three kinds."""
-    path.write_text(
-        f'preset = "zhang_yan_2024"\n[run]\nduration = 0.01\n{perturbations}\n{HEADS[kind]}\n'
-    )
-    return (
-        load_tuning_file(path)["perturbations"]
-        if kind == "tune"
-        else study_file.load_study_file(path, kind).perturbations
-    )
+    head = 'preset = "zhang_yan_2024"\n[run]\nduration = 0.01\n'
+    path.write_text(f"{head}{perturbations}\n{HEADS[kind]}\n")
+    if kind == "tune":
+        return load_tuning_file(path)["perturbations"]
+    return study_file.load_study_file(path, kind).perturbations
 
 
 def test_one_table_of_perturbations_serves_every_file_and_the_api(tmp_path):
@@ -224,55 +206,25 @@ def test_one_table_of_perturbations_serves_every_file_and_the_api(tmp_path):
         assert list(found) == list(expected)
         assert jax.tree.structure(found) == jax.tree.structure(expected)
         jax.tree.map(np.testing.assert_array_equal, found, expected)
-
-
-@pytest.mark.parametrize("kind", HEADS)
-def test_a_table_in_place_of_the_name_of_a_distribution_is_refused(kind, tmp_path):
-    words = "plant.mass = { factor = { uniform = [0.7, 1.3] } }"
-    with pytest.raises(
-        ValueError, match=r"file.toml: perturbations.plant.mass.*distribution. There are: .*uniform"
-    ):
-        perturbations_in(kind, f"[perturbations]\n{words}", tmp_path / "file.toml")
+        nested = "[perturbations]\nplant.mass = { factor = { uniform = [0.7, 1.3] } }"
+        words = r"file.toml: perturbations.plant.mass.*distribution. There are: .*uniform"
+        with pytest.raises(ValueError, match=words):
+            perturbations_in(kind, nested, tmp_path / "file.toml")
 
 
 def test_a_distribution_of_ones_own_is_named_in_files(tmp_path, monkeypatch):
-    @ij.component
-    class Triangle:
-        """From `low` up to `high`, more often near `high`."""
-
-        low: jax.Array = ij.leaf("", shape="any")
-        high: jax.Array = ij.leaf("", shape="any")
-
-        def quantile(self, u):
-            return self.low + np.sqrt(u) * (self.high - self.low)
-
-        def support(self):
-            return np.asarray(self.low), np.asarray(self.high)
-
-    monkeypatch.setitem(distributions.MEMBERS, "triangle", Triangle)
-    (found,) = perturbations_in(
-        "tune",
-        '[perturbations]\nplant.mass = { factor = "triangle", low = 1, high = 2 }',
-        tmp_path / "a",
-    ).values()
-    assert isinstance(found.distribution, Triangle) and found.kind == "factor"
+    uniform = type(ij.uniform(1.0, 2.0))
+    own = ij.component(type("Own", (uniform,), {"__annotations__": {}}))
+    monkeypatch.setitem(distributions.MEMBERS, "own", own)
+    text = '[perturbations]\nplant.mass = { factor = "own", low = 1, high = 2 }'
+    (found,) = perturbations_in("tune", text, tmp_path / "a").values()
+    assert isinstance(found.distribution, own) and found.kind == "factor"
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        ("montecarlo", "nothing.toml"),
-        ("montecarlo", "study.toml", "--out", "runs.csv"),
-        ("montecarlo", "study.toml", "--runs", "0"),
-        ("montecarlo", "study.toml", "--chunk", "0"),
-        ("montecarlo", "study.toml", "--devices", "200"),
-        ("sweep", "study.toml"),
-    ],
-)
-def test_bad_commands_end_with_2_and_one_line(command, words):
-    code, _, err = command(*words)
-    assert code == 2
-    assert err.count("\n") == 1
+def test_bad_options_end_with_2_and_one_line(command):
+    for option in ("--devices 200", "--chunk 0", "--out runs.csv"):
+        code, _, err = command(*f"montecarlo study.toml {option}".split())
+        assert (code, err.count("\n")) == (2, 1), option
 
 
 @pytest.mark.parametrize("installed", [True, False])

@@ -17,7 +17,7 @@ from independent import Loop
 from members import two_barriers
 
 import iblf_jax as ij
-from iblf_jax import barriers, controllers
+from iblf_jax import controllers
 from iblf_jax.control.controllers.saturated import AuxiliaryState
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state
 from iblf_jax.simulation.scenario import canonical
@@ -76,15 +76,6 @@ def test_the_vector_field_of_an_arm_is_that_of_the_independent_program(rng):
         np.testing.assert_allclose(sample.V, signals["V"], rtol=1e-12)
 
 
-@pytest.mark.release
-def test_a_run_of_an_arm_is_that_of_the_independent_program():
-    run = ij.simulate(LIMITED, duration=2.0, dt=1e-4, record_every=500, throw=True)
-    expected = other.arm_run(Loop(corrected=True), LIMIT, K, np.asarray(run.t))
-    assert np.max(np.abs(expected[:, 6:])) > 0.01
-    np.testing.assert_allclose(run.q, expected[:, :2], atol=1e-7)
-    np.testing.assert_allclose(run.auxiliary, expected[:, 6:], atol=1e-6)
-
-
 @pytest.fixture(scope="module")
 def coupled():
     """A chain of order 3 with coupled gains and bounds of all levels, under a tight limit."""
@@ -125,33 +116,6 @@ def test_the_input_of_a_chain_is_that_of_the_independent_program(coupled, rng):
 
 
 @pytest.mark.slow
-def test_the_rate_of_V2_of_an_arm(rng):
-    """(A.3), with equality for a barrier that decays exactly, while the torque is limited."""
-    law = controllers.Backstepping(
-        k1=2.0, K2=20.0, barrier=barriers.TransformedError(), variant="corrected", weight=[0.5, 2.0]
-    )
-    scenario = with_numbers(ij.with_parts(LIMITED, controller=_limited(law)), [2.0, 1.0], K)
-    terms, field = jax.jit(terms_at), jax.jit(evaluate)
-    for _ in range(20):
-        t = jnp.asarray(rng.uniform(0, 10))
-        tube = scenario.context.tube(t)
-        q, (dq, eta, aux) = near(rng, tube), rng.normal(size=(3, 2))
-        state = jax.tree.map(
-            jnp.asarray, LoopState(np.stack([q, dq]), AuxiliaryState((), aux), eta)
-        )
-        proof, sample = terms(scenario, t, state), field(scenario, t, state)[1]
-        assert np.any(sample.saturated)
-        value = law.weight * law.barrier.value(tube, q)
-        slope = law.weight * law.barrier.slope(tube, q)
-        decay = jnp.sum(law.barrier.decay_rate(law.k1) * value)
-        z, f_tilde = proof.e[1], proof.d_tilde
-        expected = -decay - z @ (law.K2 * z) + z @ f_tilde + f_tilde @ proof.dd_tilde
-        expected += slope @ aux
-        np.testing.assert_allclose(proof.dV, expected, rtol=1e-9, atol=1e-12 * proof.size)
-        np.testing.assert_allclose(proof.claims["torque"].auxiliary.power, slope @ aux, rtol=1e-12)
-
-
-@pytest.mark.slow
 def test_the_rate_of_V_of_a_chain_with_bounds_of_every_level(coupled, rng):
     terms = jax.jit(terms_at)
     case = chains.CASES["coupled"]
@@ -169,20 +133,21 @@ def test_a_certificate_covers_the_limited_torque():
     scenario = ij.with_parts(LIMITED, observer=ij.observers.Momentum(kf=20.0))
     run = ij.simulate(scenario, duration=1.5, dt=1e-3)
     line = ij.certify(scenario, run)["inequality, limited torque"]
-    assert np.any(run.metrics.saturated_share > 0)
+    share = np.mean(np.abs(run.tau) >= LIMIT * (1.0 - 1e-12), axis=0)
+    assert np.all(share > 0.004)
+    np.testing.assert_allclose(run.metrics.saturated_share, share, atol=1e-3)
     assert line.verdict == "holds"
     largest = float(np.max(np.abs(run.auxiliary)))
     assert f"max |lambda| = {largest:.4g}" in line.note
-    np.testing.assert_array_equal(
-        run.metrics.largest_auxiliary, np.max(np.abs(run.auxiliary), axis=0)
-    )
+    expected = np.max(np.abs(run.auxiliary), axis=0)
+    np.testing.assert_array_equal(run.metrics.largest_auxiliary, expected)
 
 
 # --- limits ---------------------------------------------------------------------------------------
 
 
-def _limited(law, limit=LIMIT, auxiliary=K):
-    return controllers.Saturated(law, limit=limit, auxiliary=auxiliary)
+def limited_by(limit, law):
+    return controllers.Saturated(law, limit=limit, auxiliary=K)
 
 
 @pytest.mark.slow
@@ -193,7 +158,7 @@ def test_without_a_reached_limit_it_is_the_law_without_it(name):
         speeds = ij.Bounds(ij.bounds.Constant(-9.0), ij.bounds.Constant(9.0))
         part["bounds"] = (PAPER.bounds[0], speeds)
     scenario = canonical(ij.with_parts(PAPER, controller=LAWS[name], **part))
-    limited = canonical(ij.with_parts(scenario, controller=_limited(LAWS[name], 1e4)))
+    limited = canonical(ij.with_parts(scenario, controller=limited_by(1e4, LAWS[name])))
     field, t = jax.jit(evaluate), jnp.asarray(0.0)
     rate, sample = field(scenario, t, initial_state(scenario))
     limited_rate, limited_sample = field(limited, t, initial_state(limited))
@@ -208,7 +173,7 @@ def test_without_a_reached_limit_it_is_the_law_without_it(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["adaptive_rbf", "adaptive_network"])
 def test_the_command_of_a_network_with_an_auxiliary_state_needs_no_model(name):
-    scenario = canonical(ij.with_parts(PAPER, controller=_limited(LAWS[name], 1e4)))
+    scenario = canonical(ij.with_parts(PAPER, controller=limited_by(1e4, LAWS[name])))
     law, x = scenario.controller, jnp.array([[0.5, 0.6], [0.1, 0.2]])
     state = law.init(x, scenario.context)._replace(auxiliary=jnp.array([0.3, -0.2]))
     commands = []

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from functools import partial
 from types import SimpleNamespace
 
 import chain_cases
@@ -78,21 +77,9 @@ def test_torque_of_an_arm_at_random_states(name, rng):
         (_, _), (low, _), (up, _) = arm.tube(t)
         q = low + (up - low) * rng.uniform(0.05, 0.95, 2)
         dq = rng.normal(size=2)
-        expected, _, _ = arm.torque(t, q, dq)
+        expected = arm.torque(t, q, dq)
         found = torque(scenario, t, q, dq)
         np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12 * max(abs(expected)))
-
-
-@pytest.mark.slow
-def test_trajectory_of_an_arm():
-    first, second = PAIRS["mixed"]
-    scenario = arm_scenario(PAIRS["mixed"], K2=4.0)
-    run = ij.simulate(scenario, duration=1.0, dt=5e-4, record_every=200)
-    least_smooth = [0.8 - 0.24, 0.8, 0.9 - 4.0 / 15.0, 0.9]
-    arm = other.Arm(K2=np.full(2, 4.0), first=first, second=second)
-    expected = arm.run_at(np.asarray(run.t), least_smooth)
-    np.testing.assert_allclose(run.q, expected[:, :2], atol=1e-7)
-    np.testing.assert_allclose(run.dq, expected[:, 2:], atol=1e-7)
 
 
 SLOWER = other.Prescribed(2.5, 3.0, 20.0)
@@ -107,64 +94,32 @@ def chain_with(name, levels):
     return case, ij.with_parts(scenario, controller=law)
 
 
-@partial(jax.jit, static_argnames="filtered")
-def commanded(scenario, t, x, d_hat, beta, filtered):
-    """The command of a law of levels at one state."""
-    state = beta if filtered else ()
-    return scenario.controller.command(t, x, d_hat, scenario.context, state)[0]
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CHAINS)
 def test_input_of_a_chain_at_random_states(name):
     case, scenario = chain_with(name, CHAINS[name])
     tables = (independent_chains.SPREAD, independent_chains.NOISE)
     data = independent_chains.points(case, *(table.get(name) for table in tables))
-    filtered = case.filter is not None
-    betas = data["beta"] if filtered else np.zeros((len(data["t"]), 0))
-    worst = 0.0
-    for i, beta in enumerate(betas):
-        x, d_hat = data["x"][i], data["d_hat"][i]
-        found = commanded(scenario, data["t"][i], x, d_hat, beta, filtered)
-        size = np.max(np.abs(data["u"][i]))
-        worst = max(worst, np.max(np.abs(found.tau - data["u"][i])) / size)
-    assert worst < 1e-12
+    found = chain_cases.commands(scenario, data)
+    size = np.max(np.abs(data["u"]), axis=1, keepdims=True)
+    assert np.max(np.abs(found.tau - data["u"]) / size) < 1e-12
 
 
 PRESCRIBED_CHAIN = (SLOWER, other.Prescribed(2.0, 3.0, 15.0), other.Prescribed(1.5, 3.0, 12.0))
 
 
-def free_pendulum(levels):
-    """The pendulum with its motor without a disturbance, bounded on its first level, with decays:
-    a case of the independent program, and its scenario.
-    """
-    quadratic = independent_chains.quadratic
-    case = dataclasses.replace(
-        independent_chains.PENDULUM,
-        barriers=(independent_chains.prescribed_performance, quadratic, quadratic),
-        bounds=(independent_chains.PENDULUM.bounds[0], None, None),
-        disturbance=lambda t, x: [[0.0]] * 3,
-        kappa=(0.0, 0.0, 0.0),
-        decays=levels,
-    )
+@pytest.mark.slow
+def test_settling_time_of_order_three():
+    """The pendulum with its motor without a disturbance, bounded on its first level."""
     law = dataclasses.replace(
         chain_cases.scenario("pendulum").controller,
         barriers=(barriers.PrescribedPerformance(), barriers.Quadratic(), barriers.Quadratic()),
-        decays=tuple(map(of_package, levels)),
+        decays=tuple(map(of_package, PRESCRIBED_CHAIN)),
     )
-    nothing = {"disturbance": disturbances.Nothing(), "observer": observers.NoObserver()}
-    bounds = chain_cases.bounds_of(case)
-    return case, chain_cases.scenario("pendulum", controller=law, bounds=bounds, **nothing)
-
-
-@pytest.mark.slow
-def test_trajectory_of_order_three_and_its_settling_time():
-    case, scenario = free_pendulum(PRESCRIBED_CHAIN)
-    run = ij.simulate(scenario, duration=3.0, dt=1e-3, record_every=100)
-    start = np.asarray(independent_chains.start(case))
-    expected = independent_chains.integrate(case, np.asarray(run.t), start)
-    np.testing.assert_allclose(run.x[..., 0], expected[:, :3], atol=1e-7)
-    certificate = ij.certify(scenario, run)
+    parts = {"bounds": (chain_cases.scenario("pendulum").bounds[0], None, None)}
+    parts |= {"disturbance": disturbances.Nothing(), "observer": observers.NoObserver()}
+    scenario = chain_cases.scenario("pendulum", controller=law, **parts)
+    certificate = ij.certify(scenario, duration=3.0, dt=1e-3)
     assert certificate["equality"].verdict == "holds"
     assert certificate["prescribed time"].verdict == "holds"
     assert certificate.holds
@@ -180,19 +135,17 @@ def test_settling_time_of_an_arm_and_the_case_in_which_it_is_broken():
     assert line.verdict == "holds"
     assert 0.1 < line.value < line.value + line.margin < 0.6
 
-    law = canonical(scenario).controller
     t = np.linspace(0.0, 1.0, 1001)
     slow = settling.Course(t, 0.3 * np.exp(-2.0 * t), 0.0 * t, 0.0 * t, np.zeros(1001, bool))
+    samples = {"jumps": np.zeros(0), "excluded": 0, "samples": 1001}
     summary = SimpleNamespace(
         run=SimpleNamespace(scenario=scenario),
-        law=law,
+        law=canonical(scenario).controller,
         claims=(THEOREM, settling.SETTLING),
         reductions=SimpleNamespace(mu=20.0),
-        jumps=np.zeros(0),
-        excluded=0,
-        samples=1001,
         why_never="",
         why_invalid="",
+        **samples,
     )
     (broken,) = settling.SETTLING.run_lines(summary, [slow], {})
     assert broken.verdict == "fails"
@@ -241,27 +194,7 @@ def test_limits():
     np.testing.assert_allclose(gains(decays.FiniteTime(1.5, 0.4, 1e-9)), 2.0 + 1.5 * Z**-0.6)
 
 
-def test_the_gain_of_prescribed_time_rises_from_the_start_to_the_cap():
-    decay = decays.PrescribedTime(T=1.0, gain=3.0, cap=30.0)
-    times = jnp.linspace(0.0, 1.5, 3001)
-    found = np.asarray(jax.vmap(lambda t: decay.effective_gain(t, K[:1], K[:1]))(times))[:, 0]
-    assert np.all(np.diff(found) >= -1e-12)
-    pole = 2.0 + 3.0 / np.maximum(1.0 - np.asarray(times), 1e-9)
-    assert np.all(found <= np.minimum(pole, 32.0) + 1e-12)
-
-
-BARRIERS = (
-    barriers.Integral(),
-    barriers.Log(p=2),
-    barriers.Tan(),
-    barriers.StateBarrier(),
-    barriers.PrescribedPerformance(),
-    barriers.TransformedError(),
-    barriers.Quadratic(),
-)
-
-
-@pytest.mark.parametrize("barrier", BARRIERS, ids=lambda barrier: type(barrier).__name__)
+@pytest.mark.parametrize("barrier", [x() for x in barriers.MEMBERS.values()])
 def test_v_decays_at_the_rate_of_the_gain_of_the_instant(barrier, rng):
     """V1' <= -rate(k(t, V1)) V1 along q' = alpha, an equality where the barrier states one."""
     law = controllers.Backstepping(2.0, 20.0, barrier=barrier, decays=of_package(FIXED))
@@ -293,19 +226,6 @@ def test_v_decays_at_the_rate_of_the_gain_of_the_instant(barrier, rng):
 # --- in the package -------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
-def test_operations_are_at_most_half_more_than_those_of_the_law_and_exponential_decays_are_free():
-    def counts(scenario):
-        found = ij.explain(scenario, varied=["initial.q"]).counts
-        return [sum(found[often].values()) for often in ("a step and run", "a step, shared")]
-
-    plain = arm_scenario(())
-    law = dataclasses.replace(plain.controller, decays=decays.Exponential())
-    before = counts(plain)
-    assert counts(ij.with_parts(plain, controller=law)) == before
-    assert sum(counts(arm_scenario(PAIRS["fixed"]))) < 1.5 * sum(before)
-
-
 def test_units():
     units = {p.path: p.unit for p in ij.parameters(arm_scenario(PAIRS["mixed"]))}
     assert units["controller.decays[0].delta"] == "rad"
@@ -323,42 +243,42 @@ def test_units():
     assert found == ["1", *levels]
 
 
+def under(given, **numbers):
+    """A Backstepping with these decays."""
+    return controllers.Backstepping(2.0, 20.0, decays=given, **numbers)
+
+
+def of_order_six():
+    """A scenario with a decay in a prescribed time above order five."""
+    plant = ij.plants.StrictFeedback(
+        lambda t, x: 0.0 * x, lambda t, x: jnp.ones_like(x), n=1, order=6
+    )
+    return canonical(
+        ij.Scenario(
+            plant=plant,
+            reference=ij.references.Sinusoid(offset=0.0, amplitude=0.1),
+            bounds=ij.Bounds(ij.bounds.Constant(-1.0), ij.bounds.Constant(1.0)),
+            controller=controllers.BarrierBackstepping(
+                k=(1.0,) * 6, barriers=barriers.Quadratic(), decays=decays.PrescribedTime(T=1.0)
+            ),
+            initial=ij.Initial(x=[[0.1]] * 6),
+        )
+    )
+
+
 @pytest.mark.parametrize(
     ("make", "match"),
     [
         (lambda: decays.FiniteTime(k_a=1.0, a=-0.2), r"FiniteTime\.a"),
         (lambda: decays.FiniteTime(k_a=1.0, delta=0.0), r"FiniteTime\.delta"),
-        (
-            lambda: controllers.Backstepping(2.0, 20.0, decays=(decays.Exponential(),) * 3),
-            "2 decays, one a level",
-        ),
-        (
-            lambda: controllers.Backstepping(2.0, 20.0, decays=barriers.Log()),
-            r"Backstepping\.decays\[0\]",
-        ),
+        (lambda: under((decays.Exponential(),) * 3), "2 decays, one a level"),
+        (lambda: under(barriers.Log()), r"Backstepping\.decays\[0\]"),
+        (of_order_six, "5 continuous derivatives"),
     ],
 )
 def test_refusals(make, match):
     with pytest.raises(ValueError, match=match):
         make()
-
-
-def test_prescribed_time_is_refused_above_order_five():
-    plant = ij.plants.StrictFeedback(
-        lambda t, x: 0.0 * x, lambda t, x: jnp.ones_like(x), n=1, order=6
-    )
-    law = controllers.BarrierBackstepping(
-        k=(1.0,) * 6, barriers=barriers.Quadratic(), decays=decays.PrescribedTime(T=1.0)
-    )
-    scenario = ij.Scenario(
-        plant=plant,
-        reference=ij.references.Sinusoid(offset=0.0, amplitude=0.1, frequency=1.0),
-        bounds=ij.Bounds(ij.bounds.Constant(-1.0), ij.bounds.Constant(1.0)),
-        controller=law,
-        initial=ij.Initial(x=[[0.1]] * 6),
-    )
-    with pytest.raises(ValueError, match="5 continuous derivatives"):
-        ij.simulate(scenario, duration=0.1, dt=1e-2)
 
 
 def test_ranges_of_the_powers_end_at_one():

@@ -34,32 +34,9 @@ def law(**options):
 
 
 def with_reference(reference, **options):
-    return ij.with_parts(
-        BASE,
-        reference=reference,
-        bounds=BASE.bounds[:1],
-        controller=law(**options),
-        initial=AT_REST,
-    )
-
-
-AT_REST = ij.Initial(q=0.0, dq=0.0)
-
-
-@pytest.mark.parametrize(
-    ("reference", "has"),
-    [
-        (references.Quintic(0.0, 0.5, 1.0), 2),
-        (references.WaypointSpline((0.0, 1.0), [[0.0], [0.5]]), 2),
-        (references.SmoothStep(0.0, 0.5, 1.0, derivatives=2), 2),
-    ],
-    ids=["quintic", "spline", "step"],
-)
-def test_a_reference_with_too_few_derivatives_is_refused(reference, has):
-    name = type(reference).__name__
-    expected = rf"reference: got {name}, which has {has}, expected .* 3 continuous derivatives"
-    with pytest.raises(ValueError, match=rf"{expected}.*derivatives=3.*filter="):
-        canonical(with_reference(reference))
+    parts = {"reference": reference, "bounds": BASE.bounds[:1]}
+    parts |= {"controller": law(**options), "initial": ij.Initial(q=0.0, dq=0.0)}
+    return ij.with_parts(BASE, **parts)
 
 
 @pytest.mark.slow
@@ -79,7 +56,7 @@ def with_bounds(level, barriers):
 
 
 @pytest.mark.parametrize(
-    ("level", "name", "needed"), [(1, r"bounds\[0\].upper", 3), (2, r"bounds\[1\].upper", 2)]
+    ("level", "name", "needed"), [(1, r"\[0\].upper", 3), (2, r"\[1\].upper", 2)]
 )
 def test_bounds_with_too_few_derivatives_are_refused(level, name, needed):
     barriers = (TransformedError(), TransformedError() if level == 2 else Quadratic(), Quadratic())

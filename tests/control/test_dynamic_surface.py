@@ -1,17 +1,16 @@
-"""The dynamic surface law: beside an independent program, and its start."""
+"""The dynamic surface law beside an independent program, and its start."""
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from independent import Loop, sine
-from scipy.integrate import solve_ivp
+from independent import Loop
 
 import iblf_jax as ij
 from iblf_jax import bounds, controllers
-
-H = np.pi / 2
+from iblf_jax.simulation.closed_loop import LoopState, initial_state, rate
 
 
 @dataclasses.dataclass
@@ -20,71 +19,38 @@ class FilteredLoop(Loop):
 
     mu: np.ndarray = dataclasses.field(default_factory=lambda: np.full(2, 0.02))
 
-    def alpha_and_slope(self, t, q):
-        (xd, dxd, _), (lo, dlo, _), (up, dup, _) = (
-            sine(*s)(t) for s in (self.reference, self.lower, self.upper)
-        )
-        kl, ku, e1 = xd - lo, up - xd, q - xd
-        kappa = np.sqrt(((dup - dxd) / ku) ** 2 + ((dxd - dlo) / kl) ** 2 + self.o)
-        return dxd - (self.k1 + kappa) * e1, 2 * e1 / (np.where(e1 > 0, ku, kl) ** 2 - e1**2)
-
     def filtered(self, t, x):
-        q, v, eta, beta = x[:2], x[2:4], x[4:6], x[6:]
+        q, v, eta, beta = np.split(x, 4)
         M, C, G, dM = self.arm(q)
-        alpha, slope = self.alpha_and_slope(t, q)
+        e1, k, alpha, _ = self.virtual(t, q, v)
         dbeta, f_hat = (alpha - beta) / self.mu, eta + self.kf * (M @ v)
+        slope = 2 * e1 / (k**2 - e1**2)
         tau = C(v) @ beta + G + M @ dbeta - f_hat - self.K2 * (v - beta) - slope
-        f = M @ sine(*self.force_a)(t)[0] + C(v) @ sine(*self.force_b)(t)[0]
         deta = -self.kf * (f_hat + tau - C(v) @ v - G + dM * v[1] @ v)
-        return np.concatenate([v, np.linalg.solve(M, tau + f - C(v) @ v - G), deta, dbeta])
+        acceleration = self.acceleration(q, v, tau + self.disturbance(t, q, v))
+        return np.concatenate([v, acceleration, deta, dbeta])
 
 
 @pytest.mark.slow
-def test_the_run_is_that_of_an_independent_program_at_random_gains_and_bounds(rng):
-    for _ in range(2):
-        draws = {
-            name: rng.uniform(low, high, 2)
-            for name, low, high in (
-                ("k1", 1, 3),
-                ("K2", 10, 25),
-                ("o", 0.05, 0.3),
-                ("mu", 0.01, 0.05),
-            )
-        }
-        loop = FilteredLoop(
-            **draws,
-            q0=tuple(rng.uniform(0.4, 0.8, 2)),
-            lower=(rng.uniform(0.1, 0.2, 2), 0.14, 1.0, (H, 0.0)),
+def test_vector_field_and_start_are_those_of_an_independent_program(rng):
+    field = jax.jit(rate)
+    for _ in range(10):
+        ranges = {"k1": (1, 3), "K2": (10, 25), "o": (0.05, 0.3), "mu": (0.01, 0.05)}
+        draws = {name: rng.uniform(*ends, 2) for name, ends in ranges.items()}
+        lower = (rng.uniform(0.1, 0.2, 2), 0.14, 1.0, (np.pi / 2, 0.0))
+        loop = FilteredLoop(**draws, q0=tuple(rng.uniform(0.4, 0.8, 2)), lower=lower)
+        scenario = ij.with_parts(
+            ij.presets.zhang_yan_2024(variant="corrected"),
+            controller=controllers.DynamicSurface(loop.k1, loop.K2, filter=loop.mu, o=loop.o),
+            bounds=bounds.Bounds(bounds.Sinusoid(*loop.lower), bounds.Sinusoid(*loop.upper)),
+            initial=ij.Initial(loop.q0),
         )
-        t, alpha = np.linspace(0.0, 1.0, 21), loop.alpha_and_slope(0.0, np.array(loop.q0))[0]
-        start = [*loop.q0, *np.zeros(4), *alpha]
-        found = solve_ivp(
-            loop.filtered, (0.0, 1.0), start, "DOP853", t_eval=t, rtol=1e-10, atol=1e-12
-        )
-        law = controllers.DynamicSurface(k1=loop.k1, K2=loop.K2, filter=loop.mu, o=loop.o)
-        walls = bounds.Bounds(
-            lower=bounds.Sinusoid(*loop.lower), upper=bounds.Sinusoid(*loop.upper)
-        )
-        scenario = ij.presets.zhang_yan_2024(variant="corrected")
-        scenario = dataclasses.replace(
-            scenario, controller=law, bounds=walls, initial=ij.Initial(loop.q0)
-        )
-        run = ij.simulate(scenario, duration=1.0, dt=2.5e-4, record_every=200)
-        np.testing.assert_allclose(run.q, found.y[:2].T, atol=1e-8)
-        np.testing.assert_allclose(run.alpha, found.y[6:].T, atol=1e-5)
-
-
-@pytest.mark.slow
-def test_it_starts_on_alpha_and_is_sampled_too():
-    scenario = ij.presets.zhang_yan_2024(law="dynamic_surface")
-    run = ij.simulate(scenario, duration=0.08, dt=1e-3)
-    np.testing.assert_array_equal(run.alpha[0], run.controller_state[0])
-    tube = scenario.context.tube(jnp.zeros(()))
-    np.testing.assert_allclose(
-        run.alpha[0],
-        scenario.controller.barrier.virtual_velocity(tube, scenario.initial.q, 2.0, 0.1),
-    )
-    held = ij.with_parts(scenario, sampling=ij.Sampling(period=1e-3))
-    held = ij.simulate(held, duration=0.08, dt=1e-3)
-    assert held.ok
-    np.testing.assert_allclose(held.q, run.q, atol=2e-3)
+        start = loop.virtual(0.0, np.array(loop.q0), np.zeros(2)).alpha
+        np.testing.assert_allclose(initial_state(scenario).controller, start, rtol=1e-12)
+        t, q = rng.uniform(0.0, 5.0), rng.uniform(0.45, 0.55, 2)
+        dq, eta, beta = rng.normal(size=(3, 2))
+        state = LoopState(jnp.stack([q, dq]), jnp.asarray(beta), jnp.asarray(eta))
+        found = field(scenario, jnp.asarray(t), state)
+        expected = loop.filtered(t, np.concatenate([q, dq, eta, beta]))
+        rates = np.concatenate([found.q, found.dq, found.observer, found.controller])
+        np.testing.assert_allclose(rates, expected, atol=1e-12 * np.max(np.abs(expected)))

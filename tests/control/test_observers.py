@@ -7,13 +7,14 @@ import warnings
 
 import jax
 import jax.numpy as jnp
+import members
 import numpy as np
 import pytest
-from iblf_jax.observers import AsPublished, Momentum, NoObserver
+from iblf_jax.observers import AsPublished, Momentum
 from iblf_jax.robots import mass_matrix_rate
+from jax.flatten_util import ravel_pytree
 
 import iblf_jax as ij
-from iblf_jax.control.observers.none import observer_of_x
 from iblf_jax.simulation.closed_loop import LoopState, evaluate
 from iblf_jax.simulation.scenario import canonical
 
@@ -40,6 +41,41 @@ def estimate_rate():
     return at
 
 
+POLES = {
+    "printed": [-20.0, -10.0],
+    "printed_matched": [-20.0, -20.0],
+    "momentum": [-20.0, -10.0],
+    "extended_state": [-40.0, -40.0, -30.0, -30.0],
+    "extended_state_two_gains": [*np.roots([1.0, 80.0, 1600.0]), *np.roots([1.0, 80.0, 900.0])],
+}
+"""Member -> the poles that its docstring states for its gains."""
+
+
+def test_the_poles_of_every_observer_with_a_state_are_listed():
+    assert set(POLES) == set(members.OBSERVERS) - {"none"}
+
+
+@pytest.mark.parametrize("name", POLES)
+def test_an_observer_has_the_poles_that_it_states(name):
+    """The characteristic polynomial of its rate, and of its exact step over a period."""
+    observer, model, period = members.OBSERVERS[name], members.TWO_LINK, 4e-3
+    q, dq, tau = jnp.asarray([[0.3, 0.5], [0.2, -0.4], [1.0, -2.0]])
+    start, as_state = ravel_pytree(observer.init(q, dq, model))
+
+    def rate(x):
+        return ravel_pytree(observer.derivative(0.0, q, dq, tau, model, as_state(x)))[0]
+
+    def after(x):
+        state = observer.advance(0.0, q, dq, tau, model, as_state(x), jnp.asarray(period))
+        return ravel_pytree(state)[0]
+
+    both = jax.jit(lambda x: (jax.jacfwd(rate)(x), jax.jacfwd(after)(x)))
+    of_rate, of_step = map(np.poly, both(start))
+    np.testing.assert_allclose(of_rate, np.poly(POLES[name]), rtol=1e-9)
+    poles = np.exp(period * np.asarray(POLES[name]))
+    np.testing.assert_allclose(of_step, np.poly(poles), rtol=1e-9)
+
+
 @pytest.mark.parametrize("payload", [0.0, 0.5], ids=["nominal", "unknown-payload"])
 @pytest.mark.parametrize("kind", [Momentum, AsPublished])
 def test_error_equation(estimate_rate, kind, payload, rng):
@@ -57,19 +93,6 @@ def test_error_equation(estimate_rate, kind, payload, rng):
         expected = kf * f_tilde + (kf * rest if kind is AsPublished else 0.0)
         np.testing.assert_allclose(df_hat, expected, rtol=1e-9, atol=1e-9)
         assert np.max(np.abs(rest)) > 1e-3
-
-
-def test_no_observer_estimates_nothing():
-    robot, drive = ij.presets.zhang_yan_2024(), ij.presets.motor_driven_two_link()
-    for scenario, shape in ((robot, (2,)), (drive, (3, 2))):
-        model = scenario.loop.model
-        x = jnp.ones((model.order, 2))
-        observer = observer_of_x(NoObserver())
-        estimate = observer.estimate(0.0, x, model, ())
-        assert estimate.shape == shape and not np.any(np.asarray(estimate))
-        assert jax.tree.leaves(observer.init(x, model)) == []
-    q = jnp.ones(2)
-    assert not np.any(np.asarray(NoObserver().estimate(0.0, q, q, robot.model, ())))
 
 
 def test_a_law_without_an_observer_is_not_advised_about_kf(paper):

@@ -6,22 +6,20 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from independent import Loop, sine
 
 import iblf_jax as ij
 from iblf_jax import barriers, bounds, controllers
 
 START, END, RATE = 6.0, 0.3, 1.0
-FUNNEL = bounds.Bounds(
-    lower=bounds.Funnel(-START, -END, RATE), upper=bounds.Funnel(START, END, RATE)
-)
+FUNNEL = bounds.Bounds(bounds.Funnel(-START, -END, RATE), bounds.Funnel(START, END, RATE))
 
 
 def scenario(**changes):
     law = controllers.SurfaceBarrier(a=2.0, K=[4.0, 8.0], surface=FUNNEL)
     width = (START - END) / (2.0 - RATE) + 1.0
-    tube = bounds.Bounds(
-        lower=bounds.Funnel(-width, -END / 2, RATE), upper=bounds.Funnel(width, END / 2, RATE)
-    )
+    sides = (bounds.Funnel(sign * width, sign * END / 2, RATE) for sign in (-1.0, 1.0))
+    tube = bounds.Bounds(*sides)
     parts = {
         "controller": law,
         "observer": ij.observers.NoObserver(),
@@ -34,18 +32,13 @@ def scenario(**changes):
 def test_its_torque_is_the_published_one():
     base, t = scenario(), 0.7
     q, dq = np.array([0.9, 0.2]), np.array([0.3, -0.8])
-    command, _ = base.controller.command(
-        jnp.asarray(t), jnp.asarray(q), jnp.asarray(dq), jnp.ones(2), base.context, ()
-    )
-    q_d, dq_d = (
-        0.5 + 0.14 * np.array([np.sin(t), np.cos(t)]),
-        0.14 * np.array([np.cos(t), -np.sin(t)]),
-    )
+    arguments = map(jnp.asarray, (t, q, dq, np.ones(2)))
+    command, _ = base.controller.command(*arguments, base.context, ())
+    q_d, dq_d, _ = sine(*Loop().reference)(t)
     sigma, rho = dq - dq_d + 2.0 * (q - q_d), (START - END) * np.exp(-RATE * t) + END
     x, k = sigma / rho, np.array([1.0, 2.0])
-    np.testing.assert_allclose(
-        command.tau, -2 * k * np.log((1 + x) / (1 - x)) / ((1 - x**2) * rho), rtol=1e-12
-    )
+    expected = -2 * k * np.log((1 + x) / (1 - x)) / ((1 - x**2) * rho)
+    np.testing.assert_allclose(command.tau, expected, rtol=1e-12)
     np.testing.assert_allclose(dq - command.alpha, sigma, rtol=1e-12)
 
 
@@ -56,28 +49,33 @@ def test_the_funnel_of_the_surface_is_one_of_the_error():
     sigma, t = np.asarray(run.dq - run.alpha), np.asarray(run.t)[:, None]
     assert np.all(np.abs(sigma) < (START - END) * np.exp(-RATE * t) + END)
     # e1' + a e1 = sigma, solved with |sigma| at its bound.
-    implied = (
-        np.exp(-2 * t) * np.abs(run.e1[0])
-        + (START - END) * (np.exp(-t) - np.exp(-2 * t))
-        + END / 2 * (1 - np.exp(-2 * t))
-    )
+    fading, fast = np.exp(-t), np.exp(-2 * t)
+    implied = fast * np.abs(run.e1[0]) + (START - END) * (fading - fast) + END / 2 * (1 - fast)
     assert np.all(np.abs(run.e1) <= implied + 1e-9)
 
 
-def test_what_it_refuses():
-    with pytest.raises(
-        ValueError, match=r"SurfaceBarrier\.surface: .*expected an iblf_jax.bounds.Bounds"
-    ):
-        controllers.SurfaceBarrier(a=2.0, K=4.0, surface=barriers.Log())
-    with pytest.raises(ValueError, match=r"SurfaceBarrier\.barrier"):
-        controllers.SurfaceBarrier(a=2.0, K=4.0, surface=FUNNEL, barrier=FUNNEL)
-    for lower, upper in ((2.0, -2.0), (1.0, [2.0, 3.0]), (-1.0, [2.0, 0.0])):
-        law = controllers.SurfaceBarrier(
-            a=2.0, K=4.0, surface=bounds.Bounds(bounds.Constant(lower), bounds.Constant(upper))
-        )
-        with pytest.raises(
-            ValueError, match=r"SurfaceBarrier\.surface: .*expected lower < 0 < upper at t = 0"
-        ):
-            ij.simulate(
-                scenario(controller=controllers.SafetyFilter(law=law)), duration=0.1, dt=1e-3
-            )
+def of(surface, **fields):
+    return controllers.SurfaceBarrier(a=2.0, K=4.0, surface=surface, **fields)
+
+
+def run_between(lower, upper):
+    law = of(bounds.Bounds(bounds.Constant(lower), bounds.Constant(upper)))
+    filtered = controllers.SafetyFilter(law=law)
+    return ij.simulate(scenario(controller=filtered), duration=0.1, dt=1e-3)
+
+
+NOT_BETWEEN = r"SurfaceBarrier\.surface: .*expected lower < 0 < upper at t = 0"
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: of(barriers.Log()), r"Barrier\.surface: .*expected an iblf_jax.bounds.Bounds"),
+        (lambda: of(FUNNEL, barrier=FUNNEL), r"SurfaceBarrier\.barrier"),
+        (lambda: run_between(1.0, [2.0, 3.0]), NOT_BETWEEN),
+        (lambda: run_between(-1.0, [2.0, 0.0]), NOT_BETWEEN),
+    ],
+)
+def test_what_it_refuses(make, words):
+    with pytest.raises(ValueError, match=words):
+        make()

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from module_cases import Learned, NetworkLaw, NetworkObserver
+from module_cases import Learned
 
 import iblf_jax as ij
 from iblf_jax.core import modules
@@ -147,18 +147,13 @@ def test_programs_are_found_by_structure(scenario):
     assert len({*nodes}) == 3
 
 
-def numpy_torque(net, x):
-    weight, bias = (np.asarray(y) for y in (net.layers[0].weight, net.layers[0].bias))
-    hidden = np.tanh(weight @ x + bias)
-    return np.asarray(net.layers[1].weight) @ hidden + np.asarray(net.layers[1].bias)
-
-
 @pytest.mark.slow
 def test_the_torque_of_a_run_is_that_of_numpy(scenario):
     run = ij.simulate(scenario, **FEW)
+    first, last = scenario.disturbance.net.layers
     for k in (0, 7, len(run.t) - 1):
-        x = np.concatenate([run.q[k], run.dq[k]])
-        expected = numpy_torque(scenario.disturbance.net, x)
+        hidden = np.tanh(first.weight @ np.concatenate([run.q[k], run.dq[k]]) + first.bias)
+        expected = last.weight @ hidden + last.bias
         assert np.allclose(run.disturbance[k], expected, rtol=0, atol=1e-9)
 
 
@@ -189,44 +184,6 @@ def test_gradient_by_a_weight_and_single_precision(scenario):
     single = ij.simulate(ij.astype(scenario, "float32"), **FEW)
     assert single.q.dtype == jnp.float32
     assert np.allclose(single.q, ij.simulate(scenario, **FEW).q, atol=1e-5)
-
-
-@pytest.mark.release
-def test_the_checkers_accept_members_with_networks():
-    ij.testing.check_disturbance(Learned(mlp(width=7)))
-    ij.testing.check_disturbance(Plain(weights_of(0, jnp.tanh)))
-    ij.testing.check_observer(NetworkObserver(ij.observers.Momentum(20.0), mlp(size=2, width=7)))
-    ij.testing.check_law(NetworkLaw(60.0, 20.0, mlp(size=2, width=7)))
-
-
-@pytest.mark.release
-def test_studies_over_weights(scenario, tmp_path):
-    path = "disturbance.net.layers[1].bias[0]"
-    points = {path: [0.0, 1.0]}
-    table = ij.sweep(scenario, points, store=tmp_path / "s.zarr", **FEW)
-    fresh = ij.with_parts(scenario, disturbance=Learned(mlp()))
-    again = ij.sweep(fresh, points, store=tmp_path / "s.zarr", **FEW)
-    assert np.array_equal(table.rmse, again.rmse)
-    assert float(table.rmse[0, 0]) != float(table.rmse[1, 0])
-    result = ij.tune(
-        scenario, [ij.tunable(path, -1.0, 1.0)], ij.objectives.tracking(), effort="quick", **FEW
-    )
-    assert result.scenario.disturbance.net.activation is jnp.tanh
-
-
-@pytest.mark.release
-def test_certify_evaluates_a_loop_with_a_network(scenario):
-    quiet = eqx.tree_at(lambda n: n.layers[1], mlp(), jax.tree.map(jnp.zeros_like, mlp().layers[1]))
-    none = ij.with_parts(scenario, disturbance=ij.disturbances.Nothing())
-    names = [line.name for line in ij.certify(none).lines]
-    found = ij.certify(ij.with_parts(scenario, disturbance=Learned(quiet)))
-    assert [line.name for line in found.lines] == names
-
-
-def test_components_with_modules_are_copied_by_pickle(scenario):
-    division = scenario.disturbance._divisions[0][1]
-    again = pickle.loads(pickle.dumps(division))
-    assert again == division and hash(again) == hash(division)
 
 
 def test_stores_describe_modules_without_addresses(scenario):
@@ -324,3 +281,9 @@ def test_flax_modules_are_fields(paper):
     torque = jax.jit(lambda s: s.disturbance.torque(0.0, x[:2], x[2:], s.plant, s.model))(double)
     expected = np.asarray(net(x.astype("float32"))) + np.array([1.0, -1.0])
     assert np.allclose(torque, expected, atol=1e-6)
+
+
+def test_components_with_modules_are_copied_by_pickle(scenario):
+    division = scenario.disturbance._divisions[0][1]
+    again = pickle.loads(pickle.dumps(division))
+    assert again == division and hash(again) == hash(division)

@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import SHORT
 from members import DISTURBANCES, LAWS, OBSERVERS, REFERENCES, ROBOTS, SIDES
 
 import iblf_jax as ij
@@ -40,28 +39,9 @@ def test_one_part_is_exchanged_and_no_other(paper, name, part):
     new = ij.with_parts(paper, **{name: part})
     fitted = dataclasses.replace(paper, **{name: part})
     for field in dataclasses.fields(ij.Scenario):
-        assert same(
-            getattr(new, field.name), getattr(fitted if field.name == name else paper, field.name)
-        ), field.name
+        expected = fitted if field.name == name else paper
+        assert same(getattr(new, field.name), getattr(expected, field.name)), field.name
     assert same(paper, ij.presets.zhang_yan_2024())
-
-
-@pytest.mark.slow
-def test_the_result_runs_whatever_the_scenario_came_from(paper, short_run, tmp_path):
-    ij.save_scenario(paper, tmp_path / "paper.toml")
-    parts = {
-        "controller": LAWS["pd_gravity"],
-        "observer": OBSERVERS["none"],
-        "bounds": WIDE,
-        "disturbance": DISTURBANCES["step"],
-    }
-    runs = [
-        ij.simulate(ij.with_parts(s, **parts), **SHORT)
-        for s in (paper, ij.load_scenario(tmp_path / "paper.toml"))
-    ]
-    assert runs[0].ok
-    assert np.array_equal(runs[0].q, runs[1].q)
-    assert not np.allclose(runs[0].q[-1], short_run.q[-1])
 
 
 def test_plant_alone_leaves_the_model_and_robot_takes_both(paper):
@@ -100,18 +80,9 @@ def test_a_robot_of_other_joints_takes_its_surroundings_with_it(paper):
 @pytest.mark.parametrize(
     ("parts", "words"),
     [
-        (
-            {"law": LAWS["pd_gravity"]},
-            (
-                "part: got 'law', expected the name of a part: robot, plant, reference, bounds,"
-                " controller"
-            ),
-        ),
+        ({"law": LAWS["pd_gravity"]}, "part: got 'law', expected the name of a part: robot, plant"),
         ({"controler": LAWS["pd_gravity"]}, "got 'controler'"),
-        (
-            {"controller": OBSERVERS["momentum"]},
-            "Scenario.controller: got .* a component that fits .*RobotLaw",
-        ),
+        ({"controller": OBSERVERS["momentum"]}, "Scenario.controller: got .* fits .*RobotLaw"),
         ({"observer": None}, "Scenario.observer: got None"),
         ({"observer": ij.observers.NoObserver}, "It is a class: make an instance"),
         ({"bounds": (0.1, 0.9)}, "Scenario.bounds: .* expected a Bounds"),
@@ -124,9 +95,6 @@ def test_a_robot_of_other_joints_takes_its_surroundings_with_it(paper):
 def test_what_is_refused(paper, parts, words):
     with pytest.raises(ValueError, match=words):
         ij.with_parts(paper, **parts)
-
-
-def test_not_a_scenario():
     with pytest.raises(ValueError, match="scenario: got 3, expected a Scenario"):
         ij.with_parts(3, observer=ij.observers.NoObserver())
 

@@ -66,19 +66,17 @@ def test_programs_that_differ_have_two_digests(case):
     assert digest(one) == digest(one)
 
 
-@pytest.mark.parametrize("call", ["pure_callback", "debug_callback", "debug_print"])
-def test_a_program_that_calls_python_has_no_digest(call):
-    def f(x):
-        if call == "debug_callback":
-            jax.debug.callback(print, x)
-            return x
-        if call == "debug_print":
-            jax.debug.print("{x}", x=x)
-            return x
-        return jax.pure_callback(np.sin, x, x)
+CALLS = {
+    "pure_callback": lambda x: jax.pure_callback(np.sin, x, x),
+    "debug_callback": lambda x: (jax.debug.callback(print, x), x)[1],
+    "debug_print": lambda x: (jax.debug.print("{x}", x=x), x)[1],
+}
 
+
+@pytest.mark.parametrize("call", CALLS)
+def test_a_program_that_calls_python_has_no_digest(call):
     with pytest.raises(CallsPythonError, match=r"callback|debug_print"):
-        digest(lambda x: jax.lax.cond(x > 0, f, lambda x: x, x), jnp.ones(()))
+        digest(lambda x: jax.lax.cond(x > 0, CALLS[call], lambda x: x, x), jnp.ones(()))
 
 
 def digest_of_a_run() -> str:

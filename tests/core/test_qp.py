@@ -35,8 +35,7 @@ def elsewhere(H, g, G, h):
     """The solution by Clarabel, or None where it gives up."""
     import scipy.sparse as sp
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         return qpsolvers.solve_qp(
             sp.csc_matrix(H), g, sp.csc_matrix(G), h, solver="clarabel", **TIGHT
         )

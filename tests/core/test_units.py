@@ -81,14 +81,9 @@ def test_components_and_levels_are_resolved_and_shown():
 
 
 def test_the_unit_of_an_entry():
+    assert pickle.loads(pickle.dumps(INPUT)) == INPUT and INPUT.formula == "u"
     weights = ByLevel((("m", "rad"), ("m/s", "rad/s")))
     assert of_entry(weights, (1,), 2) == ("m/s", "rad/s")
     assert of_entry(weights, (1, 1), 2) == "rad/s"
     assert of_entry(("m", "rad"), (1,), 1) == "rad"
     assert of_entry(("m", "rad"), (3,), 2) == ("m", "rad")  # a row of waypoints
-
-
-def test_a_plant_unit_survives_pickling():
-    unit = pickle.loads(pickle.dumps(INPUT))
-    assert unit == INPUT
-    assert unit.formula == "u"

@@ -9,8 +9,12 @@ const text = fs.readFileSync(process.argv[2], "utf8"), actions = JSON.parse(fs.r
 const script = text.slice(text.indexOf("<script>") + 8, text.indexOf("</script"));
 
 class Element {
-  constructor(tag) { Object.assign(this, {tag, children: [], listeners: {}, dataset: {}, textContent: "", className: ""}); }
-  append(...parts) { this.children.push(...parts.filter(part => part instanceof Element)); }
+  constructor(tag) { Object.assign(this, {tag, children: [], listeners: {}, dataset: {}, textContent: "", className: "", style: {}}); }
+  appendChild(part) { this.append(part); return part; }
+  append(...parts) {
+    this.words = parts.find(part => typeof part === "string") ?? "";
+    this.children.push(...parts.filter(part => part instanceof Element));
+  }
   replaceChildren() { this.children = []; }
   addEventListener(kind, does) { this.listeners[kind] = does; }
   getContext() { return new Proxy({}, {get: () => () => undefined, set: () => true}); }
@@ -38,14 +42,15 @@ globalThis.location = {search: process.argv[4] || ""};
 globalThis.devicePixelRatio = 1;
 globalThis.addEventListener = () => undefined;
 globalThis.frameElement = null;
-globalThis.matchMedia = () => ({addEventListener: () => undefined});
+globalThis.matchMedia = () => ({addEventListener: () => undefined, matches: false});
+globalThis.requestAnimationFrame = () => undefined;
 globalThis.getComputedStyle = () => ({getPropertyValue: () => ""});
 (0, eval)(script);
 
-const sliders = made.sliders;
+const {sliders, top} = made;
 for (const action of actions) {
   if ("law" in action) {
-    const choice = sliders.all("select")[0];
+    const choice = top.all("select")[0];
     choice.value = action.law;
     choice.listeners.change();
   }
@@ -54,11 +59,12 @@ for (const action of actions) {
     input.value = action.to;
     input.listeners.input();
   }
-  if ("reset" in action) sliders.all("button")[0].listeners.click();
+  if ("reset" in action) top.all("button").find(button => button.textContent === "Reset").listeners.click();
   const shown = sliders.all("label").filter(label => label.all("input").length).map(label => [label.all("input")[0].name, label.all("span")[0].textContent]);
   const places = sliders.all("input").map(input => [input.name, Number(input.value)]);
-  const menu = sliders.all("label").filter(label => label.htmlFor === "law").map(label => label.textContent);
-  const laws = sliders.all("option").map(option => option.value);
+  const menu = top.all("label").filter(label => label.htmlFor === "law").map(label => label.textContent);
+  const laws = top.all("option").map(option => option.value);
+  const words = Object.fromEntries(sliders.all("label").map(label => [label.all("input")[0].name, label.words]));
   console.log(JSON.stringify({...JSON.parse(document.body.dataset.run), shown: Object.fromEntries(shown),
-    places: Object.fromEntries(places), laws, menu, unused: made.unused.hidden ? "" : made.unused.textContent}));
+    places: Object.fromEntries(places), laws, menu, words, message: top.all("p")[0].textContent, unused: made.unused.hidden ? "" : made.unused.textContent}));
 }

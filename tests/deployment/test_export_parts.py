@@ -4,13 +4,13 @@ process noise and switched plants as FMUs: the numbers of `simulate`."""
 from __future__ import annotations
 
 import re
-import subprocess
 
-import loops_of_plants
 import members
 import numpy as np
 import pytest
+from exported import built_and_run, run_fmu
 from iblf_jax.sensors import Direct, Encoder, FilteredDifference, Levels
+from loops_of_plants import electric_drive, flexible_joint
 
 import iblf_jax as ij
 from iblf_jax.deployment import export
@@ -18,17 +18,11 @@ from iblf_jax.simulation.scenario import canonical
 
 SAMPLING = ij.Sampling(period=1e-3)
 DURATION = 0.08
-STRICT = ("-O0", "-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-Wconversion")
 
 
 def robot(**parts):
     """The paper's loop, sampled."""
     return ij.with_parts(ij.presets.zhang_yan_2024(), **({"sampling": SAMPLING} | parts))
-
-
-def law(name):
-    """The loop of a law of `members`."""
-    return robot(controller=members.LAWS[name], observer=ij.observers.NoObserver())
 
 
 def measured(loop, parts, levels):
@@ -55,13 +49,9 @@ def switched():
 FILTERED = Encoder(velocity=FilteredDifference(cutoff=200.0))
 OBSERVED = {
     "robot": lambda: measured(robot(), (Direct(), None), (1,)),
-    "drive": lambda: measured(loops_of_plants.electric_drive(), (Direct(), None, None), (1,)),
-    "current": lambda: measured(
-        loops_of_plants.electric_drive(), (Direct(), None, Direct()), (1, 3)
-    ),
-    "motor": lambda: measured(
-        loops_of_plants.flexible_joint(), (FILTERED, Direct(), None), (1, 2, 3)
-    ),
+    "drive": lambda: measured(electric_drive(), (Direct(), None, None), (1,)),
+    "current": lambda: measured(electric_drive(), (Direct(), None, Direct()), (1, 3)),
+    "motor": lambda: measured(flexible_joint(), (FILTERED, Direct(), None), (1, 2, 3)),
 }
 """Name -> a loop that estimates levels."""
 UNREAD = {"robot": {"dq"}, "drive": {"dq", "x_3"}, "current": {"dq"}, "motor": {"dq", "x_4"}}
@@ -70,12 +60,9 @@ LAWS = {
     "trigger": lambda: robot(
         sampling=ij.Sampling(1e-3, trigger=ij.EventTrigger(relative=0.1, absolute=[0.3, 0.1]))
     ),
-    "auxiliary": lambda: law("saturated_auxiliary"),
-    "adaptive": lambda: law("adaptive_parameters"),
-    "terminal": lambda: law("terminal_sliding_mode"),
-    "decays": lambda: law("backstepping_decays"),
-    "noisy": noisy,
-    "switched": switched,
+    "decays": lambda: robot(
+        controller=members.LAWS["backstepping_decays"], observer=ij.observers.NoObserver()
+    ),
 }
 
 
@@ -83,15 +70,6 @@ def release(names, quick):
     """Names as parameters of a test, of which all but one run before a release."""
     marked = [pytest.param(name, marks=pytest.mark.release) for name in names if name != quick]
     return [quick, *marked]
-
-
-def self_test(folder):
-    """Builds and runs the self-test of a folder."""
-    command = ["gcc", *STRICT, "iblf_law.c", "selftest.c", "-lm", "-o", "selftest"]
-    built = subprocess.run(command, cwd=folder, capture_output=True, text=True)
-    assert built.returncode == 0, built.stderr
-    ran = subprocess.run(["./selftest"], cwd=folder, capture_output=True, text=True)
-    assert ran.returncode == 0, ran.stdout
 
 
 @pytest.fixture(autouse=True)
@@ -106,7 +84,7 @@ def short_run(monkeypatch):
 def test_a_law_that_estimates_levels_reads_the_measured_ones(tmp_path, case):
     scenario = canonical(OBSERVED[case]())
     ij.export(scenario, tmp_path)
-    self_test(tmp_path)
+    built_and_run(tmp_path, "-O0")
     source = (tmp_path / "iblf_law.c").read_text()
     assert set(re.findall(r"if \((\w+) == NULL\)", source)) == UNREAD[case]
     run = ij.simulate(scenario, duration=DURATION, dt=1e-3)
@@ -119,47 +97,33 @@ def test_a_law_that_estimates_levels_reads_the_measured_ones(tmp_path, case):
 @pytest.mark.filterwarnings("ignore:the simulated run")
 def test_the_c_of_a_law_with_a_state_of_its_own_passes_its_self_test(tmp_path, case):
     ij.export(LAWS[case](), tmp_path)
-    self_test(tmp_path)
+    built_and_run(tmp_path, "-O0")
 
 
 @pytest.mark.release
 def test_a_law_that_estimates_levels_as_an_fmu(tmp_path):
-    fmpy = pytest.importorskip("fmpy")
     scenario = OBSERVED["drive"]()
     ij.export(scenario, tmp_path, target="fmu")
     run = ij.simulate(scenario, duration=DURATION, dt=1e-3)
-    inputs = np.zeros(run.t.size, [("time", float), ("q", float, (2,))])
-    inputs["time"], inputs["q"] = run.t, run.measured.q
+    inputs = {"time": run.t, "q": run.measured.q}
     starts = {"dq": run.dq[0].tolist(), "x_3": run.x[0, 2].tolist()}
-    found = fmpy.simulate_fmu(
-        str(tmp_path / "iblf_law.fmu"),
-        stop_time=DURATION,
-        step_size=1e-3,
-        output_interval=1e-3,
-        output=["tau"],
-        start_values=starts,
-        input=inputs,
-    )
+    file = tmp_path / "iblf_law.fmu"
+    found = run_fmu(file, ["tau"], DURATION, 1e-3, inputs, start_values=starts)
     np.testing.assert_allclose(found["tau"][1:], run.tau[:-1], atol=1e-9)
 
 
-@pytest.mark.release
 @pytest.mark.parametrize(
     ("case", "method"),
-    [(noisy, "euler_maruyama"), (switched, "rk4"), (OBSERVED["robot"], "rk4")],
-    ids=["noisy", "switched", "observed"],
+    [
+        pytest.param(noisy, "euler_maruyama", marks=pytest.mark.release),
+        pytest.param(switched, "rk4", marks=pytest.mark.release),
+        pytest.param(OBSERVED["robot"], "rk4", marks=pytest.mark.slow),
+    ],
 )
-def test_a_closed_loop_as_an_fmu_is_simulate(tmp_path, case, method):
-    fmpy = pytest.importorskip("fmpy")
+def test_a_sampled_closed_loop_as_an_fmu_is_simulate(tmp_path, case, method):
     ij.export(case(), tmp_path, target="fmu-loop", method=method, seed=3)
     run = ij.simulate(case(), duration=DURATION, dt=1e-3, method=method, seed=3)
-    found = fmpy.simulate_fmu(
-        str(tmp_path / "iblf_loop.fmu"),
-        stop_time=DURATION,
-        step_size=1e-3,
-        output_interval=1e-3,
-        output=["q", "tau"],
-    )
+    found = run_fmu(tmp_path / "iblf_loop.fmu", ["q", "tau"], DURATION, 1e-3)
     np.testing.assert_allclose(found["q"], run.q, atol=1e-9)
     np.testing.assert_allclose(found["tau"], run.tau, atol=1e-9)
 

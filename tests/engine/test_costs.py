@@ -56,19 +56,12 @@ SCENARIOS = {
     f"zhang_yan_2024, {law}": lambda law=law: ij.presets.zhang_yan_2024(law=law)
     for law in ij.presets.LAWS
 }
-PLANTS = (
-    "motor_driven_pendulum",
-    "motor_driven_two_link",
-    "flexible_joint_two_link",
-    "flexible_joint_iiwa14",
-    "vessel",
-)
+PLANTS = ("motor_driven_pendulum", "flexible_joint_two_link", "vessel")
 """Presets without a mass of a robot at "plant.mass[1]"; their runs differ in their start only."""
-SCENARIOS |= {name: x for name, x in ij.presets.PRESETS.items() if name != "zhang_yan_2024"}
-SCENARIOS["planar chain of 3"] = lambda: planar_chain(3)
+COUNTED = ("zhang_yan_2024_full_state", "zhang_yan_2024_saturated", "iiwa14", *PLANTS)
+"""Presets whose programs differ from those of all others by more than numbers or joints."""
+SCENARIOS |= {name: ij.presets.PRESETS[name] for name in COUNTED}
 SCENARIOS["planar chain of 12"] = lambda: planar_chain(12)
-LONG = ("ur5", "iiwa14", "flexible_joint_iiwa14", "planar chain of 12")
-"""Six joints and more: a count takes seconds."""
 
 
 def step_counts(name: str) -> dict[str, dict[str, int]]:
@@ -80,46 +73,40 @@ def step_counts(name: str) -> dict[str, dict[str, int]]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name", [pytest.param(x, marks=pytest.mark.slow) if x in LONG else x for x in SCENARIOS]
-)
+@pytest.mark.parametrize("name", SCENARIOS)
 def test_operations_of_a_step(name):
     table = json.loads(FILE.read_text())
     if table["jax"] != JAX:
         pytest.skip(f"counted with jax {table['jax']}")
     found, expected = step_counts(name), table["a step"][name]
-    changes = {often: Counter(found[often]) for often in found}
-    for often, counter in expected.items():
-        changes.setdefault(often, Counter()).subtract(counter)
-    moved = {
-        often: {op: n for op, n in sorted(counter.items()) if n}
-        for often, counter in changes.items()
-    }
+    moved = {}
+    for often in found.keys() | expected.keys():
+        change = Counter(found.get(often, {}))
+        change.subtract(expected.get(often, {}))
+        moved[often] = {op: n for op, n in sorted(change.items()) if n}
     assert found == expected, (
         f"{name}: {moved} more than in {FILE.name}; if that is intended, run `python"
-        " tests/engine/test_costs.py`"
-        " writes it anew"
+        " tests/engine/test_costs.py`, which writes it anew"
     )
 
 
 # ------------------------------------------------------------ a first call
 
 CALLS = {
-    "certify": lambda paper: ij.certify(paper, duration=0.1, dt=1e-3),
-    "tune": (
-        lambda paper: (
-            ij.tune(
-                paper,
-                ["controller.K2"],
-                ij.objectives.tracking(),
-                effort=ij.tuning.Effort(iterations=2),
-                progress=False,
-                **SHORT,
-            ).report
-        )
+    "certify": lambda paper: ij.certify(paper, **SHORT),
+    "tune": lambda paper: (
+        ij.tune(
+            paper,
+            ["controller.K2"],
+            ij.objectives.tracking(),
+            effort=EFFORT,
+            progress=False,
+            **SHORT,
+        ).report
     ),
 }
 """First calls of `simulate` and `monte_carlo` are timed by `benchmarks/losses.py`."""
+EFFORT = ij.tuning.Effort(iterations=2)
 SHORT = {"duration": 0.1, "dt": 1e-3}
 OPERATION = re.compile(r"^\s*(?:%\S+ = )?\"?(?:stablehlo|chlo|func\.call|call)\b", re.MULTILINE)
 SLACK = 1.02

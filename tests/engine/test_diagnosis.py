@@ -11,48 +11,82 @@ from iblf_jax.core.status import Status
 from iblf_jax.engine import diagnosis
 from iblf_jax.engine.diagnosis import SimulationWarning
 
-TransformedError, Quadratic = ij.barriers.TransformedError, ij.barriers.Quadratic
 WIDE = symmetric(999.0)
 
 
-def law(*barriers):
-    return ij.controllers.BarrierBackstepping(k=(3.0, 10.0, 30.0), barriers=barriers)
+QUADRATIC, QUIET = ij.barriers.Quadratic(), ij.disturbances.Nothing()
+PLAIN = ij.controllers.BarrierBackstepping(
+    k=(3.0, 10.0, 30.0), barriers=(ij.barriers.TransformedError(), QUADRATIC, QUADRATIC)
+)
+ROBOT = ij.presets.zhang_yan_2024()
 
 
-def message_of(scenario, duration=0.5, dt=1e-3) -> str:
-    """The warning about a run, after those about the scenario."""
+def singular_gain(t, x):
+    one = jnp.ones_like(x[0])
+    return jnp.stack([one, jnp.where(x[0] > 0.45, 0.0, 1.0), one])
+
+
+SINGULAR = ij.plants.StrictFeedback(
+    drift=lambda t, x: jnp.zeros_like(x),
+    gain=singular_gain,
+    n=1,
+    order=3,
+    level_names=("a", "b", "c"),
+)
+MESSAGES = {
+    "a level with its time, margin, unit and remedy": (
+        lambda: pendulum(controller=PLAIN, bounds=(ANGLES, WIDE, symmetric(2.0))),
+        {},
+        "Level 3 (current) of pendulum left its bounds first, at t = 0.0",
+        " A. The law has barriers.Quadratic() on that level",
+        "give it barriers.TransformedError() there",
+    ),
+    "the second level": (
+        lambda: pendulum(controller=PLAIN, bounds=(ANGLES, symmetric(0.1), WIDE)),
+        {},
+        "a bound of the second level was violated",
+        "Level 2 (speed) of pendulum left its bounds first",
+        "rad/s. The law has barriers.Quadratic()",
+    ),
+    "the second level of a robot": (
+        lambda: ij.with_parts(ROBOT, bounds=(ROBOT.bounds[0], symmetric(0.1))),
+        {},
+        "a velocity bound was violated",
+        "Joint 1 left its velocity bounds first",
+    ),
+    "a singular gain": (
+        lambda: pendulum(plant=SINGULAR, bounds=ANGLES, controller=PLAIN, disturbance=QUIET),
+        {"duration": 1.5},
+        "the law's input was not finite",
+        "the gain of level 2 (b) is singular",
+        "bound the levels so that they stay away",
+    ),
+    "the unit of the worst component": (
+        body,
+        {"duration": 10.0, "dt": 0.5},
+        "the components of the first level are inaccurate",
+        " m, ",
+    ),
+}
+ABSENT = {"the second level": "velocity bounds", "the unit of the worst component": " rad, "}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", MESSAGES)
+def test_the_warning_names(case):
+    make, options, *words = MESSAGES[case]
     with pytest.warns(SimulationWarning) as found:
-        ij.simulate(scenario, duration=duration, dt=dt)
+        run = ij.simulate(make(), **({"duration": 0.5, "dt": 1e-3} | options))
     (text,) = [str(w.message) for w in found if w.category is SimulationWarning]
-    return text
-
-
-@pytest.mark.slow
-def test_a_violated_level_is_named_with_time_margin_unit_and_remedy():
-    plain = law(TransformedError(), Quadratic(), Quadratic())
-    text = message_of(pendulum(controller=plain, bounds=(ANGLES, WIDE, symmetric(2.0))))
-    assert "Level 3 (current) of pendulum left its bounds first, at t = 0.0" in text
-    assert " A. The law has barriers.Quadratic() on that level" in text
-    assert "give it barriers.TransformedError() there" in text
-
-
-@pytest.mark.slow
-def test_a_violated_second_level_has_the_unit_of_the_level():
-    plain = law(TransformedError(), Quadratic(), Quadratic())
-    text = message_of(pendulum(controller=plain, bounds=(ANGLES, symmetric(0.1), WIDE)))
-    assert "a bound of the second level was violated" in text
-    assert "Level 2 (speed) of pendulum left its bounds first" in text
-    assert "rad/s. The law has barriers.Quadratic()" in text
-    assert "velocity bounds" not in text
+    assert all(x in text for x in words) and ABSENT.get(case, "nothing of it") not in text, text
+    assert bool(int(run.status) & Status.SINGULAR_GAIN) == (case == "a singular gain")
 
 
 @pytest.mark.slow
 def test_a_virtual_control_outside_its_level_is_reported_like_assumption_2():
-    plain = law(TransformedError(), Quadratic(), Quadratic())
-    scenario = pendulum(controller=plain, bounds=(ANGLES, symmetric(3.0), symmetric(2.0)))
-    run = None
+    bounds = (ANGLES, symmetric(3.0), symmetric(2.0))
     with pytest.warns(SimulationWarning, match="Assumption 2") as found:
-        run = ij.simulate(scenario, duration=0.5, dt=1e-3)
+        run = ij.simulate(pendulum(controller=PLAIN, bounds=bounds), duration=0.5, dt=1e-3)
     text = str(found[0].message)
     worst = -float(run.metrics.level_alpha_margin[0, 0])
     alpha = run.x[:, 2, 0] - run.e[:, 2, 0]
@@ -65,63 +99,38 @@ def test_a_virtual_control_outside_its_level_is_reported_like_assumption_2():
 
 @pytest.mark.slow
 def test_a_law_of_robots_is_told_who_keeps_the_bounds_of_levels():
-    rigid = ij.presets.zhang_yan_2024()
-    plant = ij.plants.FlexibleJoint(rigid.plant, stiffness=3e3, motor_inertia=0.02)
-    scenario = ij.Scenario(
-        plant=plant,
-        model=rigid.plant,
-        reference=rigid.reference,
-        bounds=(rigid.bounds[0], None, None, symmetric(0.5)),
-        controller=rigid.controller,
-        initial=rigid.initial,
-    )
-    text = message_of(scenario, duration=0.05, dt=2e-4)
-    assert "Level 4 (motor velocity) of joint" in text
-    assert "controllers.BarrierBackstepping keeps them" in text
+    """It has no virtual controls of higher levels, and no margins of them."""
+    parts = {
+        "plant": ij.plants.FlexibleJoint(ROBOT.plant, stiffness=3e3, motor_inertia=0.02),
+        "bounds": (ROBOT.bounds[0], None, None, symmetric(0.5)),
+        "observer": ij.observers.NoObserver(),
+    }
+    scenario = ij.with_parts(ROBOT, disturbance=QUIET, **parts)
+    with pytest.warns(SimulationWarning, match=r"Level 4 \(motor velocity\) of joint") as found:
+        run = ij.simulate(scenario, duration=0.05, dt=2e-4)
+    assert any("controllers.BarrierBackstepping keeps them" in str(w.message) for w in found)
+    assert "level_margin" in run.metrics and "level_alpha_margin" not in run.metrics
+    assert run.metrics.units["estimate_rmse"] == "N m"
+    assert jnp.all(jnp.isinf(run.metrics.level_margin[0]))  # level 3 has no bounds
+
+
+FAR = ij.references.Sinusoid(offset=0.0, amplitude=[4.0, 2.0, 3.0], frequency=1.0)
+OUTSIDE = ij.references.Sinusoid(offset=[9.0, 0.0, 0.0], amplitude=0.0)
+FAST = ij.Initial(q=[0.5, 1.0, 0.2], dq=1e13)
 
 
 @pytest.mark.slow
-def test_a_gain_that_becomes_singular_is_named():
-    def gain(t, x):
-        one = jnp.ones_like(x[0])
-        return jnp.stack([one, jnp.where(x[0] > 0.45, 0.0, 1.0), one])
-
-    plant = ij.plants.StrictFeedback(
-        drift=lambda t, x: jnp.zeros_like(x), gain=gain, n=1, order=3, level_names=("a", "b", "c")
-    )
-    scenario = pendulum(
-        plant=plant,
-        bounds=ANGLES,
-        controller=law(TransformedError(), Quadratic(), Quadratic()),
-        disturbance=ij.disturbances.Nothing(),
-    )
-    with pytest.warns(SimulationWarning) as found:
-        run = ij.simulate(scenario, duration=1.5, dt=1e-3)
-    assert int(run.status) & Status.SINGULAR_GAIN
-    text = str(found[0].message)
-    assert "the law's input was not finite" in text
-    assert "the gain of level 2 (b) is singular" in text
-    assert "bound the levels so that they stay away" in text
-
-
-@pytest.mark.slow
-def test_an_inaccurate_run_names_the_unit_of_the_worst_component():
-    text = message_of(body(), duration=10.0, dt=0.5)
-    assert "the components of the first level are inaccurate" in text
-    assert " m, " in text
-    assert " rad, " not in text
-
-
-@pytest.mark.slow
-def test_errors_before_a_run_name_components():
-    far = ij.references.Sinusoid(offset=0.0, amplitude=[4.0, 2.0, 3.0], frequency=1.0)
-    with pytest.raises(ValueError, match="reference of heading"):
-        ij.simulate(body(reference=far), duration=10.0, dt=1e-2)
-    outside = ij.references.Sinusoid(offset=[9.0, 0.0, 0.0], amplitude=0.0)
-    with pytest.raises(ValueError, match="reference of north"):
-        ij.simulate(body(reference=outside), duration=1.0, dt=1e-2)
-    with pytest.raises(ValueError, match=r"speeds below 1e\+12 m/s, m/s, rad/s"):
-        ij.simulate(body(initial=ij.Initial(q=[0.5, 1.0, 0.2], dq=1e13)), duration=1.0, dt=1e-2)
+@pytest.mark.parametrize(
+    ("parts", "words"),
+    [
+        ({"reference": FAR}, "reference of heading"),
+        ({"reference": OUTSIDE}, "reference of north"),
+        ({"initial": FAST}, r"speeds below 1e\+12 m/s, m/s, rad/s"),
+    ],
+)
+def test_errors_before_a_run_name_components(parts, words):
+    with pytest.raises(ValueError, match=words):
+        ij.simulate(body(**parts), duration=10.0, dt=1e-2)
 
 
 @pytest.mark.slow
@@ -133,21 +142,12 @@ def test_a_run_that_starts_outside_a_level_is_named_in_a_study():
         study.replay(0)
 
 
-@pytest.mark.slow
-def test_a_robot_keeps_its_words():
-    robot = ij.presets.zhang_yan_2024()
-    robot = ij.with_parts(robot, bounds=(robot.bounds[0], symmetric(0.1)))
-    text = message_of(robot, duration=0.5)
-    assert "a velocity bound was violated" in text
-    assert "Joint 1 left its velocity bounds first" in text
-    assert "2 joints" in repr(ij.simulate(ij.presets.zhang_yan_2024(), duration=0.02, dt=1e-3))
-    assert "1 component," in repr(ij.simulate(pendulum(), duration=0.02, dt=1e-3))
-
-
 @pytest.fixture(scope="module")
 def run():
     """A run of 20 ms, with the metrics of violated bounds."""
-    return ij.simulate(pendulum(), duration=0.02, dt=1e-3)
+    made = ij.simulate(pendulum(), duration=0.02, dt=1e-3)
+    assert "1 component," in repr(made)
+    return made
 
 
 def message_for(run, status, **metrics) -> str:

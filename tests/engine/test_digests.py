@@ -1,22 +1,17 @@
-"""Every number of a short run of every preset, and every line of its certificate: what a change of
-structure must not move.
+"""Every number of a short run of every preset: what a change of structure must not move.
 
 `tests/data/digests.json` has them, with a SHA-256 digest of the bytes of each signal and metric.
 The tests compare the numbers to 1e-9, which holds on every processor and with every supported
-version of JAX.  To check a refactoring, compare bit by bit on one machine,
+version of JAX.  To check a refactoring, compare bit by bit on one machine: before and after it,
 
-    python tests/engine/test_digests.py --write FILE          before the change,
-    python tests/engine/test_digests.py --compare FILE        after it,
+    python tests/engine/test_digests.py FILE
 
-where the second one names every field of every preset that moved; names of presets after FILE
-select some.  After a change that is meant to move numbers, `--write tests/data/digests.json`
-writes the stored file anew.
+writes a file, in which each field is a line, so that `diff` names what moved.  After a change that
+is meant to move numbers, `tests/data/digests.json` as FILE writes the stored file anew.
 """
 
 from __future__ import annotations
 
-import argparse
-import dataclasses
 import functools
 import hashlib
 import json
@@ -24,7 +19,6 @@ import math
 import os
 import sys
 import warnings
-from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -41,274 +35,118 @@ import iblf_jax as ij
 from iblf_jax.files.scenario import scenario_to_toml
 
 FILE = TESTS / "data" / "digests.json"
-RUN: dict[str, Any] = {"duration": 0.2, "dt": 5e-4}
 SIGNALS = ("q", "dq", "tau", "V")
 RELATIVE, ABSOLUTE = 1e-9, 1e-12
-PAPER = ("zhang_yan_2024", "printed_gap", "zhang_yan_2024_saturated", "zhang_yan_2024_funnel")
-"""Presets whose scenario is made at once; the first two share the program of their runs."""
-RELEASE = (
-    *("flexible_joint_iiwa14", "iiwa14", "ur5"),
-    *("printed_gap", "zhang_yan_2024_funnel", "zhang_yan_2024_full_state"),
-    *("motor_driven_pendulum", "vessel"),
-)
-"""Presets whose certificate takes minutes to compile, or is one of `test_certificate_texts.py`."""
-
-Fields = dict[str, Any]
+QUICK = ("zhang_yan_2024", "printed_gap")
+"""Presets whose scenario is made at once; they share the program of their runs."""
+SLOW = [pytest.param(x, marks=pytest.mark.slow) for x in ij.presets.PRESETS if x not in QUICK]
 
 # ------------------------------------------------------------ what is stored
 
 
-def digest(values: np.ndarray) -> str:
-    """SHA-256 of type, shape and bytes."""
-    words = f"{values.dtype} {values.shape} ".encode()
-    return hashlib.sha256(words + np.ascontiguousarray(values).tobytes()).hexdigest()
+def with_digest(array: Any, **fields: Any) -> dict[str, Any]:
+    """Fields of an array, with the SHA-256 of its type, shape and bytes."""
+    words = f"{array.dtype} {array.shape} ".encode() + np.ascontiguousarray(array).tobytes()
+    numbers = {name: np.ravel(x).tolist() for name, x in fields.items()}
+    return {"sha256": hashlib.sha256(words).hexdigest(), "shape": array.shape} | numbers
 
 
-def signal(values: Any) -> Fields:
+def signal(values: Any) -> dict[str, Any]:
     """Digest, last value, mean and largest size over time, of each component."""
-    values = np.asarray(values)
-    return {
-        "sha256": digest(values),
-        "shape": values.shape,
-        "last": values[-1].ravel().tolist(),
-        "mean": values.mean(axis=0).ravel().tolist(),
-        "largest": np.abs(values).max(axis=0).ravel().tolist(),
-    }
+    largest = np.abs(values).max(axis=0)
+    return with_digest(values, last=values[-1], mean=values.mean(axis=0), largest=largest)
 
 
-def metric(values: Any) -> Fields:
-    """Digest and values."""
-    values = np.asarray(values)
-    return {"sha256": digest(values), "shape": values.shape, "values": values.ravel().tolist()}
+def structure_fields(preset: str) -> dict[str, Any]:
+    """The paths of all parameters, and the scenario file."""
+    scenario = ij.presets.PRESETS[preset]()
+    paths = [row.path for row in ij.parameters(scenario)]
+    return {"paths": paths, "file": scenario_to_toml(scenario)}
 
 
-@functools.cache
-def scenario_of(preset: str) -> ij.Scenario:
-    """The scenario of a preset, with its defaults."""
-    return ij.presets.PRESETS[preset]()
-
-
-@functools.cache
-def run_of(preset: str) -> ij.Rollout:
-    """Its run with all samples."""
+def run_fields(preset: str) -> dict[str, Any]:
+    """Signals and metrics of the run."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ij.SimulationWarning)
-        return ij.simulate(scenario_of(preset), **RUN)
-
-
-def structure_fields(preset: str) -> Fields:
-    """The paths of all parameters, and the scenario file."""
-    scenario = scenario_of(preset)
-    return {
-        "paths": [row.path for row in ij.parameters(scenario)],
-        "file": scenario_to_toml(scenario),
+        run = ij.simulate(ij.presets.PRESETS[preset](), duration=0.2, dt=5e-4)
+    metrics = {name: np.asarray(x) for name, x in run.metrics.items()}
+    return {name: signal(np.asarray(getattr(run, name))) for name in SIGNALS} | {
+        f"metric {name}": with_digest(x, values=x) for name, x in metrics.items()
     }
 
 
-def run_fields(preset: str) -> Fields:
-    """Signals and metrics of the run."""
-    run = run_of(preset)
-    signals = {name: signal(getattr(run, name)) for name in SIGNALS}
-    return signals | {f"metric {name}": metric(run.metrics[name]) for name in run.metrics}
+GROUPS = {"structure": structure_fields, "run": run_fields}
 
 
-def certificate_fields(preset: str) -> Fields:
-    """The lines of the certificate of the run, or why there is none."""
-    try:
-        certificate = ij.certify(scenario_of(preset), run_of(preset))
-    except ValueError as error:
-        return {"certificate": str(error)}
-    lines = {f"line {x.name}": dataclasses.asdict(x) for x in certificate.lines}
-    return {"certificate": f"{certificate.headline} ({certificate.subject})"} | lines
-
-
-GROUPS = {"structure": structure_fields, "run": run_fields, "certificate": certificate_fields}
-
-
-def as_json(value: Any) -> Any:
-    """A value as a file has it, with every digit."""
-    return json.loads(json.dumps(value))
-
-
-def fields_of(preset: str, groups: Iterable[str] = GROUPS) -> dict[str, Fields]:
-    """Group -> name -> value."""
-    return {group: as_json(GROUPS[group](preset)) for group in groups}
-
-
-def as_text(table: dict[str, dict[str, Fields]]) -> str:
+def as_text(table: Any, depth: int = 3, indent: str = "") -> str:
     """The file: a field a line, so that its difference names what moved."""
-    presets = []
-    for preset, groups in table.items():
-        shown = []
-        for group, fields in groups.items():
-            rows = [f"   {json.dumps(name)}: {json.dumps(x)}" for name, x in fields.items()]
-            shown.append(f"  {json.dumps(group)}: {{\n" + ",\n".join(rows) + "\n  }")
-        presets.append(f" {json.dumps(preset)}: {{\n" + ",\n".join(shown) + "\n }")
-    return "{\n" + ",\n".join(presets) + "\n}\n"
+    if not depth:
+        return json.dumps(table)
+    inner = indent + " "
+    rows = [f"{inner}{json.dumps(key)}: {as_text(x, depth - 1, inner)}" for key, x in table.items()]
+    return "{\n" + ",\n".join(rows) + f"\n{indent}}}"
 
 
 # ------------------------------------------------------------ what moved
 
 
-def is_same(found: Any, stored: Any, slack: float) -> bool:
-    """Whether two values are equal, but for rounding and the slack."""
+def is_same(found: Any, stored: Any, slack: float = ABSOLUTE) -> bool:
+    """Whether two values are equal but for rounding; a signal may differ by 1e-9 of its largest
+    value."""
+    if type(found) is not type(stored):
+        return False
     if isinstance(stored, dict):
+        slack = max(slack, RELATIVE * max(stored.get("largest", ()), default=0.0))
         return found.keys() == stored.keys() and all(
-            is_same(found[key], x, slack) for key, x in stored.items()
+            is_same(found[key], x, slack) for key, x in stored.items() if key != "sha256"
         )
     if isinstance(stored, list):
         pairs = zip(found, stored, strict=False)
         return len(found) == len(stored) and all(is_same(a, b, slack) for a, b in pairs)
-    if isinstance(stored, float) and isinstance(found, float):
-        if math.isnan(stored) or math.isnan(found):
-            return math.isnan(stored) and math.isnan(found)
-        return math.isclose(found, stored, rel_tol=RELATIVE, abs_tol=slack)
-    if isinstance(stored, str) and isinstance(found, str):
-        return same_text(found, stored)
-    return type(found) is type(stored) and found == stored
+    if isinstance(stored, float):
+        both_nan = math.isnan(stored) and math.isnan(found)
+        return both_nan or math.isclose(found, stored, rel_tol=RELATIVE, abs_tol=slack)
+    return same_text(found, stored, digits=9) if isinstance(stored, str) else bool(found == stored)
 
 
-def is_close(name: str, found: Any, stored: Any) -> bool:
-    """Whether a field is equal to rounding.
-
-    A signal may differ by 1e-9 of its largest value.  The margin of a line that is within the
-    line's tolerance is rounding: it may differ by the tolerance, and its place is not compared.
-    """
-    if name == "file":  # its gains may be computed
-        return same_text(found, stored, digits=9)
-    if not (isinstance(found, dict) and isinstance(stored, dict)):
-        return is_same(found, stored, ABSOLUTE)
-    slack, ignored = ABSOLUTE, {"sha256"}
-    if "largest" in stored:
-        slack = max(slack, RELATIVE * max(stored["largest"], default=0.0))
-    if "tolerance" in stored:
-        ignored.add("tolerance")
-        if stored["margin"] is not None and abs(stored["margin"]) <= stored["tolerance"]:
-            slack = max(slack, stored["tolerance"])
-            ignored |= {"joint", "time", "first_broken"}
-    kept = [{key: x for key, x in field.items() if key not in ignored} for field in (found, stored)]
-    return is_same(*kept, slack)
-
-
-def is_equal(name: str, found: Any, stored: Any) -> bool:
-    """Whether a field is equal bit by bit."""
-    return json.dumps(found) == json.dumps(stored)
-
-
-def in_words(name: str, found: Any, stored: Any) -> str:
-    """What differs in a field."""
-    if name in ("paths", "file"):
-        rows = [x.splitlines() if isinstance(x, str) else x for x in (stored, found)]
-        gone = [f"- {x}" for x in rows[0] if x not in rows[1]]
-        new = [f"+ {x}" for x in rows[1] if x not in rows[0]]
-        return "; ".join([*gone, *new]) or "another order"
-    if isinstance(found, dict) and isinstance(stored, dict):
-        keys = [key for key in found | stored if key != "sha256"]
-        parts = [
-            f"{key} {stored.get(key)} -> {found.get(key)}"
-            for key in keys
-            if not is_equal(name, found.get(key), stored.get(key))
-        ]
-        return "; ".join(parts) or "other values between the first and the last"
-    return f"{stored} -> {found}"
-
-
-def moved(found: Fields, stored: Fields, same: Any) -> Iterator[str]:
-    """The fields that differ, in words."""
-    for name in stored | found:
-        if name not in found:
-            yield f"{name}: no longer there"
-        elif name not in stored:
-            yield f"{name}: new"
-        elif not same(name, found[name], stored[name]):
-            yield f"{name}: {in_words(name, found[name], stored[name])}"
+def moved(found: dict[str, Any], stored: dict[str, Any]) -> dict[str, tuple[Any, Any]]:
+    """The fields that differ, or are in one of both only, with what was stored and found."""
+    pairs = {name: (stored.get(name), found.get(name)) for name in stored | found}
+    return {name: (a, b) for name, (a, b) in pairs.items() if not is_same(b, a)}
 
 
 @functools.cache
-def stored_file() -> dict[str, dict[str, Fields]]:
+def stored_file() -> dict[str, Any]:
     """The stored numbers."""
     return json.loads(FILE.read_text())  # type: ignore[no-any-return]
 
 
-def check(preset: str, group: str) -> None:
-    """Compares the fields of a group with the stored ones."""
-    found = fields_of(preset, (group,))[group]
-    differences = list(moved(found, stored_file()[preset][group], is_close))
-    assert not differences, "\n".join([f"{preset}:", *differences])
-
-
-def presets(quick: Iterable[str], release: Iterable[str] = ()) -> list[Any]:
-    """All presets; those that are not quick have a mark."""
-    marks = dict.fromkeys(ij.presets.PRESETS, pytest.mark.slow)
-    marks |= dict.fromkeys(release, pytest.mark.release)
-    return [x if x in quick else pytest.param(x, marks=marks[x]) for x in ij.presets.PRESETS]
+@pytest.mark.parametrize("group", GROUPS)
+@pytest.mark.parametrize("preset", [*QUICK, *SLOW])
+def test_what_is_stored_does_not_move(preset, group):
+    found = json.loads(json.dumps(GROUPS[group](preset)))
+    assert moved(found, stored_file()[preset][group]) == {}
 
 
 def test_every_preset_is_stored():
     assert list(stored_file()) == list(ij.presets.PRESETS)
 
 
-@pytest.mark.parametrize("preset", presets(PAPER))
-def test_paths_and_file(preset):
-    check(preset, "structure")
-
-
-@pytest.mark.parametrize("preset", presets(PAPER[:2]))
-def test_run(preset):
-    check(preset, "run")
-
-
-@pytest.mark.parametrize("preset", presets((), RELEASE))
-def test_certificate(preset):
-    check(preset, "certificate")
-
-
 def test_a_change_is_named():
-    stored = {"q": signal(np.array([[1.0], [2.0]])), "line rho": {"margin": 1.0, "tolerance": 0.0}}
-    found = as_json(stored)
-    assert list(moved(found, as_json(stored), is_equal)) == []
+    stored = {"q": signal(np.array([[1.0], [2.0]])), "tau": signal(np.array([[1.0]]))}
+    found, stored = json.loads(json.dumps([stored, stored]))
     found["q"]["sha256"] = "another"
-    found["line rho"]["margin"] = 1.0 + 1e-15
-    assert list(moved(found, as_json(stored), is_close)) == []
-    assert [x.split(":")[0] for x in moved(found, as_json(stored), is_equal)] == ["q", "line rho"]
-    found["line rho"]["margin"] = 1.0 + 1e-6
+    found["tau"]["mean"] = [1.0 + 1e-15]
+    assert moved(found, stored) == {}
+    found["tau"]["mean"] = [1.0 + 1e-6]
+    assert moved(found, stored) == {"tau": (stored["tau"], found["tau"])}
     del found["q"]
-    named = ["q: no longer there", "line rho: margin 1.0 -> 1.000001"]
-    assert list(moved(found, as_json(stored), is_close)) == named
-
-
-# ------------------------------------------------------------ bit by bit
-
-
-def main() -> int:
-    """Writes a file, or compares with one; the number of fields that moved."""
-    from conftest import choose_compilers
-
-    parser = argparse.ArgumentParser(description="Numbers of all presets, compared bit by bit.")
-    what = parser.add_mutually_exclusive_group(required=True)
-    what.add_argument("--write", metavar="FILE", type=Path)
-    what.add_argument("--compare", metavar="FILE", type=Path)
-    parser.add_argument("presets", nargs="*", help="some presets only; with --compare")
-    options = parser.parse_args()
-    choose_compilers(plain=True)
-    if options.write:
-        if options.presets:
-            parser.error("--write takes all presets")
-        options.write.write_text(as_text({x: fields_of(x) for x in ij.presets.PRESETS}))
-        return 0
-    stored, count = json.loads(options.compare.read_text()), 0
-    for preset in options.presets or stored.keys() | ij.presets.PRESETS.keys():
-        if preset not in stored or preset not in ij.presets.PRESETS:
-            print(f"{preset}: only in one of both", flush=True)
-            count += 1
-            continue
-        for group, fields in fields_of(preset).items():
-            for difference in moved(fields, stored[preset][group], is_equal):
-                print(f"{preset}: {difference}", flush=True)
-                count += 1
-    print(f"{count} fields moved")
-    return min(count, 1)
+    assert moved(found, stored).keys() == {"q", "tau"}
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    from conftest import choose_compilers
+
+    choose_compilers(plain=True)
+    table = {x: {group: GROUPS[group](x) for group in GROUPS} for x in ij.presets.PRESETS}
+    Path(sys.argv[1]).write_text(as_text(table) + "\n")

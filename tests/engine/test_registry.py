@@ -60,46 +60,33 @@ def added(monkeypatch):
 
 @pytest.mark.slow
 @needs_compiler
-def test_an_added_executor_runs_a_single_run(scenario, added):
+def test_an_added_executor_makes_runs(scenario, added):
     expected = ij.simulate(scenario, **SHORT, backend="vmap")
     assert added == []
     found = ij.simulate(scenario, **SHORT)
     np.testing.assert_allclose(found.q, expected.q, rtol=1e-12)
     assert added == ["run"] * 3, "the start, the steps, the end"
-
-
-@pytest.mark.slow
-@needs_compiler
-def test_an_added_executor_runs_a_batch(scenario, added):
+    added.clear()
     perturbed = {"controller.Kp": ij.factor(ij.uniform(0.9, 1.1))}
     study = ij.monte_carlo(scenario, perturbed, runs=3, **SHORT, backend="mine")
     assert study.setup.program.batch.backend == "mine"
-    assert added.count("build") == 2
-    assert added.count("run") == 3
+    assert (added.count("build"), added.count("run")) == (2, 3)
     other = ij.monte_carlo(scenario, perturbed, runs=3, **SHORT, backend="vmap")
     np.testing.assert_allclose(study.metrics["margin"], other.metrics["margin"], rtol=1e-12)
 
 
 @pytest.mark.parametrize("backend", ["fortran", "", None, "NATIVE"])
 def test_an_unknown_name_is_an_error(scenario, backend):
+    loop, varied = canonical(scenario), {"controller.Kp": jnp.ones((2, 2))}
     request = RunRequest(10, backend=backend)
-    varied = {"controller.Kp": jnp.ones((2, 2))}
-    calls = (
+    for call in (
         lambda: check_backend(backend),
-        lambda: RunRequest.of(canonical(scenario), steps=10, backend=backend),
-        lambda: compile_batch(request, canonical(scenario), varied, (), jnp.asarray(1e-3)),
+        lambda: RunRequest.of(loop, steps=10, backend=backend),
+        lambda: compile_batch(request, loop, varied, (), jnp.asarray(1e-3)),
         lambda: ij.simulate(scenario, **SHORT, backend=backend),
-    )
-    for call in calls:
+    ):
         with pytest.raises(ValueError, match=r"backend.*one of 'auto'"):
             call()
-
-
-def test_every_executor_says_why_it_is_unavailable():
-    for name, executor in registry.EXECUTORS.items():
-        assert executor.name == name
-        reason = executor.unavailable()
-        assert reason is None or "\n" not in reason
 
 
 @pytest.mark.slow
@@ -117,8 +104,7 @@ def test_where_no_kernel_can_be_compiled_auto_runs_by_the_scan(scenario, monkeyp
         found = ij.simulate(scenario, **SHORT)
     np.testing.assert_array_equal(found.q, expected.q)
     perturbed = {"controller.Kp": ij.factor(ij.uniform(0.9, 1.1))}
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         study = ij.monte_carlo(scenario, perturbed, runs=3, **SHORT)
     assert study.backend == "vmap"
 
@@ -168,8 +154,7 @@ def test_a_stopped_compiler_does_not_decide_the_plan_of_a_batch(scenario, monkey
     CACHE.clear()
     request = RunRequest(10, backend="mine")
     arguments = (canonical(scenario), {"controller.Kp": jnp.ones((2, 2))}, (), jnp.asarray(1e-3))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         if stops == 2:
             with pytest.raises(StoppedError):
                 compile_batch(request, *arguments)
@@ -225,21 +210,11 @@ def test_what_cannot_be_loaded_runs_by_the_scan(scenario, monkeypatch, run, reas
     np.testing.assert_array_equal(again.q, expected.q)
 
 
-def test_a_lack_of_memory_is_reported_as_such():
-    """Another executor needs as much."""
+def test_an_error_of_xla_is_one_line():
+    """Except a lack of memory, of which another executor needs as much."""
+    failures = {"": "no message", "\n": "no message", "\nnot found\n at 0": "not found"}
+    for text, reason in failures.items():
+        with pytest.raises(ToolchainError, match=f"^XLA failed: {reason}$"), compile.building():
+            raise jax.errors.JaxRuntimeError(text)
     with pytest.raises(jax.errors.JaxRuntimeError, match="RESOURCE_EXHAUSTED"), compile.building():
         raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 1 TiB.")
-
-
-@pytest.mark.parametrize(
-    ("text", "reason"),
-    [("", "no message"), ("\n", "no message"), ("\nnot found\n at 0", "not found")],
-)
-def test_an_error_of_xla_is_one_line(text, reason):
-    with pytest.raises(ToolchainError, match=f"^XLA failed: {reason}$"), compile.building():
-        raise jax.errors.JaxRuntimeError(text)
-
-
-def test_a_value_of_shapes_holds_no_arrays():
-    shape = [jax.ShapeDtypeStruct((3, 2), jnp.float32)]
-    assert compile.on_shapes(lambda arrays: arrays[0].shape, shape) == (3, 2)

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import iblf_jax as ij
-from iblf_jax import tuning
 
 SHORT = ij.Runs(0.02, method="heun")
 TAKING = (
@@ -63,9 +62,3 @@ def test_what_contradicts_the_object_is_refused(paper):
 def test_a_field_that_is_not_valid_is_refused(field, value):
     with pytest.raises(ValueError, match=f"^{field}: got"):
         ij.Runs(**{"duration": 0.02, field: value})
-
-
-def test_options_of_tunings_are_compared_by_identity():
-    options = tuning.options.TuningRunOptions(0.02)
-    assert options == options and options != tuning.options.TuningRunOptions(0.02)
-    assert options.checked().steps == 20

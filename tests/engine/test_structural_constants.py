@@ -10,59 +10,52 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_from_jaxpr import DT, PRESET, STANDARD, carry_of, evaluate, numbers
+from test_from_jaxpr import DT, PRESET, STANDARD, carried, carry_of, numbers
 
 import iblf_jax as ij
 from iblf_jax.core.pytree import is_leaf_field
 from iblf_jax.core.status import Status
-from iblf_jax.engine import RunRequest, execute, registry
+from iblf_jax.engine import RunRequest, execute
 from iblf_jax.engine.batch import Batch
 from iblf_jax.engine.carry import Carry, Inputs, StepOptions
 from iblf_jax.engine.loops import program_of
 from iblf_jax.engine.structural_constants import robot_constants
 from iblf_jax.engine.time_step import TimeStep
-from iblf_jax.kernels import PER_RUN, TIME, written_out
+from iblf_jax.kernels import written_out
+from iblf_jax.kernels.program import Program
 from iblf_jax.simulation.paths import get, with_parameters
 from iblf_jax.simulation.scenario import canonical
 
-HALF = 0.5**0.5
-QUARTER, BACK = (HALF, HALF, 0.0, 0.0), (HALF, -HALF, 0.0, 0.0)
-"""Turns about x by a right angle."""
 STEP = TimeStep("euler")
 
 
 @lru_cache(maxsize=1)
 def square_arm() -> ij.Scenario:
-    """The paper's law on an arm of two joints with right angles; the model has no load."""
+    """The paper's law on an arm of two joints with right angles about x; the model has no load."""
+    half = 0.5**0.5
     arm = ij.robots.Arm(
         mass=[2.0, 1.0],
         centre=[[0.1, 0.0, 0.0], [0.0, 0.2, 0.05]],
         inertia=[[0.02, 0.03, 0.03, 0.0, 0.0, 0.0], [0.01, 0.01, 0.02, 0.0, 0.001, 0.0]],
         position=[[0.0, 0.0, 0.3], [0.4, 0.0, 0.0]],
-        rotation=[BACK, QUARTER],
+        rotation=[(half, -half, 0.0, 0.0), (half, half, 0.0, 0.0)],
         tip_position=[0.0, 0.0, 0.25],
-        tip_rotation=QUARTER,
+        tip_rotation=(half, half, 0.0, 0.0),
         payload=0.5,
     )
-    return canonical(
-        dataclasses.replace(PRESET, plant=arm, model=dataclasses.replace(arm, payload=0.0))
-    )
+    model = dataclasses.replace(arm, payload=0.0)
+    return canonical(dataclasses.replace(PRESET, plant=arm, model=model))
 
 
 FIELDS = [f.name for f in dataclasses.fields(ij.robots.Arm) if is_leaf_field(f)]
 
 
-def batch_of(scenario, varied=(), known=True) -> tuple[Batch, Carry]:
-    """One run, to be lowered with what is known of the mechanism, or with nothing, and a carry."""
+def lowered(scenario, varied=()) -> tuple[Batch, Carry, Program]:
+    """One run with what is known of its mechanism, a carry, and the program of a step."""
     leaves = {path: jnp.asarray(get(scenario, path))[None] for path in ("initial.q", *varied)}
     inputs = Inputs(scenario, STANDARD, jnp.asarray(DT), jnp.asarray(10.0))
     carries = carry_of(inputs, {"initial.q": leaves["initial.q"]}, "euler")
-    return Batch.of(inputs, leaves, constants=robot_constants(scenario) if known else None), carries
-
-
-def lowered(*case):
-    """A batch, a carry, and the program of a step."""
-    batch, carries = batch_of(*case)
+    batch = Batch.of(inputs, leaves, constants=robot_constants(scenario))
     return batch, carries, written_out(program_of(STEP, batch, carries).program)
 
 
@@ -71,24 +64,13 @@ def by_jax(inputs, carry, index):
     return jax.tree.leaves(STEP(inputs, carry, index, StepOptions())[0])
 
 
-def both(scenario, varied=()):
-    """What a step gives by its program and by JAX."""
-    batch, carries, program = lowered(scenario, varied)
-    carry, lane = (jax.tree.map(lambda x: x[0], x) for x in (carries, batch.leaves.per_run))
-    inputs = batch.leaves.unflatten(batch.leaves.shared, lane)
+def assert_same_step(case, inputs, lane):
+    """A step of a lowered batch by its program, with these leaves of a run, is that of JAX."""
+    batch, carries, program = case
+    carry, index = jax.tree.map(lambda x: x[0], carries), jnp.int32(3)
     values = (numbers(x) for x in (batch.leaves.shared, lane, jax.tree.leaves(carry)))
-    index = jnp.int32(3)
-    return evaluate(program, *values, index), numbers(by_jax(inputs, carry, index))
-
-
-def moving(program) -> int:
-    return sum(program.counts()[PER_RUN | TIME].values())
-
-
-@pytest.mark.slow
-def test_a_mechanism_of_right_angles_saves_a_fifth_of_the_operations_of_two_joints():
-    scenario = square_arm()
-    assert moving(lowered(scenario)[2]) < 0.8 * moving(lowered(scenario, (), False)[2])
+    expected = numbers(by_jax(inputs, carry, index))
+    np.testing.assert_allclose(carried(program, *values, 3), expected, rtol=1e-10, atol=1e-12)
 
 
 @pytest.mark.slow
@@ -102,103 +84,69 @@ def test_every_number_of_an_arm_counts_once_it_is_changed(part):
         before = np.asarray(get(scenario, path))
         change = 0.01 * np.abs(np.cos(1.0 + np.arange(before.size))).reshape(before.shape)
         changed[path] = jnp.asarray(np.where(np.isfinite(before), before + change, before))
-    by_program, expected = both(with_parameters(scenario, changed))
-    np.testing.assert_allclose(by_program, expected, rtol=1e-10, atol=1e-12)
+    case = lowered(with_parameters(scenario, changed))
+    leaves = case[0].leaves
+    lane = [x[0] for x in leaves.per_run]
+    assert_same_step(case, leaves.unflatten(leaves.shared, lane), lane)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", ["plant.axis", "model.rotation", "plant.position[0]"])
 def test_what_differs_between_runs_is_never_compiled_in(path):
     """The same program for other numbers: a run beside it may have anything there."""
-    scenario = square_arm()
-    batch, carries, program = lowered(scenario, (path,))
-    carry = jax.tree.map(lambda x: x[0], carries)
+    case = lowered(square_arm(), (path,))
+    leaves = case[0].leaves
     moved = [
-        x[0] + 0.01 * np.cos(1.0 + np.arange(x[0].size).reshape(x[0].shape))
-        for x in batch.leaves.per_run
+        x[0] + 0.01 * np.cos(1.0 + np.arange(x[0].size).reshape(x[0].shape)) for x in leaves.per_run
     ]
-    inputs = batch.leaves.unflatten(batch.leaves.shared, moved)
-    values = (numbers(x) for x in (batch.leaves.shared, moved, jax.tree.leaves(carry)))
-    expected = numbers(by_jax(inputs, carry, jnp.int32(3)))
-    np.testing.assert_allclose(evaluate(program, *values, 3), expected, rtol=1e-10, atol=1e-12)
+    assert_same_step(case, leaves.unflatten(leaves.shared, moved), moved)
 
 
-@pytest.mark.parametrize(
-    ("path", "value"),
-    [
-        ("plant.mass", 1e-6),
-        ("model.mass[0]", 1.0),
-        ("plant.payload", 0.7),
-        ("plant.carried.mass", 2.0),
-        ("controller.K2", 1.0),
-        ("model.armature", 1.0),
-    ],
-)
-def test_new_masses_gains_and_loads_compile_nothing(path, value):
+LENGTH = jnp.asarray([0.5, 0.0, 0.0])
+
+
+def test_new_masses_gains_and_loads_compile_nothing():
+    """Nor does another length; one of the plant alone, which the model's was equal to, does."""
     scenario = square_arm()
-    changed = with_parameters(scenario, {path: jnp.full_like(get(scenario, path), value)})
-    assert robot_constants(changed) == robot_constants(scenario)
-    assert hash(robot_constants(changed)) == hash(robot_constants(scenario))
-
-
-def test_another_number_that_is_none_of_these_compiles_nothing():
-    scenario = square_arm()
-    longer = {f"{robot}.position[1]": jnp.asarray([0.5, 0.0, 0.0]) for robot in ("plant", "model")}
-    assert robot_constants(with_parameters(scenario, longer)) == robot_constants(scenario)
-    assert robot_constants(
-        with_parameters(scenario, {"plant.position[1]": jnp.asarray([0.5, 0.0, 0.0])})
-    ) != robot_constants(scenario)
+    known = robot_constants(scenario)
+    changes = {"plant.mass": 1e-6, "model.mass[0]": 1.0, "plant.payload": 0.7}
+    changes |= {"plant.carried.mass": 2.0, "controller.K2": 1.0, "model.armature": 1.0}
+    for path, value in changes.items():
+        changed = with_parameters(scenario, {path: jnp.full_like(get(scenario, path), value)})
+        assert robot_constants(changed) == known, path
+        assert hash(robot_constants(changed)) == hash(known)
+    plant = {"plant.position[1]": LENGTH}
+    assert robot_constants(with_parameters(scenario, plant)) != known
+    both = plant | {"model.position[1]": LENGTH}
+    assert robot_constants(with_parameters(scenario, both)) == known
 
 
 def test_a_right_angle_costs_no_more_in_the_model_than_in_the_plant():
     """Equal numbers of a row, of either sign, are one input, and the model's are the plant's."""
     known = robot_constants(square_arm()).numbers
-    rows = [x for x in known if x is not None and x.sign < 0]
-    assert rows and all(
-        known[x.same].same is None for x in known if x is not None and x.same is not None
-    )
+    given = [x for x in known if x is not None]
+    assert [x for x in given if x.sign < 0]
+    assert all(known[x.same].same is None for x in given if x.same is not None)
 
 
-def test_a_robot_of_a_user_may_have_a_field_of_that_name():
-    @ij.component
-    class Mine(ij.robots.Arm):
-        geometry: jax.Array = ij.leaf("m", shape="any", default=(1.0, 2.0))
-        geometry_fields: jax.Array = ij.leaf("m", shape="any", default=(1.0, 2.0))
+@ij.component
+class Mine(ij.robots.Arm):
+    geometry: jax.Array = ij.leaf("m", shape="any", default=(1.0, 2.0))
+    geometry_fields: jax.Array = ij.leaf("m", shape="any", default=(1.0, 2.0))
 
+
+def test_a_robot_of_a_user_or_without_a_geometry_and_tracers_have_none():
     arm = square_arm().plant
-    fields = {f.name: getattr(arm, f.name) for f in dataclasses.fields(arm)}
-    mine = dataclasses.replace(square_arm(), plant=Mine(**fields), model=Mine(**fields))
-    assert robot_constants(mine) is None
+    mine = Mine(**{f.name: getattr(arm, f.name) for f in dataclasses.fields(arm)})
+    assert robot_constants(dataclasses.replace(square_arm(), plant=mine, model=mine)) is None
+    assert robot_constants(canonical(PRESET)) is None
 
+    @jax.jit
+    def read(scenario):
+        assert robot_constants(scenario) is None
+        return jnp.zeros(())
 
-@pytest.mark.release
-def test_derivatives_by_the_geometry(monkeypatch):
-    """A direction moves numbers that are compiled in as zeros: their derivatives are there all the
-    same."""
-    scenario = square_arm()
-    start, along = (
-        {"initial.q": scenario.initial.q[None]},
-        {"plant.centre": np.eye(6)[[0, 2, 3]].reshape(3, 2, 3)},
-    )
-    dt = jnp.asarray(DT)
-
-    def by(backend, mechanism):
-        run = RunRequest(5, "euler", constants=mechanism, backend=backend)
-        return jax.jit(
-            lambda s, v: execute.run_batch_jvp(s, v, along, STANDARD[:1], dt, run).tangents
-        )(scenario, start)
-
-    known, plain = by("native", robot_constants(scenario)), by("vmap", None)
-    no_tangents = registry.NATIVE._replace(limits=registry.Limits(derivative_nodes=0))
-    monkeypatch.setitem(registry.EXECUTORS, "native", no_tangents)
-    column_by_column = by("auto", robot_constants(scenario))
-    for name, expected in plain.items():
-        np.testing.assert_allclose(known[name], expected, rtol=1e-9, atol=1e-12, err_msg=name)
-        np.testing.assert_allclose(
-            column_by_column[name], expected, rtol=1e-9, atol=1e-12, err_msg=name
-        )
-    counts = np.abs(plain["rmse"]).max(axis=(0, 2)) > 0
-    assert counts.tolist() == [True, False, True], "a height on the vertical axis is no lever"
+    read(square_arm())
 
 
 @pytest.mark.slow
@@ -211,38 +159,40 @@ def test_another_mechanism_in_the_same_process_is_another_program():
 
     def metrics(scenario, backend):
         request = RunRequest(5, "euler", constants=robot_constants(scenario), backend=backend)
-        return metrics_of(scenario, run=request)
+        found = outcome_of(scenario, run=request).metrics
+        return np.concatenate([np.ravel(x).astype(float) for _, x in sorted(found.items())])
 
     by_kernel = [metrics(scenario, "native") for scenario in (first, second, first)]
     by_scan = [metrics(scenario, "vmap") for scenario in (first, second, first)]
-    for found, expected in zip(by_kernel, by_scan, strict=True):
-        np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(by_kernel, by_scan, rtol=1e-10, atol=1e-12)
     assert not np.allclose(by_kernel[0], by_kernel[1], rtol=1e-6)
     np.testing.assert_array_equal(by_kernel[0], by_kernel[2])
 
 
 @partial(jax.jit, static_argnames="run")
-def metrics_of(scenario, *, run):
+def outcome_of(scenario, *, run):
     start = {"initial.q": scenario.initial.q[None]}
-    found = execute.run_batch(scenario, start, STANDARD, jnp.asarray(DT), run).metrics
-    return jnp.concatenate([jnp.ravel(x).astype(float) for _, x in sorted(found.items())])
+    return execute.run_batch(scenario, start, STANDARD, jnp.asarray(DT), run)
 
 
-def test_robots_without_a_geometry_and_tracers_have_none():
-    assert robot_constants(canonical(PRESET)) is None
+@pytest.mark.release
+def test_derivatives_by_the_geometry():
+    """A direction moves numbers that are compiled in as zeros: their derivatives are there all the
+    same."""
+    scenario, dt = square_arm(), jnp.asarray(DT)
+    along = {"plant.centre": np.eye(6)[[0, 2, 3]].reshape(3, 2, 3)}
 
-    @jax.jit
-    def read(scenario):
-        assert robot_constants(scenario) is None
-        return jnp.zeros(())
+    def by(backend, mechanism):
+        run = RunRequest(5, "euler", constants=mechanism, backend=backend)
+        tangents = partial(execute.run_batch_jvp, scenario)
+        start = {"initial.q": scenario.initial.q[None]}
+        return jax.jit(lambda v: tangents(v, along, STANDARD[:1], dt, run).tangents)(start)
 
-    read(square_arm())
-
-
-@partial(jax.jit, static_argnames="run")
-def status_of(scenario, *, run):
-    start, run = {"initial.q": scenario.initial.q[None]}, run._replace(backend="native")
-    return execute.run_batch(scenario, start, STANDARD, jnp.asarray(DT), run).status[0]
+    known, plain = by("native", robot_constants(scenario)), by("vmap", None)
+    for name, expected in plain.items():
+        np.testing.assert_allclose(known[name], expected, rtol=1e-9, atol=1e-12, err_msg=name)
+    counts = np.abs(plain["rmse"]).max(axis=(0, 2)) > 0
+    assert counts.tolist() == [True, False, True], "a height on the vertical axis is no lever"
 
 
 @pytest.mark.slow
@@ -255,5 +205,5 @@ def test_a_run_that_is_not_finite_is_seen_to_be_so(path):
     for number, expected in ((value, 0), (jnp.full_like(value, jnp.nan), int(Status.NOT_FINITE))):
         # Compiled, so that nothing looks at the number.
         changed = jax.jit(lambda s, x: with_parameters(s, {path: x}))(scenario, number)
-        run = RunRequest(5, "euler", constants=robot_constants(changed))
-        assert int(status_of(changed, run=run)) & int(Status.NOT_FINITE) == expected
+        run = RunRequest(5, "euler", constants=robot_constants(changed), backend="native")
+        assert int(outcome_of(changed, run=run).status[0]) & int(Status.NOT_FINITE) == expected

@@ -4,11 +4,12 @@
 import json
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
 import iblf_jax as ij
-from iblf_jax.files.earlier import fields_of_line
+from iblf_jax.files.earlier import fields_of_line, order_of_leaves
 from iblf_jax.simulation.paths import get
 
 EARLIER = Path(__file__).parents[1] / "data" / "earlier"
@@ -40,6 +41,27 @@ def test_a_scenario(kind):
     assert values[0].keys() == values[1].keys()
     for path, value in values[0].items():
         np.testing.assert_allclose(value, values[1][path], rtol=1e-14, err_msg=path)
+
+
+@pytest.mark.parametrize(
+    ("kind", "field", "is_before"),
+    [("robot", "velocity_bounds", True), ("plant", "state_bounds", False)],
+)
+def test_bounds_of_levels_have_their_earlier_place_beside_the_regions(kind, field, is_before):
+    """Before them for a robot, behind them for another plant; all other leaves keep their order."""
+    walls = (ij.regions.HalfSpace(normal=[0.0, 1.0], offset=0.45),)
+    scenario = ij.with_parts(PRESETS[kind](), regions=walls)
+    paths = [jax.tree_util.keystr(path) for path, _ in jax.tree.leaves_with_path(scenario)]
+    order = order_of_leaves({field: {}}, scenario)
+    earlier = [paths[number] for number in order]
+    above, regions = (
+        [i for i, path in enumerate(earlier) if path.startswith(start)]
+        for start in ((".bounds[1]", ".bounds[2]"), ".regions")
+    )
+    assert above and regions
+    assert (max(above) < min(regions)) if is_before else (min(above) > max(regions))
+    others = [number for i, number in enumerate(order) if i not in above]
+    assert others == sorted(others)
 
 
 @pytest.mark.parametrize("ending", [".result", ".npz"])
@@ -74,18 +96,14 @@ def test_a_run_can_be_done_again(kind):
     np.testing.assert_allclose(again.level_upper, run.level_upper, rtol=1e-14)
 
 
-@pytest.mark.parametrize(
-    ("name", "role"),
-    [
-        ("inequality, case 2", "inequality"),
-        ("inequality, own V", "own inequality"),
-        ("weighted inequality, case 1", "weighted inequality"),
-        ("weighted xi", "weighted"),
-        ("envelope, case 2", "other"),
-    ],
-)
-def test_the_name_of_a_stored_line_says_its_role(name, role):
-    stored = {"name": name, "counts": False, "first": 0.5}
-    found = fields_of_line(stored)
-    assert found == {"name": name, "enters_verdict": False, "first_broken": 0.5, "role": role}
-    assert fields_of_line(found) == found
+def test_the_name_of_a_stored_line_says_its_role():
+    for name, role in {
+        "inequality, case 2": "inequality",
+        "inequality, own V": "own inequality",
+        "weighted inequality, case 1": "weighted inequality",
+        "weighted xi": "weighted",
+        "envelope, case 2": "other",
+    }.items():
+        found = fields_of_line({"name": name, "counts": False, "first": 0.5})
+        assert found == {"name": name, "enters_verdict": False, "first_broken": 0.5, "role": role}
+        assert fields_of_line(found) == found

@@ -10,27 +10,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import tomli_w
 import xarray
 from conftest import SHORT
+from loops_of_plants import rigid_law
 from made_up_runs import ALWAYS
+from plant_cases import body, pendulum
 
 import iblf_jax as ij
 from iblf_jax.files import rollouts
 from iblf_jax.files import scenario as scenario_file
-from iblf_jax.files.rollouts import load_datasets
+from iblf_jax.files.rollouts import load_datasets, load_rollouts
 from iblf_jax.simulation.signals import VIEWS
 
 
 @pytest.fixture(scope="module")
 def batch(paper) -> ij.Rollout:
     def one(gain):
-        return ij.simulate(
-            ij.with_parameters(paper, {"controller.K2": gain}),
-            duration=0.1,
-            record_every=5,
-            method="euler",
-        )
+        scenario = ij.with_parameters(paper, {"controller.K2": gain})
+        return ij.simulate(scenario, duration=0.1, record_every=5, method="euler")
 
     return jax.vmap(one)(jnp.array([10.0, 20.0, 30.0]))
 
@@ -87,46 +84,6 @@ def test_batches_of_batches_and_of_different_steps(batch):
     np.testing.assert_array_equal(data.t, t)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("ending", [".NC", ".npz"])
-def test_files_give_the_same_datasets_back(ending, short_run, batch, tmp_path):
-    runs = {"integral BLF": short_run, "b-2": batch}
-    ij.save_rollouts(runs, tmp_path / f"runs{ending}")
-    found = load_datasets(tmp_path / f"runs{ending}")
-    assert list(found) == list(runs)
-    for name, run in runs.items():
-        xarray.testing.assert_identical(found[name], run.to_xarray())
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("ending", [".nc", ".npz"])
-def test_batches_of_earlier_versions_load(ending, paper, tmp_path):
-    """Bounds of velocities had a field of their own; two bounds differ between the runs."""
-    speeds = ij.Bounds(lower=ij.bounds.Constant(-9.0), upper=ij.bounds.Constant(9.0))
-    scenario = ij.with_parts(paper, bounds=(paper.bounds[0], speeds))
-
-    def one(x):
-        changes = {"bounds[0].upper.offset": 0.9 + x, "bounds[1].upper.value": 8.0 + x}
-        changed = ij.with_parameters(scenario, changes)
-        return ij.simulate(changed, duration=0.01, record_every=5, method="euler")
-
-    batch = jax.vmap(one)(jnp.array([0.0, 0.1]))
-    names = {
-        "bounds[0].upper.offset": "bounds.upper.offset",
-        "bounds[1].upper.value": "velocity_bounds.upper.value",
-    }
-    data = batch.to_xarray().rename(names)
-    tables = tomllib.loads(data.attrs["scenario"])
-    tables["bounds"], tables["velocity_bounds"] = tables["bounds"]
-    data.attrs["scenario"] = tomli_w.dumps(tables)
-    write = {".nc": rollouts._write_netcdf, ".npz": rollouts._write_npz}[ending]
-    write(tmp_path / f"old{ending}", {"run": data})
-    loaded = ij.load(tmp_path / f"old{ending}")
-    assert jax.tree.structure(loaded.scenario) == jax.tree.structure(batch.scenario)
-    jax.tree.map(np.testing.assert_array_equal, loaded.scenario, batch.scenario)
-    np.testing.assert_array_equal(loaded.q, batch.q)
-
-
 def test_states_of_any_structure(short_run, tmp_path):
     T = short_run.t.size
     state = {"weights": jnp.zeros((T, 3, 4)), "rest": (jnp.ones((T, 2)), jnp.ones(T))}
@@ -149,44 +106,35 @@ def test_metrics_with_the_name_of_a_field(short_run):
 
 
 def test_a_users_law_is_kept_by_its_parameters(short_run):
-    @ij.component
-    class Mine:
-        gain: jax.Array = ij.leaf("1")
-
-        def init(self, q, dq, context):
-            return ()
-
-        def command(self, t, q, dq, f_hat, context, state):
-            raise NotImplementedError
-
-    run = dataclasses.replace(
-        short_run, scenario=dataclasses.replace(short_run.scenario, controller=Mine(2.0))
-    )
-    attributes = run.to_xarray().attrs
+    law = ij.controllers.PDGravity
+    mine = ij.component(type("Mine", (law,), {"__annotations__": {}}))(Kp=2.0, Kd=1.0)
+    scenario = dataclasses.replace(short_run.scenario, controller=mine)
+    attributes = dataclasses.replace(short_run, scenario=scenario).to_xarray().attrs
     assert "scenario" not in attributes
     assert "Mine" in attributes["scenario_not_saved"]
-    assert json.loads(attributes["parameters"])["controller.gain"] == [2.0, 2.0]
+    assert json.loads(attributes["parameters"])["controller.Kp"] == [2.0, 2.0]
 
 
 def test_bad_arguments(short_run, tmp_path):
-    with pytest.raises(ValueError, match=r"ends in \.nc"):
-        ij.save_rollouts(short_run, tmp_path / "a.csv")
+    path = tmp_path / "a.nc"
+    for runs, place, words in (
+        (short_run, tmp_path / "a.csv", r"ends in \.nc"),
+        *((runs, path, "dict of at least one Rollout") for runs in ({}, [short_run], None)),
+        *(({x: short_run}, path, "name of a run") for x in ("a.b", "", "a/b", 3, "attributes")),
+        ({"a": 3}, path, "expected a Rollout"),
+        *(
+            (
+                path,
+                run,
+                r"path: got \w+, expected a path, after the runs.*save_rollouts\(runs, path\)",
+            )
+            for run in (short_run, {"a": short_run})
+        ),
+    ):
+        with pytest.raises(ValueError, match=words):
+            ij.save_rollouts(runs, place)
     with pytest.raises(ValueError, match=r"ends in \.nc"):
         load_datasets(tmp_path / "a")
-    for runs in ({}, [short_run], None):
-        with pytest.raises(ValueError, match="dict of at least one Rollout"):
-            ij.save_rollouts(runs, tmp_path / "a.nc")  # type: ignore[arg-type]
-    for name in ("a.b", "", "a/b", 3, "attributes"):
-        with pytest.raises(ValueError, match="name of a run"):
-            ij.save_rollouts({name: short_run}, tmp_path / "a.nc")  # type: ignore[dict-item]
-    with pytest.raises(ValueError, match="expected a Rollout"):
-        ij.save_rollouts({"a": 3}, tmp_path / "a.nc")  # type: ignore[dict-item]
-    for runs in (short_run, {"a": short_run}):
-        with pytest.raises(
-            ValueError,
-            match=r"path: got \w+, expected a path, after the runs.*save_rollouts\(runs, path\)",
-        ):
-            ij.save_rollouts(tmp_path / "a.nc", runs)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="jit"):
         jax.jit(lambda run: rollouts.rollout_to_xarray(run) and 0)(short_run)
 
@@ -254,8 +202,11 @@ def test_a_damaged_netcdf_file_is_refused_or_loads_as_it_was(kind, stored, rng, 
     assert refused > 16  # a few of the bytes are padding
 
 
-def test_the_error_for_a_damaged_file_names_variable_and_remedy(stored, tmp_path):
-    path, _ = stored
+def test_an_edited_file_is_refused_unless_it_has_no_digest(stored, tmp_path):
+    """Files of older versions have none; a Dataset that a user edits and saves must not hold one
+    that has become stale."""
+    path, expected = stored
+    assert not any("digest" in one.attrs for one in expected.values())
     data = xarray.load_dataset(path, engine="scipy")
     data["one.q"][3, 1] += 1e-9
     data.to_netcdf(tmp_path / "edited.nc", engine="scipy")
@@ -266,18 +217,7 @@ def test_the_error_for_a_damaged_file_names_variable_and_remedy(stored, tmp_path
     data.to_netcdf(tmp_path / "edited.nc", engine="scipy")
     found = load_datasets(tmp_path / "edited.nc")
     np.testing.assert_array_equal(found["one"].q, data["one.q"])
-
-
-def test_files_without_a_digest_load_and_datasets_carry_none(stored, tmp_path):
-    """Files of older versions have none; a Dataset that a user edits and saves must not hold one
-    that has become stale."""
-    path, expected = stored
-    older = xarray.load_dataset(path, engine="scipy")
-    assert "digest" in older.attrs
-    del older.attrs["digest"]
-    older.to_netcdf(tmp_path / "older.nc", engine="scipy")
-    assert _is_same(load_datasets(tmp_path / "older.nc"), expected)
-    assert not any("digest" in one.attrs for one in expected.values())
+    assert _is_same({"two runs": found["two runs"]}, {"two runs": expected["two runs"]})
 
 
 def test_a_digest_knows_values_that_are_written_in_several_ways(short_run, tmp_path):
@@ -293,3 +233,63 @@ def test_a_digest_knows_values_that_are_written_in_several_ways(short_run, tmp_p
     )
     ij.save_rollouts(run, tmp_path / "a.nc")
     assert bool(load_datasets(tmp_path / "a.nc")["run"]["is_so"])
+
+
+@pytest.fixture(scope="module")
+def levels_run():
+    return ij.simulate(pendulum(), duration=0.2, dt=1e-3)
+
+
+def test_signals_of_levels_have_dimensions_and_units_also_in_a_file(levels_run, tmp_path):
+    data = levels_run.to_xarray()
+    for ending in (".nc", ".npz"):
+        ij.save_rollouts(levels_run, tmp_path / f"run{ending}")
+        assert load_datasets(tmp_path / f"run{ending}")["run"].identical(data)
+    assert data.disturbance.dims == ("time", "level", "joint")
+    assert data.disturbance.attrs["units"] == "rad/s; rad/s^2; A/s"
+    assert data.x.dims == ("time", "level", "joint")
+    assert data.x.attrs["units"] == "rad; rad/s; A"
+    assert data.tau.attrs == {"units": "V", "description": "input: input"}
+    assert data.level_margin.dims == ("higher_level", "joint")
+    assert data.estimate_rmse.dims == ("level", "joint")
+    assert np.array_equal(data.level, [1, 2, 3])
+    assert np.array_equal(data.higher_level, [3])
+    assert data.level.attrs["description"] == "level of the plant, from 1: angle, speed, current"
+    assert data.joint.attrs["description"] == "component of a level, from 0: pendulum"
+
+
+@pytest.mark.slow
+def test_a_study_has_dimensions_and_units_of_levels():
+    start = {"initial.x[2]": ij.offset(ij.uniform(-1.0, 1.0))}
+    study = ij.monte_carlo(pendulum(), start, runs=4, duration=0.1, dt=1e-3)
+    data = study.to_xarray()
+    assert data.level_margin.dims == ("run", "higher_level", "joint")
+    assert data.level_margin.attrs["units"] == "A"
+    assert data["initial.x[2]"].attrs["units"] == "A"
+    assert np.allclose(data["initial.x[2]"], study.samples["initial.x[2]"])
+    # The level starts where it was drawn, so its margin is at most that of the start.
+    drawn = np.abs(study.samples["initial.x[2]"])
+    assert np.all(np.asarray(study.metrics.level_margin)[:, 0] <= 20.0 - drawn + 1e-12)
+
+
+@pytest.mark.slow
+def test_components_of_different_units():
+    data = ij.simulate(body(), duration=0.1, dt=1e-2).to_xarray()
+    assert data.q.attrs == {"units": "m, m, rad", "description": "pose"}
+    assert data.margin.attrs["units"] == "m, m, rad"
+
+
+@pytest.mark.slow
+def test_estimated_levels_of_a_robot_within_a_plant_have_rows_of_the_model(tmp_path):
+    """The plant has four levels, and its model two."""
+    plant = rigid_law().plant
+    scenario = rigid_law(model=plant.rigid(), observer=ij.observers.StateObserver(bandwidth=100.0))
+    run = ij.simulate(scenario, duration=0.02, dt=1e-3)
+    data = run.to_xarray()
+    assert data.x.sizes == {"time": 21, "level": 4, "joint": 2}
+    assert data.x_hat.sizes == {"time": 21, "model_level": 2, "joint": 2}
+    assert data.peak_level_error.dims == ("model_level", "joint")
+    assert np.array_equal(data.model_level, [1, 2])
+    ij.save_rollouts(run, tmp_path / "run.nc")
+    loaded = load_rollouts(tmp_path / "run.nc")
+    assert np.array_equal(loaded.x_hat, run.x_hat)

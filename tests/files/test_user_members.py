@@ -27,6 +27,7 @@ CHAIN = ij.with_parts(
     sensor=ij.sensors.Levels((members.SENSORS["encoder_measured"], *[ij.sensors.Direct()] * 2)),
     process_noise=members.PROCESS_NOISES["additive"],
 )
+MOORED = ij.with_parts(ij.presets.vessel(), plant=members.PLANTS["vessel_moored"])
 FAMILIES = [
     (protocol, name)
     for protocol, family in components.FAMILIES.items()
@@ -64,7 +65,7 @@ def test_a_class_of_a_user_in_a_scenario_file(protocol, table, tmp_path, monkeyp
     found = components.FAMILIES[protocol].tables[table]
     scenario, member = next(
         (scenario, cls)
-        for scenario in (ARM, CHAIN)
+        for scenario in (ARM, CHAIN, MOORED)
         for cls in _classes(scenario)
         if cls in found.values()
     )
@@ -82,3 +83,7 @@ def test_a_class_of_a_user_in_a_scenario_file(protocol, table, tmp_path, monkeyp
     again = ij.load_scenario(tmp_path / "mine.toml")
     assert jax.tree.structure(again) == jax.tree.structure(given)
     assert mine in set(_classes(again))
+    monkeypatch.delitem(found, "mine")
+    remedy = rf'kind: .*register it first: .*{table}\["mine"\] = TheClass'
+    with pytest.raises(ValueError, match=remedy):
+        ij.load_scenario(tmp_path / "mine.toml")

@@ -3,17 +3,18 @@ torque with wrong masses."""
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
+from arm_cases import as_mjcf
 
 import iblf_jax as ij
 from iblf_jax import disturbances
 
 COUNT = 2.0 * np.pi / 2**14
-DAMPING, ARMATURE = (
-    np.array([1.0, 1.0, 0.8, 0.8, 0.4, 0.3, 0.2]),
-    np.array([0.1, 0.1, 0.1, 0.1, 0.05, 0.05, 0.05]),
-)
+DAMPING = np.array([1.0, 1.0, 0.8, 0.8, 0.4, 0.3, 0.2])
+ARMATURE = np.array([0.1, 0.1, 0.1, 0.1, 0.05, 0.05, 0.05])
 DRY = np.array([2.0, 2.0, 1.5, 1.5, 0.6, 0.6, 0.3])
 """Dry friction, which MuJoCo solves for as a soft constraint: a joint sticks, and gives way slowly
 [N m]."""
@@ -23,24 +24,13 @@ MIDDLE = np.array([0.0, 0.5, 0.0, -1.2, 0.0, 0.8, 0.0])
 
 
 def described(arm, mass, dry):
-    """The arm as an MJCF."""
+    """The arm with friction as a model of MuJoCo's."""
+    import mujoco
 
-    def words(x):
-        return " ".join(f"{float(y):.17g}" for y in np.ravel(x))
-
-    text = (
-        '<mujoco><compiler angle="radian"/><option timestep="0.0005" integrator="RK4" gravity="0 0'
-        ' -9.81"/><worldbody>'
-    )
-    for i in range(arm.n):
-        text += (
-            f'<body pos="{words(arm.position[i])}" quat="{words(arm.rotation[i])}"><joint'
-            f' axis="{words(arm.axis[i])}" '
-        )
-        text += f'damping="{DAMPING[i]}" armature="{ARMATURE[i]}" frictionloss="{dry[i]}"/>'
-        text += f'<inertial pos="{words(arm.centre[i])}" mass="{mass[i]:.17g}" '
-        text += f'fullinertia="{words(arm.inertia[i])}"/>'
-    return text + "</body>" * arm.n + "</worldbody></mujoco>"
+    fields = {"mass": mass, "damping": DAMPING, "armature": ARMATURE, "friction": dry}
+    model = mujoco.MjModel.from_xml_string(as_mjcf(dataclasses.replace(arm, **fields)))
+    model.opt.timestep, model.opt.integrator = 5e-4, mujoco.mjtIntegrator.mjINT_RK4
+    return model
 
 
 def logged(arm, duration, dry, seed=0, step=2e-3):
@@ -51,32 +41,29 @@ def logged(arm, duration, dry, seed=0, step=2e-3):
     A, P = rng.uniform(0.1, 0.3, (3, 7)), rng.uniform(0, 6.28, (3, 7))
     W = np.array([[1.0], [2.2], [4.0]]) * rng.uniform(0.8, 1.2, (3, 7))
     nominal = np.asarray(arm.mass)
-    true, known = (
-        mujoco.MjModel.from_xml_string(described(arm, *x))
-        for x in ((nominal * FACTOR, dry), (nominal, 0 * dry))
-    )
+    true, known = described(arm, nominal * FACTOR, dry), described(arm, nominal, 0 * dry)
     moving, thinking = mujoco.MjData(true), mujoco.MjData(known)
-    moving.qpos[:], moving.qvel[:] = (
-        MIDDLE + np.sum(A * np.sin(P), axis=0),
-        np.sum(A * W * np.cos(P), axis=0),
-    )
+
+    def reference(t):
+        """Position, velocity and acceleration."""
+        s, c = np.sin(W * t + P), np.cos(W * t + P)
+        return (
+            MIDDLE + np.sum(A * s, axis=0),
+            np.sum(A * W * c, axis=0),
+            -np.sum(A * W**2 * s, axis=0),
+        )
+
+    moving.qpos[:], moving.qvel[:], _ = reference(0.0)
     before, speed, M, rows = None, moving.qvel.copy(), np.zeros((7, 7)), []
     for k in range(round(duration / step)):
         t, y = k * step, COUNT * np.round(moving.qpos / COUNT)
         speed, before = speed if before is None else 0.7 * speed + 0.3 * (y - before) / step, y
-        wanted = [
-            MIDDLE + np.sum(A * np.sin(W * t + P), axis=0),
-            np.sum(A * W * np.cos(W * t + P), axis=0),
-        ]
+        desired, rate, push = reference(t)
         thinking.qpos[:], thinking.qvel[:] = y, speed
         mujoco.mj_forward(known, thinking)
         mujoco.mj_fullM(known, thinking, M)
-        push = (
-            -np.sum(A * W**2 * np.sin(W * t + P), axis=0)
-            + 100.0 * (wanted[0] - y)
-            + 20.0 * (wanted[1] - speed)
-        )
-        tau = M @ push + thinking.qfrc_bias + DAMPING * wanted[1]
+        push = push + 100.0 * (desired - y) + 20.0 * (rate - speed)
+        tau = M @ push + thinking.qfrc_bias + DAMPING * rate
         rows.append((t, y, tau))
         moving.qfrc_applied[:] = tau
         mujoco.mj_step(true, moving, nstep=4)

@@ -3,25 +3,22 @@ falls back."""
 
 from __future__ import annotations
 
-import os
+import re
 import shutil
-import warnings
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from fallback import with_fallback
 from test_toolchain import ZIG_CACHE, ziglang_script
 
 import iblf_jax as ij
-from iblf_jax.core.caches import CACHE
-from iblf_jax.engine import RunRequest, compile, execute, loops, native, registry, thresholds
+from iblf_jax.engine import RunRequest, execute, loops, native, registry, thresholds
 from iblf_jax.engine.batch import Batch
 from iblf_jax.engine.carry import Inputs, initial_carry
 from iblf_jax.engine.time_step import TimeStep
-from iblf_jax.kernels import cpu, packed
+from iblf_jax.kernels import Shapes, compile_step, cpu, packed
 from iblf_jax.simulation.metrics import as_folds, standard
 from iblf_jax.simulation.scenario import canonical
 from iblf_jax.tuning.quantities import Peak, Quantities, TimeIntegral
@@ -115,50 +112,15 @@ def test_results_do_not_depend_on_place_or_number_of_runs():
 @pytest.mark.slow
 @needs_compiler
 def test_a_run_that_fails_does_not_touch_the_others():
-    values = draws(5)
-    good = batch(values=values)
-    broken = {k: v.copy() for k, v in values.items()}
-    broken["plant.mass[1]"][1] = np.nan
+    good, broken = batch(dt=4e-3), draws(5)
+    broken["plant.mass[1]"][[1, 4]] = np.nan, 0.02
     broken["initial.q"][3] = 40.0
-    found = batch(values=broken)
-    others = [0, 2, 4]
+    found = batch(values=broken, dt=4e-3)
     for x, y in zip(jax.tree.leaves(found), jax.tree.leaves(good), strict=True):
-        np.testing.assert_array_equal(x[others], y[others])
-    assert ij.Status.NOT_FINITE in ij.Status(int(found.status[1]))
-    assert ij.Status.BOUND_VIOLATED in ij.Status(int(found.status[3]))
-    np.testing.assert_array_equal(found.status, batch(backend="vmap", values=broken).status)
-
-
-@pytest.mark.slow
-@needs_compiler
-def test_a_step_that_is_too_large_is_seen_by_every_backend():
-    values = {
-        "plant.mass[1]": np.asarray([0.85, 0.05, 0.02, 0.85, 0.9]),
-        "initial.q": np.full((5, 2), 0.8),
-    }
-    found, expected = batch(values=values, dt=4e-3), batch(values=values, dt=4e-3, backend="vmap")
-    np.testing.assert_array_equal(found.status, expected.status)
-    assert np.any(found.status & ij.Status.STEP_TOO_LARGE)
-
-
-@pytest.mark.slow
-@needs_compiler
-def test_one_run_and_threads():
-    one = batch(values=draws(1))
-    os.environ["IBLF_JAX_THREADS"] = "3"
-    try:
-        assert native.threads() == 3
-    finally:
-        del os.environ["IBLF_JAX_THREADS"]
-    assert one.status.shape == (1,)
-    assert_same(
-        one,
-        jax.tree.map(
-            lambda x: x[:1],
-            batch(values=draws(5) | {k: np.repeat(v, 5, 0) for k, v in draws(1).items()}),
-        ),
-        1e-12,
-    )
+        np.testing.assert_array_equal(x[[0, 2]], y[[0, 2]])
+    for run, flag in ((1, "NOT_FINITE"), (3, "BOUND_VIOLATED"), (4, "STEP_TOO_LARGE")):
+        assert ij.Status[flag] in ij.Status(int(found.status[run]))
+    np.testing.assert_array_equal(found.status, batch("vmap", broken, dt=4e-3).status)
 
 
 @pytest.mark.slow
@@ -166,62 +128,49 @@ def test_one_run_and_threads():
 @pytest.mark.parametrize(("runs", "dtype"), [(1, "float64"), (65, "float32")])
 def test_leaves_become_rows_and_leaves_again(runs, dtype):
     """As by JAX's own operations, for every type and shape that a carry may have."""
-    rng, leaves = np.random.default_rng(runs), []
-    for kind in (dtype, "int32", "bool", dtype, "int64", "int16", "int8"):
-        for shape in ((), (2,), (3, 2), (0,), (2, 1, 5)):
-            leaves.append(jnp.asarray(rng.normal(size=(runs, *shape)) * 9).astype(kind))
+    rng = np.random.default_rng(runs)
+    leaves = [
+        jnp.asarray(rng.normal(size=(runs, *shape)) * 9).astype(kind)
+        for kind in (dtype, "int32", "bool", dtype, "int64", "int16", "int8")
+        for shape in ((), (2,), (3, 2), (0,), (2, 1, 5))
+    ]
     leaves[0] = leaves[0].at[0].set(jnp.nan)
-    shapes = packed.Shapes.of(leaves, 1)
-    rows = jax.jit(lambda x: native.pack(x, shapes, np.dtype(dtype), runs))(leaves)
-    for found, expected in zip(
-        rows, packed.pack(leaves, shapes, np.dtype(dtype), runs), strict=True
-    ):
-        np.testing.assert_array_equal(found, expected, strict=True)
-    for found, expected in zip(
-        jax.jit(lambda x: native.unpack(x, shapes, runs))(rows), leaves, strict=True
-    ):
-        np.testing.assert_array_equal(found, expected, strict=True)
+    shapes, number = packed.Shapes.of(leaves, 1), np.dtype(dtype)
+    rows = jax.jit(lambda x: native.pack(x, shapes, number, runs))(leaves)
+    again = jax.jit(lambda x: native.unpack(x, shapes, runs))(rows)
+    expected = packed.pack(leaves, shapes, number, runs)
+    for found, wanted in zip((*rows, *again), (*expected, *leaves), strict=True):
+        np.testing.assert_array_equal(found, wanted, strict=True)
 
 
 @needs_compiler
 def test_rows_of_another_size_are_an_error_and_no_crash():
     """What XLA is told of the shapes is checked where memory is written."""
-    leaf, rows = (
-        jnp.ones((4, 3)),
-        [jax.ShapeDtypeStruct((n, 4), t) for n, t in ((2, jnp.float64), (0, jnp.int32))],
-    )
-    with pytest.raises(jax.errors.JaxRuntimeError, match="does not fit"):
-        jax.block_until_ready(jax.ffi.ffi_call(cpu.rows_function("pack"), rows)(leaf))
-    with pytest.raises(jax.errors.JaxRuntimeError, match="without an array"):
-        jax.block_until_ready(
-            jax.ffi.ffi_call(
-                cpu.rows_function("pack"), [jax.ShapeDtypeStruct((5, 4), jnp.float64), rows[1]]
-            )(leaf)
+    for rows, integers, words in ((2, 0, "does not fit"), (5, 0, "without an array")):
+        shapes = [((rows, 4), jnp.float64), ((integers, 4), jnp.int32)]
+        call = jax.ffi.ffi_call(
+            cpu.rows_function("pack"), [jax.ShapeDtypeStruct(*x) for x in shapes]
         )
-
-
-def forget_kernels():
-    """What this process knows of kernels and their text."""
-    cpu.kernel.cache_clear()
-    cpu.c_source.cache_clear()
+        with pytest.raises(jax.errors.JaxRuntimeError, match=words):
+            jax.block_until_ready(call(jnp.ones((4, 3))))
 
 
 @pytest.mark.slow
 @needs_compiler
-@pytest.mark.parametrize(("parts", "record_every"), [("functions", 100), ("both", 100)])
-def test_a_long_step_is_cut_into_functions(monkeypatch, parts, record_every):
+def test_a_long_step_is_cut_into_functions(monkeypatch):
     """Cut into pieces of fifty operations, and with its stages as calls, the numbers stay: the
     places of some products with sums differ."""
-    whole = batch(record_every=record_every)
+    whole = batch(record_every=100)
+    limits = thresholds.LOWERING_LIMITS._replace(written_out=10)
     monkeypatch.setattr(thresholds, "MAX_C_FUNCTION_NODES", 0)
     monkeypatch.setattr(thresholds, "SEGMENT_NODES", 50)
-    if parts == "both":
-        limits = thresholds.LOWERING_LIMITS._replace(written_out=10)
-        monkeypatch.setattr(thresholds, "LOWERING_LIMITS", limits)
-    forget_kernels()
-    monkeypatch.delitem(COMPILED, ("native", record_every))
-    cut = batch(record_every=record_every)
-    forget_kernels()
+    monkeypatch.setattr(thresholds, "LOWERING_LIMITS", limits)
+    monkeypatch.delitem(COMPILED, ("native", 100))
+    for known in (cpu.kernel, cpu.c_source):
+        known.cache_clear()
+    cut = batch(record_every=100)
+    for known in (cpu.kernel, cpu.c_source):
+        known.cache_clear()
     # The mode comes from differences of rates, which magnify the last digit.
     np.testing.assert_allclose(cut.fastest_mode, whole.fastest_mode, rtol=1e-9)
     assert_same(cut._replace(fastest_mode=whole.fastest_mode), whole, 1e-12)
@@ -250,85 +199,37 @@ def pushed_by_vmap():
 
 @pytest.mark.slow
 @needs_compiler
-@pytest.mark.parametrize(
-    ("written_out", "by_columns"), [(thresholds.LOWERING_LIMITS.written_out, False), (10, True)]
-)
-def test_forward_sensitivities(monkeypatch, pushed_by_vmap, written_out, by_columns):
-    limits = thresholds.LOWERING_LIMITS._replace(written_out=written_out)
-    monkeypatch.setattr(thresholds, "LOWERING_LIMITS", limits)
+@pytest.mark.parametrize("by_columns", [False, True])
+def test_forward_sensitivities(monkeypatch, pushed_by_vmap, by_columns):
     if by_columns:
+        limits = thresholds.LOWERING_LIMITS._replace(written_out=10)
+        monkeypatch.setattr(thresholds, "LOWERING_LIMITS", limits)
         executor = registry.EXECUTORS["native"]
         limits = executor.limits._replace(derivative_nodes=0)
         monkeypatch.setitem(registry.EXECUTORS, "native", executor._replace(limits=limits))
         monkeypatch.setattr(execute, "run_with_tangents", None)
-    outcome, tangents, products = pushed("auto" if by_columns else "native")
-    reference, expected, exact = pushed_by_vmap
-    assert_same(jax.tree.map(np.asarray, tangents), jax.tree.map(np.asarray, expected), 1e-10)
-    assert_same(jax.tree.map(np.asarray, outcome), jax.tree.map(np.asarray, reference), 1e-10)
+    found = jax.tree.map(np.asarray, pushed("auto" if by_columns else "native"))
+    for x, y in zip(found, pushed_by_vmap, strict=True):
+        assert_same(x, jax.tree.map(np.asarray, y), 1e-10)
+    _, tangents, products = found
     assert tangents["rmse"].shape == (3, 3, 2)
-    assert_same(products, exact, 1e-10)
     assert [x.shape for x in products] == [(3, 3, 3)] * 2
-
-
-def test_without_a_compiler_it_runs_on_vmap_with_one_warning(monkeypatch):
-    monkeypatch.setenv("CXX", "no-such-compiler")
-    CACHE.clear(compile.WARNINGS)
-    cpu.kernel.cache_clear()
-    called = []
-    with pytest.warns(compile.BackendWarning, match="no-such-compiler.*vmap"):
-        with_fallback("auto", called.append, lambda: called.append("vmap"))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        with_fallback("auto", called.append, lambda: called.append("vmap"))
-    assert called == ["vmap"] * 2
-
-
-@pytest.mark.slow
-def test_one_run_on_the_native_backend_is_the_run(paper):
-    """Records, metrics and status of `simulate(backend="native")` are those of vmap; another value
-    of a leaf builds nothing new."""
-    for scenario in (
-        paper,
-        ij.with_parameters(paper, {"controller.K2": 30.0, "plant.mass[1]": 1.1}),
-    ):
-        one, other = (
-            ij.simulate(scenario, duration=0.5, dt=1e-3, record_every=7, backend=backend)
-            for backend in ("vmap", "native")
-        )
-        np.testing.assert_allclose(one.q, other.q, rtol=0, atol=1e-10)
-        np.testing.assert_allclose(one.tau, other.tau, rtol=0, atol=1e-9)
-        np.testing.assert_allclose(one.observer_state, other.observer_state, rtol=0, atol=1e-9)
-        assert int(one.status) == int(other.status) == 0
-        for name in one.metrics:
-            np.testing.assert_allclose(
-                one.metrics[name], other.metrics[name], rtol=1e-9, atol=1e-12
-            )
-    with pytest.raises(ValueError, match="backend"):
-        ij.simulate(paper, duration=0.5, dt=1e-3, backend="fortran")
 
 
 @pytest.mark.slow
 @needs_compiler
-@pytest.mark.parametrize("every", [1, 7])
-def test_a_long_run_in_several_calls_is_the_same_run(monkeypatch, every):
+def test_a_long_run_in_several_calls_is_the_same_run(monkeypatch):
     """Python sees Ctrl-C between them; the numbers are bit for bit those of one call."""
-    options = {
-        "duration": 0.5,
-        "dt": 1e-3,
-        "record_every": every,
-        "method": "euler",
-        "backend": "native",
-    }
     scenario = ij.presets.zhang_yan_2024()
-    whole = ij.simulate(scenario, **options)
+    options = {"method": "euler", "record_every": 7, "backend": "native"}
+    whole = ij.simulate(scenario, duration=0.5, dt=1e-3, **options)
     calls = []
     monkeypatch.setattr(thresholds, "OPERATIONS_PER_CALL", 1.0)
     monkeypatch.setattr(
         thresholds, "steps_per_call", lambda nodes, steps, every: calls.append(nodes) or 21 * 7
     )
-    parts = ij.simulate(scenario, **options)
-    assert len(calls) == 1
-    assert calls[0] > 100
+    parts = ij.simulate(scenario, duration=0.5, dt=1e-3, **options)
+    assert len(calls) == 1 and calls[0] > 100
     for x, y in zip(jax.tree.leaves(parts), jax.tree.leaves(whole), strict=True):
         np.testing.assert_array_equal(np.asarray(x), np.asarray(y))
 
@@ -342,3 +243,59 @@ def test_a_call_is_short_and_whole(nodes, steps, every):
     assert length == steps or length % (every or 1) == 0
     assert length * nodes <= max(thresholds.OPERATIONS_PER_CALL, nodes * (every or 1))
     assert (length == steps) == (steps * nodes < thresholds.OPERATIONS_PER_CALL)
+
+
+@needs_compiler
+def test_copies_at_the_end_of_a_batch_have_the_results_of_their_runs():
+    """The kernel does not compute blocks of copies; a copy of a run is not one of its neighbour."""
+
+    def step(shared, per_run, carry, index):
+        (k,), (x, count) = per_run, carry
+        return [x - 0.1 * k * x, count + (k > 2.0).astype(count.dtype)], []
+
+    leaf = Shapes((((), np.dtype("float64")),))
+    numbers = Shapes((*leaf.items, ((), np.dtype("int32"))))
+    program = compile_step(step, np.dtype("float64"), Shapes(()), leaf, numbers).program
+    rng = np.random.default_rng(0)
+    k = rng.uniform(1.0, 3.0, 20)
+    x = np.concatenate([rng.uniform(1.0, 2.0, 17), np.full(3, np.nan)])
+
+    def ends(rows):
+        columns = [jnp.asarray(x[rows]), jnp.zeros(64, jnp.int32)]
+        carry = packed.pack(columns, numbers, np.dtype("float64"), runs=64)
+        return cpu.run(program, jnp.zeros(0), jnp.asarray(k[rows])[None], carry, 7)[0]
+
+    each = ends(np.resize(np.arange(20), 64))
+    for distinct, last in ((1, 1), (2, 2), (9, 1), (12, 2), (16, 1), (16, 2), (20, 1), (17, 3)):
+        copies = np.resize(np.arange(distinct - last, distinct), 64 - distinct)
+        rows = np.concatenate([np.arange(distinct), copies])
+        found = ends(rows)
+        np.testing.assert_array_equal(found.floats, each.floats[:, rows])
+        np.testing.assert_array_equal(found.ints, each.ints[:, rows])
+
+
+def test_the_places_of_numbers_that_nobody_reads_any_more_are_used_again():
+    """A step in many functions, each of which reads a number of the one before it."""
+
+    def step(shared, per_run, carry, index):
+        (x,) = carry
+        for _ in range(60):
+            x = jnp.cos(x) + 0.1 * jnp.sin(x)
+        return [x], []
+
+    number = Shapes((((), np.dtype("float64")),))
+    program = compile_step(step, np.dtype("float64"), Shapes(()), Shapes(()), number).program
+    text = cpu.c_source(program, shared=0, per_run=0, segment=8)
+    assert len(re.findall(r"SEPARATE void segment_", text)) > 20
+    assert int(re.search(r"F x\[(\d+)\];", text)[1]) <= 4
+
+
+def test_records_come_back_run_by_run_and_sample_by_sample():
+    rng, runs, samples = np.random.default_rng(0), 4, 3
+    one = {"a": jax.ShapeDtypeStruct((), int), "b": jax.ShapeDtypeStruct((2, 3), float)}
+    rows = [rng.integers(9, size=(samples, 1, runs)), rng.normal(size=(samples, 6, runs))]
+    found = packed.unpacked_records(one, rows)
+    assert found["a"].dtype == int
+    for r, k in np.ndindex(runs, samples):
+        assert found["a"][r, k] == rows[0][k, 0, r]
+        np.testing.assert_array_equal(found["b"][r, k].ravel(), rows[1][k, :, r])

@@ -94,31 +94,27 @@ def test_one_entry_of_a_stack():
 
 
 def test_constants_and_primitives_of_inner_functions():
-    def branches(x):
-        return jax.lax.cond(x[0] > 0.5, lambda x: jnp.sum(jnp.sin(x)) * 7.5, dotted, x)
-
-    def dotted(x):
-        return x @ jnp.asarray(TABLE)
-
-    traced = jax.make_jaxpr(branches)(jnp.asarray(TABLE))
-    assert {"cond", "sin", "dot_general", "reduce_sum"} <= jaxprs.primitives(traced)
-    found = [np.asarray(x) for x in jaxprs.constants(traced)]
-    assert any(np.array_equal(x, TABLE) for x in found)
-    assert any(np.array_equal(x, 7.5) for x in found)
+    """Before JAX 0.11 a function that a loop calls keeps its constants for itself."""
     captured = jnp.arange(6.0).reshape(2, 3)
-    inner = jax.make_jaxpr(jax.jit(lambda x: x + captured))(1.0)
-    assert any(np.array_equal(x, captured) for x in jaxprs.constants(inner))
 
-
-def test_constants_of_a_function_that_a_loop_calls():
-    """Before JAX 0.11 such a function keeps its constants for itself."""
+    def branches(x):
+        return jax.lax.cond(x[0] > 0.5, lambda x: jnp.sum(jnp.sin(x)) * 7.5, lambda x: x @ TABLE, x)
 
     def body(carry, _):
         return jax.jit(lambda x: x @ jnp.diag(np.array([3.0, 5.0, 8.0])))(carry), None
 
-    traced = jax.make_jaxpr(lambda x: jax.lax.scan(body, x, None, length=2)[0])(jnp.ones(3))
-    found = [np.asarray(x) for x in jaxprs.constants(traced)]
-    assert any(np.array_equal(x, [3.0, 5.0, 8.0]) for x in found)
+    def loop(x):
+        return jax.lax.scan(body, x, None, length=2)[0]
+
+    traced = jax.make_jaxpr(branches)(TABLE)
+    assert {"cond", "sin", "dot_general", "reduce_sum"} <= jaxprs.primitives(traced)
+    for function, *wanted in (
+        (traced, TABLE, 7.5),
+        (jax.make_jaxpr(jax.jit(lambda x: x + captured))(1.0), captured),
+        (jax.make_jaxpr(loop)(jnp.ones(3)), [3.0, 5.0, 8.0]),
+    ):
+        found = [np.asarray(x) for x in jaxprs.constants(function)]
+        assert all(any(np.array_equal(x, y) for x in found) for y in wanted)
 
 
 def shape_of_first(x, y):
@@ -138,15 +134,13 @@ double_sum = new_primitive(
 )
 
 
-def test_a_primitive_of_our_own():
+def test_a_primitive_of_our_own_and_its_derivatives():
     x, y = jnp.asarray([1.0, 2.0]), jnp.asarray([3.0, 5.0])
-    np.testing.assert_array_equal(double_sum.bind(x, y), [8.0, 14.0])
-    np.testing.assert_array_equal(jax.jit(double_sum.bind)(x, y), [8.0, 14.0])
-    np.testing.assert_array_equal(jax.vmap(double_sum.bind)(x, y), [8.0, 14.0])
+    for transform in (lambda f: f, jax.jit, jax.vmap):
+        np.testing.assert_array_equal(transform(double_sum.bind)(x, y), [8.0, 14.0])
     assert names(jax.make_jaxpr(double_sum.bind)(x, y)) == ["double_sum_of_the_tests"]
-
-
-def test_derivatives_of_a_primitive_of_our_own():
+    assert jax.jvp(lambda x: double_sum.bind(x, 3.0 * x), (1.0,), (1.0,))[1] == 8.0
+    assert jax.linear_transpose(double_sum.bind, 1.0, 1.0)(1.0) == (2.0, 2.0)
     seen = []
 
     def jvp(primals, tangents):
@@ -162,5 +156,3 @@ def test_derivatives_of_a_primitive_of_our_own():
     )
     assert jax.jvp(lambda x: first.bind(x, jnp.asarray(2.0)), (1.0,), (4.0,))[1] == 4.0
     assert seen == [[False, True]]
-    assert jax.jvp(lambda x: double_sum.bind(x, 3.0 * x), (1.0,), (1.0,))[1] == 8.0
-    assert jax.linear_transpose(double_sum.bind, 1.0, 1.0)(1.0) == (2.0, 2.0)

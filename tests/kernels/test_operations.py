@@ -94,13 +94,17 @@ def exactly(f, x):
 @needs_compiler
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_native_functions(dtype):
-    library = kernel(dtype)
+    library, edges = kernel(dtype), np.asarray(EDGES, np.float64).astype(dtype)
+    rounding = {"rtol": 4 * np.finfo(dtype).eps, "atol": np.finfo(dtype).tiny}
     for name, (f, points, limit) in FUNCTIONS.items():
         x = points.astype(dtype)
         x = x[np.abs(x) < 85] if name == "exp" and dtype == np.float32 else x
         x = np.concatenate([x, spread(dtype).astype(dtype)]) if name in ("sin", "cos") else x
         worst = np.max(ulps(native_value(library, name, x), exactly(f, x), dtype))
         assert worst <= limit + 0.6, f"{name} is off by {worst} ulp"
+        with np.errstate(all="ignore"):
+            found, expected = native_value(library, name, edges), f(edges)
+        np.testing.assert_allclose(found, expected, err_msg=name, **rounding)
 
 
 @needs_compiler
@@ -109,29 +113,10 @@ def test_native_functions(dtype):
 )
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_sin_and_cos_without_a_fused_multiply_add(dtype):
-    library, x = (
-        kernel(dtype, ("-march=nehalem",)),
-        np.concatenate([LINE, UNIT, spread(dtype)]).astype(dtype),
-    )
+    library = kernel(dtype, ("-march=nehalem",))
+    x = np.concatenate([LINE, UNIT, spread(dtype)]).astype(dtype)
     for name, f in (("sin", np.sin), ("cos", np.cos)):
         assert np.max(ulps(native_value(library, name, x), exactly(f, x), dtype)) <= 2.1
-
-
-@needs_compiler
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_native_functions_at_the_edges(dtype):
-    library = kernel(dtype)
-    x = np.asarray(EDGES, np.float64).astype(dtype)
-    with np.errstate(all="ignore"):
-        for name, (f, _, _) in FUNCTIONS.items():
-            found, expected = native_value(library, name, x), f(x)
-            np.testing.assert_allclose(
-                found,
-                expected,
-                rtol=4 * np.finfo(dtype).eps,
-                atol=np.finfo(dtype).tiny,
-                err_msg=name,
-            )
 
 
 LAX = {
@@ -203,6 +188,27 @@ def all_operations(dtype, runs=256):
     program = finished(b, outputs[:9] + [-1] * len(outputs[9:]), outputs, [])
     carry = np.asarray([*values["f"]]), np.asarray([*values["i"], *values["b"]])
     return program, carry, expected, names
+
+
+def test_constants_are_folded_as_jax_computes_them():
+    """Every operation on numbers that JAX has by the same name, with numbers of both signs."""
+    x, y = np.array([[-3.5, -0.4, 0.3, 2.5, 0.0], [1.5, -0.7, 0.2, -2.0, -1.0]])
+    folds = {
+        name: operation.numpy
+        for name, operation in OPERATIONS.items()
+        if operation.numpy and hasattr(jax.lax, name) and name != "select"
+    }
+    assert {"rem", "sub", "atan2", "sign", "lt", "pow"} <= folds.keys()
+    arguments = {name: (x, y)[: getattr(fold, "nin", 1)] for name, fold in folds.items()}
+
+    @jax.jit
+    def computed(arguments):
+        return {name: getattr(jax.lax, name)(*given) for name, given in arguments.items()}
+
+    found = computed(arguments)
+    with np.errstate(all="ignore"):
+        for name, given in arguments.items():
+            np.testing.assert_allclose(folds[name](*given), found[name], rtol=1e-12, err_msg=name)
 
 
 @pytest.mark.slow

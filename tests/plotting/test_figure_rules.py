@@ -22,8 +22,9 @@ from matplotlib.text import Text
 
 import iblf_jax as ij
 from iblf_jax import Status, plotting
-from iblf_jax.plotting import _panels, _proofs, _scales, _studies, _style, _tuning, certificates
+from iblf_jax.plotting import _panels, _proofs, _scales, _style, _tuning, certificates
 from iblf_jax.plotting._curves import curves_of, rounding_error
+from iblf_jax.studies.statistics import scalar_samples
 from iblf_jax.studies.summaries import LEVELS, initial_margins
 
 
@@ -45,16 +46,17 @@ def changed(run, joint, sample, value, field="q", flag=Status.BOUND_VIOLATED):
     return with_signals(run, **{field: values}, status=jnp.int32(int(flag)))
 
 
-# ---- peaks keep their sign and their joint
-
-
 def test_a_clipped_peak_has_its_sign_its_run_and_its_joint():
     calm = made_up(chain(2))
-    dipped = changed(calm, 1, 50, -9.0)
-    figure = plotting.positions({"calm": calm, "dipped": dipped})
-    first, _, second, _ = figure.axes
+    runs = {"calm": calm, "dipped": changed(calm, 1, 50, -9.0)}
+    first, _, second, _ = plotting.positions(runs).axes
     assert texts_of(first) == []
     assert texts_of(second) == ["peak \N{MINUS SIGN}9 rad, dipped, joint 1, t = 0.5 s"]
+    for run, texts in ((calm, []), (changed(calm, 1, 3, -4321.5, "tau"), ["4321.5 N m, joint 1"])):
+        (axes,) = [axes for axes in run.plot().axes if "torque" in axes.get_ylabel()]
+        assert len(texts_of(axes)) == len(texts)
+        assert all(x in y for x, y in zip(texts, texts_of(axes), strict=True))
+        assert np.ptp(axes.get_ylim()) < 60
 
 
 def test_a_peak_of_a_region_names_no_joint():
@@ -71,7 +73,7 @@ def test_a_peak_of_a_region_names_no_joint():
 
 def test_the_bars_of_a_tuning_have_the_signs_of_the_torques():
     run = made_up(chain(2))
-    (axes,) = [Figure().subplots()]
+    axes = Figure().subplots()
     _tuning._peaks(axes, curves_of({"before": run, "tuned": run}), np.array([40.0, 20.0]))
     heights = [bar.get_height() for bar in axes.patches]
     tau = np.asarray(run.tau)
@@ -81,19 +83,6 @@ def test_the_bars_of_a_tuning_have_the_signs_of_the_torques():
     assert texts_of(axes) == [f"{x:.3g}".replace("-", "\N{MINUS SIGN}") for x in expected] * 2
     limits = [line.get_ydata()[0] for line in axes.get_lines()[:4]]
     assert limits == [-40.0, 40.0, -20.0, 20.0]
-
-
-def test_a_report_lists_the_peaks_with_their_signs():
-    from iblf_jax.reports import shown
-
-    tables = shown(made_up(chain(2))).tables
-    cells = re.findall(r"<td[^>]*>([^<]*)</td>", tables["Peaks with their signs"])
-    rows = [cells[i : i + 5] for i in range(0, len(cells), 5)]
-    assert ["tau", "N m", "joint 0", "-5", "0"] in rows
-    assert ["tau", "N m", "joint 1", "-4", "0"] in rows
-
-
-# ---- a zoom states its reason
 
 
 def zoom_titles(figure):
@@ -111,26 +100,17 @@ def test_a_zoom_of_the_transient_says_so_and_bounds_what_follows():
     for title, largest in zip(titles, later, strict=True):
         stated = float(title.split("\\leq$ ")[1].removesuffix(" rad/s"))
         assert largest <= stated <= 1.1 * largest
-
-
-def test_the_range_after_a_zoom_of_a_torque_is_that_of_the_run():
-    run = made_up(chain(2), duration=20.0)
     figure = plotting.torques(run)
-    end = figure.axes[1].get_xlim()[1]
-    later = np.asarray(run.tau)[np.asarray(run.t) > end]
-    for joint, title in enumerate(zoom_titles(figure)):
-        low, high = later[:, joint].min(), later[:, joint].max()
-        assert title.endswith(f"then {low:.3g} to {high:.3g} N m")
-
-
-def test_a_relative_error_has_no_unit_in_words():
-    titles = zoom_titles(plotting.errors(made_up(chain(1), duration=20.0)))
-    assert re.fullmatch(r".*then \$\|\\xi\| \\leq\$ [\d.e-]+", titles[0]), titles
+    later = np.asarray(run.tau)[np.asarray(run.t) > figure.axes[1].get_xlim()[1]]
+    for title, torques in zip(zoom_titles(figure), later.T, strict=True):
+        assert title.endswith(f"then {torques.min():.3g} to {torques.max():.3g} N m")
 
 
 def test_other_zooms_have_other_reasons():
     run = made_up(chain(2), duration=20.0)
     assert "first 0.1 s of a transient of " in zoom_titles(plotting.errors(run, zoom=0.1))[0]
+    relative = zoom_titles(plotting.errors(run))[0]
+    assert re.fullmatch(r".*then \$\|\\xi\| \\leq\$ [\d.e-]+", relative), relative  # without a unit
     still = dataclasses.replace(run, e=0.0 * run.e, xi=0.0 * run.xi)
     assert "no transient" in zoom_titles(plotting.errors(still))[0]
     bad = runaway(chain(2))
@@ -139,15 +119,13 @@ def test_other_zooms_have_other_reasons():
     assert "the transient (failed runs aside)" in zoom_titles(both)[0]
 
 
-def test_a_stated_bound_is_not_below_the_value():
-    rounded = [_panels.rounded_away(value) for value in (0.0385, 0.5, 0.0)]
-    assert rounded == ["0.039", "0.5", "0"]
-
-
 @pytest.mark.slow
 def test_a_comparison_states_the_reason_for_each_window(paper):
     options = {"duration": 8.0, "dt": 2e-3, "equal_effort": False}
-    error, torque = ij.compare(paper, ["integral", "log"], **options).plot().axes[:2]
+    compared = ij.compare(paper, ["integral", "log"], **options)
+    in_print = compared.plot(style="paper").axes[:2]
+    assert [axes.get_title() for axes in in_print] == ["gains as given", ""]
+    error, torque = compared.plot().axes[:2]
     assert error.get_title().startswith("gains as given\nfirst ")
     assert "the transient" in error.get_title()
     assert torque.get_title().startswith(f"first {torque.get_xlim()[1]:.3g} s: the laws differ")
@@ -161,7 +139,8 @@ def test_a_certificate_until_a_time_says_so(paper, short_run):
     assert "as requested" not in certificate.plot().get_suptitle()
 
 
-# ---- scatter axes follow the data
+def assert_inside(x, limits):
+    assert limits[0] < x.min() and x.max() < limits[1]
 
 
 def middle_share(scale, x):
@@ -184,33 +163,11 @@ def test_an_axis_shows_all_values_and_squeezes_none(x, name):
     axes = Figure().subplots()
     _scales.follow(axes, "x", np.append(x, np.nan))
     assert axes.get_xscale() == name
-    low, high = axes.get_xlim()
-    assert low < x.min()
-    assert high > x.max()
+    assert_inside(x, axes.get_xlim())
     if name != "linear":
         scale = _scales.scale_of(x)
         assert middle_share(scale, x) > 2.0 * middle_share(_scales.LINEAR, x)
         np.testing.assert_allclose(scale.inverse(scale.forward(x)), x, rtol=1e-9)
-
-
-def test_a_front_shows_every_trial():
-    tried = np.array([[0.5, 40.0], [0.9, 1.0], [3.0, 0.8]])
-    front = ij.ParetoFront(
-        labels=("tracking", "effort"),
-        objectives=np.array([[0.8, 1.0], [0.85, 0.9]]),
-        x=np.ones((2, 1)),
-        names=("controller.K2",),
-        tried=tried,
-        first=np.array([1.0, 1.0]),
-        start=ij.presets.zhang_yan_2024(),
-        blocks=(),
-        z=np.zeros((2, 1)),
-        seconds=1.0,
-    )
-    (axes,) = plotting.pareto(front).axes
-    for limits, x in zip((axes.get_xlim(), axes.get_ylim()), tried.T, strict=True):
-        assert limits[0] < x.min()
-        assert limits[1] > x.max()
 
 
 @pytest.fixture(scope="module")
@@ -225,21 +182,12 @@ def test_a_scatter_shows_every_run(study):
     far = dataclasses.replace(
         study, metrics=ij.Metrics({"margin": margins}, study.metrics.unit_pairs)
     )
-    figure = plotting.scatter(far)
     worst = margins.min(axis=1)
-    for axes, x in zip(figure.axes, (v for v in _flat(study)), strict=True):
+    drawn_numbers = scalar_samples(study.samples).values()
+    for axes, x in zip(plotting.scatter(far).axes, drawn_numbers, strict=True):
         assert axes.get_yscale() == "symlog"
-        assert axes.get_ylim()[0] < worst.min()
-        assert axes.get_ylim()[1] > worst.max()
-        assert axes.get_xlim()[0] < x.min()
-        assert axes.get_xlim()[1] > x.max()
-
-
-def _flat(study):
-    """The drawn numbers of a study, one array a number."""
-    from iblf_jax.studies.statistics import scalar_samples
-
-    return scalar_samples(study.samples).values()
+        assert_inside(worst, axes.get_ylim())
+        assert_inside(x, axes.get_xlim())
 
 
 def test_a_run_that_diverged_does_not_squeeze_the_velocity_portrait():
@@ -247,9 +195,6 @@ def test_a_run_that_diverged_does_not_squeeze_the_velocity_portrait():
     alone = plotting.velocity_portrait(good).axes[0].get_ylim()
     both = plotting.velocity_portrait({"good": good, "bad": runaway(chain(2))}).axes[0].get_ylim()
     assert both == alone
-
-
-# ---- the mark of a violation
 
 
 def crosses_of(axes):
@@ -302,9 +247,6 @@ def test_a_refutation_is_red_for_the_joint_that_leaves_its_bounds():
     assert red == [False, True]
 
 
-# ---- rounding errors are zero
-
-
 def noise(run, size=1e-17):
     values = size * np.random.default_rng(0).standard_normal(run.q.shape)
     return jnp.asarray(values)
@@ -343,14 +285,32 @@ def test_a_constant_has_no_axis_that_magnifies_rounding_errors():
         assert np.ptp(axes.get_ylim()) > 0.1
 
 
-@pytest.mark.parametrize(("values", "is_zero"), [(0.0, True), (1e-17, True), (1e-3, False)])
-def test_a_certificate_says_zero(values, is_zero):
-    t = np.linspace(0.0, 1.0, 50)
-    axes = Figure().subplots()
+T = np.linspace(0.0, 1.0, 50)
+
+
+def bounded(axes, size):
     signal = certificates.Bounded("estimation error", r"$|\tilde f|$", "N m")
-    certificates._draw_bounded(axes, t, np.full(50, values), np.full(50, 2.0), signal)
-    assert any(text.startswith("zero") for text in texts_of(axes)) == is_zero
-    assert axes.get_yscale() == ("linear" if is_zero else "log")
+    certificates._draw_bounded(axes, T, np.full(50, size), np.full(50, 2.0), signal)
+    assert axes.get_yscale() == ("log" if size == 1e-3 else "linear")
+
+
+def inequality(axes, size):
+    traces = types.SimpleNamespace(t=T, left=np.full(50, -size), V=np.exp(-T))
+    certificates._draw_inequality(axes, traces, 0.0 * T, "terms")
+
+
+def disturbances(axes, size):
+    columns = np.stack([np.exp(-T), np.exp(-2.0 * T)], axis=1)[:, :, None]
+    traces = types.SimpleNamespace(t=T, d_tilde=np.full((50, 2), size), error=columns)
+    certificates._disturbances(axes, traces)
+
+
+@pytest.mark.parametrize("draw", [bounded, inequality, disturbances])
+def test_a_certificate_says_zero(draw):
+    for size in (0.0, 1e-17, 1e-3):
+        axes = Figure().subplots()
+        draw(axes, size)
+        assert any(text.startswith("zero") for text in texts_of(axes)) == (size < 1e-3)
 
 
 def test_a_zoom_of_rounding_errors_has_no_transient():
@@ -364,56 +324,27 @@ def test_a_zoom_of_rounding_errors_has_no_transient():
     assert titles[1] == "then zero"
 
 
-@pytest.mark.parametrize("size", [1e-16, 1e-3])
-def test_an_inequality_of_rounding_errors_is_zero(size):
-    t = np.linspace(0.0, 1.0, 50)
-    traces = types.SimpleNamespace(t=t, left=np.full(50, -size), V=np.exp(-t))
-    axes = Figure().subplots()
-    certificates._draw_inequality(axes, traces, 0.0 * t, "terms")
-    assert any(text.startswith("zero") for text in texts_of(axes)) == (size < 1e-3)
-
-
-@pytest.mark.parametrize("size", [1e-16, 1e-3])
-def test_errors_of_an_estimate_that_are_rounding_are_zero(size):
-    t = np.linspace(0.0, 1.0, 50)
-    columns = np.stack([np.exp(-t), np.exp(-2.0 * t)], axis=1)[:, :, None]
-    traces = types.SimpleNamespace(t=t, d_tilde=np.full((50, 2), size), error=columns)
-    axes = Figure().subplots()
-    certificates._disturbances(axes, traces)
-    assert any(text.startswith("zero") for text in texts_of(axes)) == (size < 1e-3)
-
-
-# ---- margins of the start
-
-
 def with_margins(study, margins):
     metrics = ij.Metrics({"margin": margins}, study.metrics.unit_pairs)
     return dataclasses.replace(study, metrics=metrics)
 
 
 def test_a_study_says_when_the_start_sets_every_margin(study):
-    starts = initial_margins(study.scenario, study.samples)[LEVELS[0]]
-    of_start = with_margins(study, starts)
-    assert _studies.set_by_start(of_start, "margin")
+    starts = initial_margins(study.scenario, study.samples)[LEVELS[0]].copy()
+    of_start = with_margins(study, starts.copy())
     figure = drawn(plotting.histograms(of_start, ["margin"]))
     assert "says nothing about the law" in figure.get_suptitle().replace("\n", " ")
     assert "that of the start" in figure.axes[0].get_title()
     scatter = plotting.scatter(of_start).get_suptitle().replace("\n", " ")
     assert "The least margin of every run is that of its start (t = 0)" in scatter
-    lower = starts.copy()
-    lower[5] -= 1e-6
-    other = with_margins(study, lower)
-    assert not _studies.set_by_start(other, "margin")
-    assert "law" not in plotting.histograms(other, ["margin"]).get_suptitle()
+    starts[5] -= 1e-6
+    assert "law" not in plotting.histograms(with_margins(study, starts), ["margin"]).get_suptitle()
 
 
-def test_one_margin_for_all_runs_is_stated_not_drawn(study):
+def test_histograms_name_one_margin_for_all_runs_and_peaks_as_sizes(study):
     figure = drawn(plotting.histograms(with_margins(study, np.full((64, 2), 0.1)), ["margin"]))
     assert texts_of(figure.axes[0]) == ["0.1 rad in every run"]
     assert not figure.axes[0].patches
-
-
-def test_a_peak_of_a_study_is_labelled_as_a_size(study):
     peaks = np.linspace(1.0, 2.0, 128).reshape(64, 2)
     metrics = ij.Metrics({"peak_torque": peaks}, (("peak_torque", "N m"),))
     figure = plotting.histograms(dataclasses.replace(study, metrics=metrics))
@@ -430,15 +361,68 @@ def test_a_tuning_says_when_the_start_sets_its_margin(paper):
         assert ("that of the start" in axes.get_title()) == is_start
 
 
-# ---- figures for print, and figures of the user
-
-
 PUBLIC = sorted(
     name
     for name in dir(plotting)
     if inspect.isfunction(getattr(plotting, name))
     and name not in ("animate", "paper_figures", "save")
 )
+OF_RUNS = {
+    *("errors", "joint", "levels", "overview", "phase_portrait", "positions", "torques"),
+    *("uncertain_terms", "velocities", "velocity_errors", "velocity_portrait", "workspace"),
+}
+"""Functions that draw any run."""
+OF_STUDIES = {
+    "bands": lambda study, table: (study,),
+    "heat_map": lambda study, table: (table,),
+    "histograms": lambda study, table: (study,),
+    "parallel": lambda study, table: (table,),
+    "scatter": lambda study, table: (study,),
+    "study_overview": lambda study, table: (study,),
+    "tube": lambda study, table: (study.scenario,),
+}
+"""Functions that draw a study, a sweep or a scenario -> their arguments."""
+OF_RESULTS = {
+    *("comparison", "failure_probability", "first_exit", "guaranteed_tube", "identification"),
+    *("pareto", "tuning"),
+}
+"""The methods `plot` of results, which `test_results` calls with a figure."""
+ELSEWHERE = {"adaptation", "paths", "region_margins"}
+"""The tests of adaptive laws, of searches and of regions call them with a figure."""
+
+
+def test_every_figure_function_is_called_with_a_figure():
+    assert set(PUBLIC) == OF_RUNS | set(OF_STUDIES) | OF_RESULTS | ELSEWHERE
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [*sorted(OF_RUNS), *OF_STUDIES])
+def test_a_figure_is_drawn_into_the_users_figure_and_returned(name, short_run, study):
+    """Into a Figure, and into a SubFigure that leaves the other half alone."""
+    function, arguments = getattr(plotting, name), (short_run,)
+    if name in OF_STUDIES:
+        arguments = OF_STUDIES[name](study, cases.table())
+    whole = Figure(figsize=(12.0, 9.0))
+    left, right = whole.subfigures(1, 2)
+    assert function(*arguments, figure=left) is left
+    assert left.axes and not right.axes
+    alone = Figure()
+    assert function(*arguments, figure=alone) is alone and alone.axes
+
+
+def test_a_lyapunov_function_that_is_a_noise_is_a_band():
+    run = made_up(chain(2), duration=20.0)
+    noise = np.exp(np.random.default_rng(0).normal(0.0, 1.0, len(run.t)))
+    for V, is_band in ((run.V, False), (jnp.asarray(noise), True)):
+        axes = plotting.overview(with_signals(run, V=V)).axes[-1]
+        assert axes.get_ylabel().startswith("Lyapunov function")
+        assert bool(axes.collections) is is_band
+        if is_band:
+            assert len(axes.get_lines()[0].get_xdata()) == _panels.NOISE_BLOCKS
+            (band,) = axes.collections
+            low, high = np.nanmin(noise), np.nanmax(noise)
+            ends = band.get_paths()[0].vertices[:, 1]
+            np.testing.assert_allclose([ends.min(), ends.max()], [low, high])
 
 
 def test_every_figure_function_takes_a_style_and_a_figure():
@@ -481,19 +465,6 @@ def test_a_figure_for_print_has_the_size_and_the_font_of_the_journal(style, widt
     assert plotting.torques(run).get_figwidth() == pytest.approx(_style.WIDTH)
 
 
-def test_a_figure_of_the_user_is_drawn_into_and_returned():
-    run = made_up(chain(2))
-    whole = Figure(figsize=(9.0, 4.0))
-    left, right = whole.subfigures(1, 2)
-    assert plotting.positions(run, figure=left) is left
-    assert plotting.phase_portrait(run, figure=right) is right
-    assert len(left.axes) == 4 and len(right.axes) == 1
-    assert plotting.errors(run).figure is not whole
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        whole.canvas.draw()
-
-
 def test_a_noise_is_a_band_and_a_motion_is_a_line():
     t = np.linspace(0.0, 1.0, 2001)
     noise = np.random.default_rng(0).normal(0.0, 0.2, t.size)
@@ -505,3 +476,7 @@ def test_a_noise_is_a_band_and_a_motion_is_a_line():
     np.testing.assert_allclose(mean, np.sin(9.0 * times), atol=0.2)
     held = np.repeat(noise[:1001], 2)[: t.size]  # a noise that a sampled law holds
     assert _panels.noise_band(t, held) is not None
+    fine = np.linspace(0.0, 1.0, 4 * (t.size - 1) + 1)
+    smooth = np.interp(fine, t, noise)  # four steps in one direction a sample
+    assert _panels.noise_band(fine, smooth) is not None
+    assert _panels.noise_band(t, np.sin(400.0 * t) * np.sin(9.0 * t)) is None

@@ -4,12 +4,13 @@ import re
 
 import numpy as np
 import pytest
+from loops_of_plants import flexible_joint
+from made_up_runs import chain, made_up
 from plant_cases import ANGLES, body, pendulum, symmetric
 
 import iblf_jax as ij
 from iblf_jax import plotting
 from iblf_jax.plotting._curves import curves_of
-from iblf_jax.presets.paper import customary_two_link
 
 
 @pytest.fixture(scope="module")
@@ -24,15 +25,7 @@ def body_run():
 
 @pytest.fixture(scope="module")
 def flexible_run():
-    plant = ij.plants.FlexibleJoint(customary_two_link(), stiffness=300.0, motor_inertia=0.02)
-    scenario = ij.Scenario(
-        plant=plant,
-        reference=ij.references.Sinusoid(offset=0.5, amplitude=0.3),
-        bounds=ij.Bounds(lower=ij.bounds.Constant(-0.2), upper=ij.bounds.Constant(1.2)),
-        controller=ij.controllers.BarrierBackstepping(k=(3.0, 20.0, 60.0, 150.0)),
-        initial=ij.Initial(q=[0.7, 0.3]),
-    )
-    return ij.simulate(scenario, duration=0.08, dt=1e-3)
+    return ij.simulate(flexible_joint(), duration=0.08, dt=1e-3)
 
 
 def labels_of(figure) -> list[str]:
@@ -40,38 +33,28 @@ def labels_of(figure) -> list[str]:
     return [axes.get_ylabel() for axes in figure.axes]
 
 
-def line_of(axes, label):
-    """The line of a panel with a label."""
-    return next(line for line in axes.get_lines() if line.get_label() == label)
-
-
 @pytest.mark.slow
-def test_the_overview_has_a_row_for_every_level(run):
-    labels = labels_of(run.plot())
+def test_the_overview_has_a_row_for_every_level_with_bounds_and_virtual_control(run):
+    figure = run.plot()
+    labels = labels_of(figure)
     assert labels[:3] == ["angle $x_1$ [rad]", "speed $x_2$ [rad/s]", "current $x_{3}$ [A]"]
     assert "input $u$ [V]" in labels
     assert "error $e_2$ [rad/s]" in labels
     # Only level 2 is disturbed.
     assert [x for x in labels if "$d_" in x] == [r"$d_{2}$ (broad), $\hat d_{2}$ [rad/s^2]"]
-
-
-@pytest.mark.slow
-def test_a_level_is_drawn_with_its_bounds_and_virtual_control(run):
-    current = run.plot().axes[2]
-    guide = line_of(current, r"virtual control $\alpha_{i-1}$")
-    alpha = np.asarray(run.x - run.e)[:, 2, 0]
-    assert np.allclose(guide.get_ydata(), alpha[: len(guide.get_ydata())])
-    assert np.allclose(line_of(current, "bounds").get_ydata(), -20.0)
+    current = figure.axes[2]
+    lines = {line.get_label(): line.get_ydata() for line in current.get_lines()}
+    guide = lines[r"virtual control $\alpha_{i-1}$"]
+    assert np.allclose(guide, np.asarray(run.x - run.e)[: len(guide), 2, 0])
+    assert np.allclose(lines["bounds"], -20.0)
     low, high = current.get_ylim()
-    assert low < -20.0
-    assert high > 20.0
+    assert low < -20.0 and high > 20.0
 
 
 @pytest.mark.slow
 def test_regions_are_named_by_the_robot_inside_a_plant(flexible_run):
-    scenario = flexible_run.scenario
     wall = ij.regions.HalfSpace(normal=[1.0, 0.0], offset=-0.1)
-    beside = ij.with_parts(scenario, regions=(wall,))
+    beside = ij.with_parts(flexible_run.scenario, regions=(wall,))
     run = ij.simulate(beside, duration=0.05, dt=1e-3)
     assert int(run.status) == 0
     legends = [axes.get_legend() for axes in run.plot().axes]
@@ -86,18 +69,11 @@ def test_a_level_without_bounds_shows_none_and_keeps_its_virtual_control_in_view
     law = ij.controllers.BarrierBackstepping(k=(3.0, 10.0, 30.0))
     only_third = pendulum(controller=law, bounds=(ANGLES, None, symmetric(20.0)))
     speed = ij.simulate(only_third, duration=0.5, dt=1e-2).plot().axes[1]
-    assert not [line for line in speed.get_lines() if line.get_label() == "bounds"]
-    guide = line_of(speed, r"virtual control $\alpha_{i-1}$").get_ydata()
+    lines = {line.get_label(): line.get_ydata() for line in speed.get_lines()}
+    assert "bounds" not in lines
+    guide = lines[r"virtual control $\alpha_{i-1}$"]
     low, high = speed.get_ylim()
-    assert low < np.min(guide)
-    assert high > np.max(guide)
-
-
-@pytest.mark.slow
-def test_components_of_different_units_have_labels_of_their_own(body_run):
-    labels = labels_of(body_run.plot())
-    assert labels[:3] == ["pose $x_1$ [m]", "pose $x_1$ [m]", "pose $x_1$ [rad]"]
-    assert "force $u$ [N, N, N m]" in labels
+    assert low < np.min(guide) and high > np.max(guide)
 
 
 @pytest.mark.slow
@@ -108,6 +84,9 @@ def test_figures_have_the_names_and_units_of_the_plant(run, body_run):
         "current $x_{3}$ [A]",
         "input $u$ [V]",
     ]
+    overview = labels_of(body_run.plot())
+    assert overview[:3] == ["pose $x_1$ [m]", "pose $x_1$ [m]", "pose $x_1$ [rad]"]
+    assert "force $u$ [N, N, N m]" in overview
     assert "north\n$u$ [N]" in labels_of(plotting.torques(body_run))
     assert "heading\n$x_2$ [rad/s]" in labels_of(plotting.velocities(body_run))
     assert plotting.positions(body_run).get_suptitle() == "Pose"
@@ -122,28 +101,10 @@ def test_figures_have_the_names_and_units_of_the_plant(run, body_run):
 
 @pytest.mark.slow
 def test_levels_of_plants_of_different_orders_are_refused(run, body_run):
-    one = pendulum(plant=ij.plants.StrictFeedback(_rows, _ones, n=1, order=2), **_ORDER_2)
-    other = ij.simulate(one, duration=0.1, dt=1e-2)
     with pytest.raises(ValueError, match="the same number of levels"):
-        plotting.levels({"third": run, "second": other})
+        plotting.levels({"third": run, "second": made_up(chain(1))})
     with pytest.raises(ValueError, match="a component, 0 to 2"):
         plotting.levels(body_run, 3)
-
-
-def _rows(t, x):
-    return 0.0 * x
-
-
-def _ones(t, x):
-    return 0.0 * x + 1.0
-
-
-_ORDER_2 = {
-    "controller": ij.controllers.BarrierBackstepping(k=(3.0, 10.0)),
-    "bounds": ANGLES,
-    "initial": ij.Initial(x=[[0.3], [0.0]]),
-    "disturbance": ij.disturbances.Nothing(),
-}
 
 
 @pytest.mark.slow

@@ -19,7 +19,7 @@ OF_THEIR_OWN = ("gpu.py", "monte_carlo.py", "throughput.py")
 another start."""
 BEFORE_A_RELEASE = {
     *("armour.py", "constraints.py", "laws.py", "monte_carlo.py", "proofs.py"),
-    *("robust_tuning.py", "starts.py", "throughput.py", "tuning.py"),
+    *("robust_tuning.py", "small_levels.py", "starts.py", "throughput.py", "tuning.py"),
 }
 """Their quick sizes take more than a quarter of a minute."""
 
@@ -83,12 +83,9 @@ def version(text):
 def test_results_that_are_withdrawn_are_not_there(monkeypatch):
     monkeypatch.syspath_prepend(FOLDER)
     withdrawn = importlib.import_module("withdrawn")
-    for folder, names in (
-        (FOLDER / "results", withdrawn.BENCHMARKS),
-        (FOLDER / "field" / "results", withdrawn.FIELD),
-    ):
-        assert names
-        assert not [name for name in names if (folder / f"{name}.json").exists()]
+    names = withdrawn.BENCHMARKS
+    assert names
+    assert not [name for name in names if (FOLDER / "results" / f"{name}.json").exists()]
 
 
 def test_a_commit_that_is_not_known_has_its_reason(monkeypatch, tmp_path):

@@ -31,27 +31,36 @@ def test_every_law_has_a_row_and_advice(scripts):
 def test_the_sentences_follow_the_numbers(scripts):
     _, choosing = scripts
     column = "error [mrad]"
-    rows = [
-        dict.fromkeys((*choosing.LOWER_IS_BETTER, choosing.LONGEST), 3.0) | {"law": law}
-        for law in ("a", "b", "c")
-    ]
+    numbers = dict.fromkeys((*choosing.LOWER_IS_BETTER, choosing.LONGEST), 3.0)
+    rows = [{"law": law, "factor": 1.0, **numbers} for law in ("a", "b", "c", "d")]
+    # A law with gains of its own has another effort, so that its error is not compared.
+    rows[3][column], rows[3]["factor"] = 0.5, choosing.OWN
     rows[1][column], rows[2][column], rows[0][choosing.LONGEST] = 1.0, "left", 0.0
     sentences = choosing.best_of_each_column(rows)
     assert "least with b (1), largest with a (3). Outside the bounds: c." in sentences[0]
-    assert "up to 3 ms: b; c. With none of the tested delays: a." in sentences[-1]
+    assert "up to 3 ms: b; c; d. With none of the tested delays: a." in sentences[-1]
     assert choosing.page(STORED).startswith("# Choosing a law")
 
 
-def test_the_saving_of_the_trigger_is_that_of_the_file(scripts):
+def test_the_four_questions_name_the_laws_of_the_table(scripts):
     _, choosing = scripts
-    rows = [
-        {"trigger": words, "messages per s": rate, "error [mrad]": error}
-        for words, rate, error in (("none", 1000.0, 0.5), ("T", 12.0, 3.0))
-    ]
-    found = choosing.saving(rows)
-    assert "`T` the first law sends 12 messages a second in place of 1000" in found
-    assert "3 mrad in place of 0.5 mrad" in found
-    assert choosing.saving(STORED["messages"]) in choosing.page(STORED)
+    rows = [dict(row) for row in STORED["rows"]]
+    questions = choosing.four_questions({**STORED, "rows": rows})
+    slow, delay = (next(x for x in questions if word in x) for word in ("*10 ms*", "*A delay*"))
+    assert "Backstepping(Integral); " in slow and "DynamicSurface" in slow
+    assert "Backstepping(Log)" not in slow  # it left the bounds
+    assert "ComputedTorque" not in slow  # it claims nothing about bounds
+    assert delay.endswith("up to 16 ms BarrierBackstepping(Integral, Integral) or SafetyFilter.")
+    by_name = {row["law"]: row for row in rows}
+    by_name["Backstepping(Log)"][choosing.SLOW] = 0.01
+    by_name["BarrierBackstepping(Integral, Integral)"][choosing.SLOW] = 0.001  # its gains are own
+    by_name["DynamicSurface"][choosing.SLOW] = "left"
+    by_name["DynamicSurface"][choosing.LONGEST] = 64.0
+    questions = choosing.four_questions({**STORED, "rows": rows})
+    slow, delay = (next(x for x in questions if word in x) for word in ("*10 ms*", "*A delay*"))
+    assert "Of those with a factor Backstepping(Log) has the least error (0.01 mrad)." in slow
+    assert "DynamicSurface" not in slow
+    assert delay.endswith("up to 64 ms DynamicSurface.")
 
 
 @pytest.mark.release

@@ -11,6 +11,7 @@ import inspect
 import re
 
 from conftest import ROOT
+from members import FAMILIES
 
 import iblf_jax as ij
 
@@ -90,19 +91,8 @@ def test_help_lists_the_fields_with_shape_unit_sign_and_default():
 
 
 def test_the_members_of_every_family_are_among_them():
-    families = (
-        ij.robots,
-        ij.references,
-        ij.bounds,
-        ij.disturbances,
-        ij.barriers,
-        ij.controllers,
-        ij.decays,
-        ij.observers,
-        ij.metrics,
-    )
-    for family in families:
-        assert set(family.MEMBERS.values()) <= set(components().values())
+    for _, registry, _ in FAMILIES.values():
+        assert set(registry.values()) <= set(components().values())
     others = {ij.Scenario, ij.Initial, ij.bounds.Bounds, ij.robots.Payload, ij.VectorField}
     assert others <= set(components().values())
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 import ast
 import functools
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -44,6 +45,7 @@ INTERNAL = ("jax._src", "jax.extend", "jax.interpreters", "jax.experimental")
 
 INTERNALS = {
     "core/disk_cache.py": "the cache of compiled programs",
+    "core/kept_programs.py": "how an executable is written and read",
     "core/taylor.py": "rules of Taylor coefficients",
     "kernels/jaxprs.py": "how a jaxpr stores equations, constants and inner functions",
     "kernels/primitives.py": "primitives and their rules",
@@ -137,39 +139,6 @@ def test_no_cycle_between_modules():
         reach(module)
 
 
-@pytest.mark.parametrize("library", ONLY_IN)
-def test_libraries_stay_in_their_place(library):
-    users = {
-        module_of(p)
-        for p, text in SOURCES.items()
-        if any(x.split(".")[0] == library for x in imports(text, at_the_top=False))
-    }
-    assert users <= set(ONLY_IN[library]), (
-        f"{library} belongs to {ONLY_IN[library]}, not to {users - set(ONLY_IN[library])}"
-    )
-
-
-def test_internals_of_jax_stay_in_their_modules():
-    users = {
-        str(path.relative_to(PACKAGE))
-        for path, text in SOURCES.items()
-        if any(x.startswith(INTERNAL) for x in imports(text, at_the_top=False))
-        or any(calls(text, name) for name in INTERNAL)
-    }
-    assert users <= set(INTERNALS)
-
-
-def test_equations_of_jaxprs_are_read_by_interpreters_only():
-    """The others ask `kernels.jaxprs`."""
-    interpreters = {"core/taylor.py", "kernels/from_jaxpr.py", "proofs/examination.py"}
-    users = {
-        str(path.relative_to(PACKAGE))
-        for path, text in SOURCES.items()
-        if re.search(r"\.(eqns|constvars|call_jaxpr)\b", text)
-    }
-    assert users <= set(INTERNALS) | interpreters
-
-
 def calls(source: str, name: str) -> list[int]:
     """Lines that use an attribute chain such as jax.lax.scan or jax.config.update."""
     last = name.split(".")[-1]
@@ -180,6 +149,32 @@ def calls(source: str, name: str) -> list[int]:
         for node in ast.walk(ast.parse(source))
         if isinstance(node, ast.Attribute) and node.attr == last and ast.unparse(node) == name
     ]
+
+
+def users(uses: Callable[[str], object]) -> set[str]:
+    """The files whose text uses something."""
+    return {str(path.relative_to(PACKAGE)) for path, text in SOURCES.items() if uses(text)}
+
+
+@pytest.mark.parametrize("library", ONLY_IN)
+def test_libraries_stay_in_their_place(library):
+    found = users(
+        lambda text: library in {x.split(".")[0] for x in imports(text, at_the_top=False)}
+    )
+    assert {Path(name).parts[0] for name in found} <= {*ONLY_IN[library]}
+
+
+def test_internals_of_jax_stay_in_their_modules():
+    found = users(lambda text: any(x.startswith(INTERNAL) for x in imports(text, at_the_top=False)))
+    found |= users(lambda text: any(calls(text, name) for name in INTERNAL))
+    assert found <= set(INTERNALS)
+
+
+def test_equations_of_jaxprs_are_read_by_interpreters_only():
+    """The others ask `kernels.jaxprs`."""
+    interpreters = {"core/taylor.py", "kernels/from_jaxpr.py", "proofs/examination.py"}
+    found = users(lambda text: re.search(r"\.(eqns|constvars|call_jaxpr)\b", text))
+    assert found <= set(INTERNALS) | interpreters
 
 
 def test_time_is_scanned_in_one_place():
@@ -195,29 +190,19 @@ def test_time_is_scanned_in_one_place():
         "simulation/integrators.py",
         "world/plants/markov_switched.py",
     }
-    users = {
-        str(p.relative_to(PACKAGE))
-        for p, text in SOURCES.items()
-        if calls(text, "jax.lax.scan") or calls(text, "lax.scan")
-    }
-    assert {p for p in users if not p.startswith(("engine/", "testing/"))} == allowed
+    found = users(lambda text: calls(text, "jax.lax.scan") or calls(text, "lax.scan"))
+    assert {name for name in found if not name.startswith(("engine/", "testing/"))} == allowed
 
 
 def test_the_session_is_left_alone():
     """jax.config belongs to the user: the command line, a program of its own, sets it, and the
     cache of compiled programs its fields; `initialize_worker` sets it where a user calls it in a
     worker's process; the options of a thread are read."""
-    users = {
-        p.relative_to(PACKAGE): text for p, text in SOURCES.items() if calls(text, "jax.config")
-    }
-    assert {p for p in users if p.parts[0] != "cli"} == {
-        Path("core/disk_cache.py"),
-        Path("core/devices.py"),
-        Path("core/thread_options.py"),
-        Path("studies/workers.py"),
-    }
-    for reader in ("core/devices.py", "core/thread_options.py"):
-        assert not calls(users[Path(reader)], "jax.config.update")
+    readers = {"core/devices.py", "core/thread_options.py"}
+    found = users(lambda text: calls(text, "jax.config"))
+    writers = {"core/disk_cache.py", "studies/workers.py"}
+    assert {name for name in found if not name.startswith("cli/")} == writers | readers
+    assert not readers & users(lambda text: calls(text, "jax.config.update"))
 
 
 def test_no_prints_and_no_star_imports():

@@ -4,14 +4,11 @@ the configuration of pip on, and says clearly when it cannot make an environment
 
 from __future__ import annotations
 
-import configparser
 import os
-import re
 import select
 import signal
 import subprocess
 import sys
-import tomllib
 
 import pytest
 from conftest import ROOT
@@ -31,31 +28,6 @@ def call(*words, **variables):
     return subprocess.run(
         command, env=os.environ | variables, capture_output=True, text=True, check=False
     )
-
-
-def test_the_extras_are_those_of_the_test_command_of_the_readme():
-    extras = tool.extras_of_the_tests()
-    assert f'-e ".[{extras}]"' in (ROOT / "README.md").read_text()
-    assert "test" in extras.split(",")
-
-
-def test_requirements_are_those_of_pyproject():
-    content = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    found = tool.requirements("test,sweep", False)
-    optional = content["optional-dependencies"]
-    for text in [*content["dependencies"], *optional["test"], *optional["sweep"]]:
-        assert text in found
-    assert set(optional["export"]).isdisjoint(found)
-    with pytest.raises(tool.UnavailableError, match="extra 'no_such_extra'; pyproject"):
-        tool.requirements("test,no_such_extra", False)
-
-
-def test_pre_releases_are_taken_of_jax_alone_and_above_its_limit():
-    usual, early = (set(tool.requirements("test", pre)) for pre in (False, True))
-    (limited,) = usual - early
-    assert re.match(r"jax>=.*<", limited)
-    assert early - usual == {"jax>=0.dev0", "jaxlib>=0.dev0"}
-    assert any(text.startswith("equinox") for text in early)
 
 
 # --- keys ----------------------------------------------------------------------------------------
@@ -94,39 +66,7 @@ def test_different_environments_have_different_keys(tmp_path, monkeypatch):
     assert tool.key_of(description()) != keys[-1]
 
 
-# --- the configuration of pip --------------------------------------------------------------------
-
-
-def test_the_configuration_of_pip_is_passed_on(tmp_path, monkeypatch):
-    wheels, own = tmp_path / "wheels", tmp_path / "pip.conf"
-    index = tmp_path / "index" / "simple"  # its links lead to a folder beside it
-    wheels.mkdir()
-    index.mkdir(parents=True)
-    own.write_text(
-        f"[global]\nfind-links = {wheels}\n  file://{wheels}\n  /no/such/folder\n"
-        "index-url = https://user:a%20b@example.org/simple\n"
-        f"extra-index-url = file://{index}\n[install]\nno-binary = a\n"
-    )
-    monkeypatch.setenv("PIP_CONFIG_FILE", str(own))
-    found = tool.PipConfiguration.of_machine()
-    assert {wheels, index.parent} <= set(found.paths)
-    assert index not in found.paths
-    found.write(tmp_path / "written.conf")
-    parser = configparser.RawConfigParser()
-    parser.read(tmp_path / "written.conf")
-    assert parser["global"]["index-url"] == "https://user:a%20b@example.org/simple"
-    assert parser["global"]["find-links"].split()[:2] == [str(wheels), f"file://{wheels}"]
-    assert parser["install"]["no-binary"] == "a"
-
-
 # --- the copy ------------------------------------------------------------------------------------
-
-
-def test_the_copy_has_tracked_and_new_files_only(machine, tmp_path):
-    tool.copy_tree(["pyproject.toml", "tools/newest_python"], tmp_path / "tree")
-    copied = tmp_path / "tree" / "tools" / "newest_python"
-    assert copied.read_bytes() == (ROOT / "tools" / "newest_python").read_bytes()
-    assert os.access(copied, os.X_OK)
 
 
 def test_the_command_has_the_environment_of_the_copy(machine, tmp_path, monkeypatch):

@@ -11,6 +11,7 @@ import copy
 import itertools
 import re
 import sys
+import tomllib
 from pathlib import Path
 
 import nbformat
@@ -38,6 +39,33 @@ def test_notebook_runs(name, tmp_path):
         output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs
     ]
     assert any("image/png" in output.get("data", {}) for output in shown), "no figure was shown"
+    assert not [output for output in shown if is_progress(output)]
+
+
+def is_progress(output: dict) -> bool:
+    """Whether an output of a cell is a bar, or a box, of progress."""
+    text = str(output.get("text", ""))
+    return "\r" in text or "%|" in text or any("widget" in kind for kind in output.get("data", {}))
+
+
+def test_a_bar_of_progress_is_found():
+    assert is_progress({"output_type": "stream", "text": "tune:  40%|####      | 4/10"})
+    assert is_progress({"data": {"application/vnd.jupyter.widget-view+json": {}}})
+    assert not is_progress({"output_type": "stream", "text": "97 % of the runs"})
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_notebook_is_installed_by_one_line_where_the_package_is_not(path):
+    cells = nbformat.read(path, as_version=4).cells
+    urls = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["urls"]
+    needed = set(re.findall(r"`(\w+)`", cells[1].source.split("Extras:")[1].split("Time:")[0]))
+    first = next(cell.source for cell in cells if cell.cell_type == "code")
+    found = re.search(r'^# %pip install "iblf_jax(\[[\w,]+\])? @ git\+(\S+)"$', first, re.MULTILINE)
+    assert found and found[2] == urls["Repository"]
+    start = (ROOT / "docs" / "start.md").read_text(encoding="utf-8")
+    assert f'pip install "iblf_jax @ git+{found[2]}"' in start
+    extras = set((found[1] or "[]")[1:-1].split(",")) - {""}
+    assert extras == needed - {"notebooks"}  # such a service has what opens a notebook
 
 
 def test_there_are_notebooks():

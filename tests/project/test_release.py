@@ -81,7 +81,8 @@ def test_readme_and_article_have_the_measured_numbers():
 
 def test_another_number_in_the_table_is_found():
     text = comparison.FILES[0].read_text(encoding="utf-8")
-    assert comparison.replaced(text.replace("12 ms", "11 ms", 1)) == text
+    changed = text.replace(" ms of a processor", " s of a processor", 1)
+    assert changed != text and comparison.replaced(changed) == text
     with pytest.raises(LookupError, match="has no place for the table"):
         comparison.replaced("nothing")
     wrong = comparison.COMPARISONS[0]._replace(ours={"row": "native"})

@@ -165,15 +165,6 @@ def test_what_all_depend_on_or_nobody_knows_selects_all(graph, changed):
     assert names(graph, "tests/folder/test_tune.py", changed) is None
 
 
-def test_a_change_of_several_files_selects_the_tests_of_each(graph):
-    assert names(graph, "tests/data/arm.urdf", "README.md") == {"data", "pages"}
-
-
-def test_what_is_used_directly_is_nearer(graph):
-    reaching = graph.reaching("iblf_jax/tuning/search.py")
-    assert reaching["tests/folder/test_tune.py"] < reaching["tests/folder/test_fixture.py"]
-
-
 # --- where a change begins ------------------------------------------------------------------------
 
 

@@ -36,10 +36,21 @@ AGAIN = {
 SETTINGS = "project/test_users_settings.py::test_the_testers_own_flags_come_last"
 
 
-def plain_environment() -> dict[str, str]:
-    """The environment without what this run of the tests has put into it."""
+def run_tests(*words: str, **variables: str) -> str:
+    """What a run of tests prints that has nothing of this one in its environment."""
     own = ("PYTEST_", "SLOW_")
-    return {name: value for name, value in os.environ.items() if not name.startswith(own)}
+    plain = {name: value for name, value in os.environ.items() if not name.startswith(own)}
+    options = ["-n", "0", "-p", "no:cacheprovider", "-m", "not release"]
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", *options, *words],
+        cwd=ROOT,
+        env=plain | variables,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stdout[-3000:]
+    return done.stdout
 
 
 def test_the_testers_own_flags_come_last():
@@ -59,45 +70,16 @@ def test_the_testers_own_flags_come_last():
     ],
 )
 def test_the_same_as_users_compile(what):
-    plain = plain_environment()
     names = [str(ROOT / "tests" / name) for name in (SETTINGS, *AGAIN[what])]
-    command = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-n",
-        "0",
-        "-p",
-        "no:cacheprovider",
-        "-m",
-        "not release",
-        *names,
-    ]
-    done = subprocess.run(
-        command,
-        cwd=ROOT,
-        env=plain | {"TEST_AS_USERS": "1"},
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-    assert done.returncode == 0, done.stdout[-3000:]
-    assert f"{len(names)} passed" in done.stdout
+    assert f"{len(names)} passed" in run_tests(*names, TEST_AS_USERS="1")
 
 
 def collected(files: str | None, *options: str) -> list[str]:
     """The tests that a run of two files has, in their order, with SLOW_FILES; None is without."""
-    command = [sys.executable, "-m", "pytest", "--collect-only", "-n", "0", "-m", "not release"]
     paths = [str(ROOT / "tests" / "control" / name) for name in ("test_laws.py", "test_decays.py")]
-    done = subprocess.run(
-        [*command, *options, *paths],
-        cwd=ROOT,
-        env=plain_environment() | ({} if files is None else {"SLOW_FILES": files}),
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    return [line for line in done.stdout.splitlines() if "::" in line]
+    variables = {} if files is None else {"SLOW_FILES": files}
+    printed = run_tests("--collect-only", *options, *paths, **variables)
+    return [line for line in printed.splitlines() if "::" in line]
 
 
 @pytest.mark.slow
@@ -117,16 +99,7 @@ def test_a_change_runs_the_slow_tests_of_the_files_that_it_reaches():
 def test_slow_tests_that_begin_late_are_skipped():
     """And the others run."""
     names = "test_a_base_that_does_not_exist_is_not_known or test_changes_of_this_package"
-    done = subprocess.run(
-        [
-            *(sys.executable, "-m", "pytest", "-n", "0", "-rs", "-m", "not release", "-k", names),
-            str(ROOT / "tests" / "project" / "test_select_tests.py"),
-        ],
-        cwd=ROOT,
-        env=plain_environment() | {"SLOW_MINUTES": "0"},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert "slow, and not begun within 0 minutes" in done.stdout
-    assert "1 passed, 1 skipped" in done.stdout
+    file = str(ROOT / "tests" / "project" / "test_select_tests.py")
+    printed = run_tests("-rs", "-k", names, file, SLOW_MINUTES="0")
+    assert "slow, and not begun within 0 minutes" in printed
+    assert "1 passed, 1 skipped" in printed

@@ -28,15 +28,8 @@ PROSE = re.compile(
     r"|way of|said by)\b",
     re.IGNORECASE,
 )
-UNFINISHED: frozenset[str] = frozenset()
-"""Folders whose names and prose are still to be revised."""
-FOLDERS = sorted(
-    {path.relative_to(PACKAGE).parts[0] for path in PACKAGE.rglob("*.py")} - UNFINISHED
-)
-PAGES = sorted(
-    [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")],
-    key=lambda path: str(path),
-)
+FOLDERS = sorted({path.relative_to(PACKAGE).parts[0] for path in PACKAGE.rglob("*.py")})
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")]
 
 
 def names_in(source: str) -> set[str]:
@@ -74,37 +67,18 @@ def private_words(text: str) -> list[str]:
     return [match.group(0) for match in PROSE.finditer(text)]
 
 
-def sources(folder: str):
+@pytest.mark.parametrize("folder", FOLDERS)
+def test_names_docstrings_and_comments_are_standard_terms(folder):
     place = PACKAGE / folder
-    return [place] if place.is_file() else sorted(place.rglob("*.py"))
-
-
-@pytest.mark.parametrize("folder", FOLDERS)
-def test_names_are_standard_terms(folder):
-    found = {}
-    for path in sources(folder):
-        name = path.relative_to(PACKAGE).as_posix()
-        names = private_names(path.read_text())
-        if names:
-            found[name] = sorted(names)
-    assert not found
-
-
-@pytest.mark.parametrize("folder", FOLDERS)
-def test_docstrings_and_comments_use_standard_terms(folder):
-    words = {
-        path.relative_to(PACKAGE).as_posix(): private_words(prose_in(path.read_text()))
-        for path in sources(folder)
-    }
-    assert not {name: found for name, found in words.items() if found}
+    for path in [place] if place.is_file() else place.rglob("*.py"):
+        source = path.read_text()
+        assert not private_names(source), path
+        assert not private_words(prose_in(source)), path
 
 
 def test_pages_use_standard_terms():
-    words = {
-        path.relative_to(ROOT).as_posix(): private_words(path.read_text(encoding="utf-8"))
-        for path in PAGES
-    }
-    assert not {name: found for name, found in words.items() if found}
+    found = {path: private_words(path.read_text(encoding="utf-8")) for path in PAGES}
+    assert not {path: words for path, words in found.items() if words}
 
 
 def test_notebooks_use_standard_terms():

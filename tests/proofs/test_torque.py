@@ -18,16 +18,16 @@ from iblf_jax.proofs.torque import MARGINS, TorqueRange, without_limits
 Saturated, Motor = ij.controllers.Saturated, ij.actuators.Motor
 
 
-def limited(scenario, limit, **more):
+def limited(scenario, limit, actuator=None, **more):
     law = Saturated(scenario.controller, limit=limit, **more)
-    return dataclasses.replace(scenario, controller=law)
+    return dataclasses.replace(scenario, controller=law, actuator=actuator or scenario.actuator)
 
 
 @functools.cache
-def proof(limit=None, level=0.5, weight=3e-3, **options):
+def proof(limit=None, weight=3e-3, **options):
     scenario = pendulum() if limit is None else limited(pendulum(), limit)
-    options = {"parameters": within(3.0), "progress": False} | options
-    return ij.prove(scenario, level=level, weight=weight, **options)
+    options = {"parameters": within(3.0), "level": 0.5, "progress": False} | options
+    return ij.prove(scenario, weight=weight, **options)
 
 
 # --- the bound --------------------------------------------------------------------------------
@@ -47,7 +47,7 @@ def test_bound_over_boxes_contains_the_torque_of_their_points(name):
         torque = problem.torques(points, inside)
         rows = np.array([coordinates_of(point, n) for point in points])
         x = np.insert(rows, rows.shape[1] - n - 1, max(share, 1e-6 / level**0.5), axis=1)
-        function, lower, upper, _ = problem.torque_search
+        lower, upper, _ = problem.whole_set
         width = np.concatenate([upper - lower, np.zeros(n + 1)])
         size = width * generator.choice([0.0, 1e-6, 1e-3, 1e-2, 0.1], (len(x), 1))
         below, above = generator.uniform(size=(2, *x.shape)) * size
@@ -55,7 +55,7 @@ def test_bound_over_boxes_contains_the_torque_of_their_points(name):
         # The level is not divided by share^2 where share is an interval.
         low[:, -n - 2] = np.maximum(low[:, -n - 2], 0.0)
         constants = [*problem.constants(WEIGHT, level), *ends]
-        _, (bounds, _) = enclose(function, low, high, constants)
+        _, (bounds, _) = enclose(problem.torque.excess, low, high, constants)
         excess = np.maximum(torque - ends[1], ends[0] - torque).max(axis=1) / 4.0
         assert not np.any(bounds[:, 0] < excess - 1e-9 * np.abs(excess))
         is_narrow = size[:, 0] == 0.0
@@ -119,6 +119,17 @@ class TwoLinks:
         M, h, G = self.dynamics(q, factor)
         return np.einsum("bij,bj->bi", M, acceleration) + self.coriolis(h, v, v) + G
 
+    def states(self, t, s, level, weight):
+        """q, e2 and f_tilde where V_w = level |s|^2, s (count, 6)."""
+        q_d, _, _, k_l, k_u, _, _ = self.tube(t)
+        xi = np.sign(s[:, :2]) * np.sqrt(-np.expm1(-level * s[:, :2] ** 2))
+        q = q_d + xi * np.where(xi > 0.0, k_u, k_l)
+        M0, _, _ = self.dynamics(q, np.ones_like(q))
+        scaled = np.sqrt(2.0 * level) * s[:, 2:4]
+        root = np.swapaxes(np.linalg.cholesky(M0), 1, 2)
+        e2 = np.linalg.solve(root, scaled[..., None])[..., 0]
+        return q, e2, np.sqrt(2.0 * level / weight) * s[:, 4:]
+
     def random(self, count, level, weight, width, seed):
         """Torques at points of {V_w <= level}, every second one on its boundary."""
         generator = np.random.default_rng(seed)
@@ -126,29 +137,16 @@ class TwoLinks:
         s = generator.normal(size=(count, 6))
         s /= np.linalg.norm(s, axis=1, keepdims=True)
         s[::2] *= generator.uniform(size=(len(s[::2]), 1))
-        q_d, _, _, k_l, k_u, _, _ = self.tube(t)
-        xi = np.sign(s[:, :2]) * np.sqrt(-np.expm1(-level * s[:, :2] ** 2))
-        q = q_d + xi * np.where(xi > 0.0, k_u, k_l)
-        M0, _, _ = self.dynamics(q, np.ones_like(q))
-        scaled = np.sqrt(2.0 * level) * s[:, 2:4]
-        root = np.linalg.cholesky(M0)
-        e2 = np.linalg.solve(np.swapaxes(root, 1, 2), scaled[..., None])[..., 0]
-        f_tilde = np.sqrt(2.0 * level / weight) * s[:, 4:]
         factor = 1.0 + width * generator.choice([-1.0, 0.0, 1.0], (count, 2))
-        return self.torque(t, q, e2, f_tilde, factor)
-
-
-def proof_of_paper_loop(level, **options):
-    masses = {"plant.mass, plant.inertia": ij.factor(ij.interval(0.99, 1.01))}
-    return ij.prove(
-        paper_loop(), level=level, weight=3e-3, parameters=masses, progress=False, **options
-    )
+        return self.torque(t, *self.states(t, s, level, weight), factor)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("level", [0.1, pytest.param(1.0, marks=pytest.mark.release)])
 def test_the_torque_of_two_links_is_bounded_and_the_bound_is_tight(level):
-    found = proof_of_paper_loop(level)
+    masses = {"plant.mass, plant.inertia": ij.factor(ij.interval(0.99, 1.01))}
+    options = {"level": level, "weight": 3e-3, "parameters": masses, "progress": False}
+    found = ij.prove(paper_loop(), **options)
     assert found.proved and found.torque.is_proved
     torque = TwoLinks()
     samples = np.concatenate([torque.random(100_000, level, 3e-3, 0.01, seed) for seed in range(5)])
@@ -160,12 +158,9 @@ def test_the_torque_of_two_links_is_bounded_and_the_bound_is_tight(level):
     # Sampled with other equations, at the weights 1.9e-3 and 3e-3
     expected = {1.0: [52.0, 51.0], 0.1: [17.5, 14.7]}[level]
     np.testing.assert_allclose(found_largest, expected, rtol=0.1)
-    state = found.problem.state_of(
-        found.problem.sample(0, 1)[0], found.problem.constants(3e-3, 1.0)
-    )
-    of_package = found.problem.torques(
-        found.problem.sample(0, 1), found.problem.constants(3e-3, 1.0)
-    )
+    points, constants = found.problem.sample(0, 1), found.problem.constants(3e-3, 1.0)
+    state = found.problem.state_of(points[0], constants)
+    of_package = found.problem.torques(points, constants)
     factor = np.array([[state.parameters[f"plant.mass[{i}]"] for i in range(2)]]) / torque.mass
     t, q = np.array([state.t]), state.q[None]
     e2 = state.dq[None] - torque.alpha(t, q)
@@ -193,8 +188,7 @@ def test_no_run_exceeds_the_bound_and_the_law_commands_what_the_plant_needs():
 def test_limits_of_law_and_motor_are_joined():
     scenario = pendulum()
     assert without_limits(scenario)[1] is None
-    loop = limited(scenario, 50.0, lower_limit=-20.0)
-    loop = dataclasses.replace(loop, actuator=Motor(limit=45.0))
+    loop = limited(scenario, 50.0, lower_limit=-20.0, actuator=Motor(limit=45.0))
     free, limits = without_limits(loop)
     np.testing.assert_array_equal(limits, [[-20.0], [45.0]])
     assert type(free.actuator) is Ideal
@@ -203,17 +197,21 @@ def test_limits_of_law_and_motor_are_joined():
     assert type(without_limits(slow)[0].actuator) is Motor
 
 
-def test_what_changes_the_torque_inside_its_limits_is_refused():
-    options = {"level": 0.5, "parameters": within(1.0)}
-    with pytest.raises(ValueError, match=r"controller\.edge"):
-        ij.prove(limited(pendulum(), 50.0, edge="smooth"), **options)
-    apart = dataclasses.replace(
-        limited(pendulum(), 9.0, lower_limit=8.0), actuator=Motor(limit=7.0)
-    )
-    with pytest.raises(ValueError, match="limits that overlap"):
-        ij.prove(apart, **options)
-    with pytest.raises(ValueError, match="any torque"):
-        ij.prove(limited(pendulum(), 50.0), disturbance_rate=1.0, **options)
+@pytest.mark.parametrize(
+    ("scenario", "options", "words"),
+    [
+        (limited(pendulum(), 50.0, edge="smooth"), {}, r"controller\.edge"),
+        (
+            limited(pendulum(), 9.0, lower_limit=8.0, actuator=Motor(limit=7.0)),
+            {},
+            "limits that overlap",
+        ),
+        (limited(pendulum(), 50.0), {"disturbance_rate": 1.0}, "any torque"),
+    ],
+)
+def test_what_changes_the_torque_inside_its_limits_is_refused(scenario, options, words):
+    with pytest.raises(ValueError, match=words):
+        ij.prove(scenario, level=0.5, parameters=within(1.0), **options)
 
 
 @pytest.mark.slow

@@ -20,6 +20,7 @@ from iblf_jax.control.controllers.event_compensated import TANH_GAP, excess
 from iblf_jax.simulation.closed_loop import initial_state, run_sampled_law
 from iblf_jax.simulation.metrics import Events
 from iblf_jax.simulation.scenario import canonical
+from iblf_jax.testing.metrics import folded, samples
 
 PERIOD = 4e-3
 PAPER = ij.with_parts(ij.presets.zhang_yan_2024(variant="corrected"), sampling=ij.Sampling(1e-3))
@@ -27,32 +28,33 @@ TRIGGER = ij.EventTrigger(relative=0.1, absolute=[0.3, 0.1])
 TRIGGERED = ij.with_parts(PAPER, sampling=ij.Sampling(1e-3, trigger=TRIGGER))
 
 
-def free_case():
-    """The pendulum of order 3 without disturbance, with a bound of its first level only."""
-    case = chains.CASES["pendulum"]
-    return dataclasses.replace(
-        case,
-        bounds=(case.bounds[0], None, None),
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "compensated", [False, pytest.param(True, marks=pytest.mark.release)], ids=["plain", "smooth"]
+)
+def test_a_chain_of_order_three_is_that_of_the_independent_program(compensated):
+    """The pendulum without disturbance, with a bound of its first level only: states, commands and
+    events."""
+    case = dataclasses.replace(
+        chains.CASES["pendulum"],
+        bounds=(chains.CASES["pendulum"].bounds[0], None, None),
         barriers=(chains.mapping, chains.quadratic, chains.quadratic),
         k=((2.0,), (5.0,), (10.0,)),
     )
-
-
-def free_scenario(case, law=lambda inner: inner, **trigger):
-    """The same loop in the package's terms, with an event trigger."""
-    inner = controllers.BarrierBackstepping(k=case.k, c=case.c, weights=case.w)
-    return chain_cases.scenario(
+    law = controllers.BarrierBackstepping(k=case.k, c=case.c, weights=case.w)
+    delta, m, options = 0.01, 0.002, {}
+    if compensated:
+        delta, m, m_bar, epsilon = 0.05, 0.02, 0.03, 0.5
+        law = controllers.EventCompensated(law, relative=delta, absolute=m_bar, epsilon=epsilon)
+        options["adjust"] = lambda z, v: other.compensated(z, v, delta, m_bar, epsilon)
+    scenario = chain_cases.scenario(
         "pendulum",
-        controller=law(inner),
+        controller=law,
         bounds=chain_cases.bounds_of(case),
         disturbance=ij.disturbances.Nothing(),
-        sampling=ij.Sampling(PERIOD, trigger=ij.EventTrigger(**trigger)),
+        sampling=ij.Sampling(PERIOD, trigger=ij.EventTrigger(relative=delta, absolute=m)),
     )
-
-
-def against_the_independent_program(scenario, expected):
-    """A run of the scenario; states, commands and events are those of the program."""
-    states, commands, sent = expected
+    states, commands, sent = other.triggered_chain(case, PERIOD, delta, m, count=250, **options)
     run = ij.simulate(scenario, duration=PERIOD * len(commands), dt=5e-4, throw=True)
     every = round(PERIOD / 5e-4)
     np.testing.assert_allclose(run.x[::every], states, atol=1e-7)
@@ -61,58 +63,32 @@ def against_the_independent_program(scenario, expected):
     np.testing.assert_array_equal(np.flatnonzero(np.diff(number, prepend=0.0)), sent)
     between = other.intervals(sent, PERIOD)
     np.testing.assert_allclose(run.metrics.shortest_interval, min(between))
-    last = float(run.events[-1]) - len(sent)
-    if last == 0:
+    if float(run.events[-1]) == len(sent):
         np.testing.assert_allclose(run.metrics.mean_interval, np.mean(between))
     assert 5 < len(sent) < 0.8 * len(commands)
-    return run
 
 
-@pytest.mark.slow
-def test_a_chain_of_order_three_is_that_of_the_independent_program():
-    case = free_case()
-    expected = other.triggered_chain(case, PERIOD, 0.01, 0.002, count=250)
-    against_the_independent_program(free_scenario(case, relative=0.01, absolute=0.002), expected)
+@ij.component
+class Given:
+    """A law with a given input and a given slope."""
 
+    v: ij.Leaf
+    z: ij.Leaf
 
-@pytest.mark.release
-def test_a_compensated_chain_is_that_of_the_independent_program():
-    case, delta, m, m_bar, epsilon = free_case(), 0.05, 0.02, 0.03, 0.5
+    def init(self, q, dq, context):
+        return ()
 
-    def adjust(z, v):
-        return other.compensated(z, v, delta, m_bar, epsilon)
-
-    def law(inner):
-        return controllers.EventCompensated(inner, relative=delta, absolute=m_bar, epsilon=epsilon)
-
-    expected = other.triggered_chain(case, PERIOD, delta, m, count=250, adjust=adjust)
-    against_the_independent_program(free_scenario(case, law, relative=delta, absolute=m), expected)
+    def command(self, t, q, dq, f_hat, context, state):
+        never = jnp.zeros_like(self.v, bool)
+        return controllers.Command(self.v, q, q, never, never)._replace(input_slope=self.z), ()
 
 
 def test_the_compensation_bounds_what_a_held_command_adds(rng):
-    """(E.2) at random z, v and held commands within the threshold."""
+    """(E.3) at random z, v and held commands within the threshold."""
     size = (20_000,)
     z, v = rng.normal(size=size) * 10.0 ** rng.uniform(-3, 1, size), rng.normal(size=size) * 5
     delta, m, epsilon = rng.uniform(0, 0.9, (3, *size))
     m_bar = m / (1 - delta) * rng.uniform(1.0, 2.0, size)
-
-    @ij.component
-    class Given:
-        """A law with a given input and a given slope."""
-
-        v: ij.Leaf
-        z: ij.Leaf
-
-        def init(self, q, dq, context):
-            """No state."""
-            return ()
-
-        def command(self, t, q, dq, f_hat, context, state):
-            """The given numbers."""
-            never = jnp.zeros_like(self.v, bool)
-            command = controllers.Command(self.v, q, q, never, never)
-            return command._replace(input_slope=self.z), ()
-
     law = controllers.EventCompensated(Given(v, z), delta, m_bar, epsilon)
     context = ij.presets.zhang_yan_2024().context
     u = np.asarray(law.command(0.0, jnp.zeros((2, 2)), jnp.zeros(2), context, ())[0].tau)
@@ -127,34 +103,23 @@ def test_the_compensation_bounds_what_a_held_command_adds(rng):
     assert np.max(grows / epsilon) > TANH_GAP
 
 
-@pytest.mark.slow
-def test_a_threshold_of_zero_sends_every_command_that_changes():
-    always = ij.with_parts(PAPER, sampling=ij.Sampling(1e-3, trigger=ij.EventTrigger()))
-    run = ij.simulate(always, duration=0.2, dt=1e-3)
-    same = ij.simulate(PAPER, duration=0.2, dt=1e-3)
-    np.testing.assert_array_equal(run.q, same.q)
-    assert float(run.metrics.event_count) == 201
+@ij.component
+class Failing:
+    """A law that computes NaN from 10 ms on."""
+
+    law: controllers.TrackingLaw
+
+    def init(self, *arguments):
+        return self.law.init(*arguments)
+
+    def command(self, t, *arguments):
+        command, rate = self.law.command(t, *arguments)
+        return command._replace(tau=jnp.where(t > 0.01, jnp.nan, command.tau)), rate
 
 
 @pytest.mark.slow
 def test_a_command_that_is_not_finite_is_not_held():
     """A run whose law computes NaN stops with a trigger as it does without one."""
-
-    @ij.component
-    class Failing:
-        """A law that computes NaN from a time on."""
-
-        law: controllers.TrackingLaw
-
-        def init(self, *arguments):
-            """The state of the law."""
-            return self.law.init(*arguments)
-
-        def command(self, t, *arguments):
-            """The command of the law; NaN after 10 ms."""
-            command, rate = self.law.command(t, *arguments)
-            return command._replace(tau=jnp.where(t > 0.01, jnp.nan, command.tau)), rate
-
     scenario = ij.with_parts(TRIGGERED, controller=Failing(TRIGGERED.controller))
     with pytest.warns(ij.SimulationWarning, match="ran away"):
         run = ij.simulate(scenario, duration=0.05, dt=1e-3)
@@ -190,28 +155,16 @@ def test_the_derivative_of_a_held_command():
         scenario = ij.with_parameters(TRIGGERED, {"controller.K2": K2})
         return ij.simulate(scenario, duration=0.05, dt=1e-3).metrics.ise
 
-    K2, h = jnp.array([20.0, 20.0]), 1e-6
-    slope = jax.jacfwd(end)(K2)[:, 0]
-    move = jnp.array([h, 0.0])
-    differences = (end(K2 + move) - end(K2 - move)) / (2 * h)
-    np.testing.assert_allclose(slope, differences, rtol=1e-4, atol=1e-10)
+    K2, move = jnp.array([20.0, 20.0]), jnp.array([1e-6, 0.0])
+    differences = (end(K2 + move) - end(K2 - move)) / 2e-6
+    np.testing.assert_allclose(jax.jacfwd(end)(K2)[:, 0], differences, rtol=1e-4, atol=1e-10)
 
 
 def test_a_run_with_one_event_has_no_interval():
-    fold = Events()
-    sample = ij.testing.metrics.samples(np.random.default_rng(0))
-    first = jax.tree.map(lambda x: x[0], sample)
-    found = fold.finish(fold.update(fold.init(first), first))
+    first = jax.tree.map(lambda x: x[:1], samples(np.random.default_rng(0), 1))
+    found = folded((Events(),), first)
     assert float(found["event_count"]) == 1.0
-    assert np.isinf(found["mean_interval"])
-    assert np.isinf(found["shortest_interval"])
-
-
-@pytest.mark.parametrize("field", ["relative", "absolute"])
-def test_bad_thresholds_are_refused(field):
-    value = {"relative": 1.0, "absolute": -0.1}[field]
-    with pytest.raises(ValueError, match=f"EventTrigger.{field}"):
-        ij.EventTrigger(**{field: value})
+    assert np.isinf(found["mean_interval"]) and np.isinf(found["shortest_interval"])
 
 
 def test_a_law_without_a_lyapunov_function_has_no_compensation():
@@ -222,26 +175,22 @@ def test_a_law_without_a_lyapunov_function_has_no_compensation():
         ij.simulate(ij.with_parts(PAPER, controller=law), duration=0.1, dt=1e-3)
 
 
-@pytest.mark.slow
-def test_a_certificate_says_that_the_compensation_changes_the_input():
-    law = controllers.EventCompensated(
-        TRIGGERED.controller, relative=0.1, absolute=0.4, epsilon=0.5
-    )
-    scenario = ij.with_parts(TRIGGERED, controller=law, sampling=None)
-    line = ij.certify(scenario, duration=0.05, dt=1e-3)["inequality, case 2"]
-    assert line.verdict == "not applicable"
-    assert "or EventCompensated changed the input of Backstepping all the time" in line.note
-
-
-def test_a_certificate_says_nothing_of_held_commands_behind_a_lag():
-    motor = ij.actuators.Motor(bandwidth=500.0)
-    run = SimpleNamespace(scenario=ij.with_parts(TRIGGERED, actuator=motor))
-    assert _certify._trigger_lines(run) == ()
-
-
 @pytest.mark.release
 def test_a_certificate_states_what_held_commands_may_add():
     run = ij.simulate(TRIGGERED, duration=0.1, dt=1e-3)
     line = ij.certify(TRIGGERED, run)["event trigger"]
     threshold = 0.1 * np.abs(run.tau) + np.array([0.3, 0.1])
     np.testing.assert_allclose(line.value, np.max(np.sum(np.abs(run.e2) * threshold, axis=1)))
+
+
+@pytest.mark.parametrize("field", ["relative", "absolute"])
+def test_bad_thresholds_are_refused(field):
+    value = {"relative": 1.0, "absolute": -0.1}[field]
+    with pytest.raises(ValueError, match=f"EventTrigger.{field}"):
+        ij.EventTrigger(**{field: value})
+
+
+def test_a_certificate_says_nothing_of_held_commands_behind_a_lag():
+    motor = ij.actuators.Motor(bandwidth=500.0)
+    run = SimpleNamespace(scenario=ij.with_parts(TRIGGERED, actuator=motor))
+    assert _certify._trigger_lines(run) == ()

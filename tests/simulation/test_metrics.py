@@ -11,6 +11,7 @@ import pytest
 from conftest import SHORT
 
 import iblf_jax as ij
+from iblf_jax.testing.metrics import folded, samples
 from iblf_jax.tuning.quantities import Quantities
 
 
@@ -27,7 +28,6 @@ def recorded(short_run):
 RECORDED = ("t", "q", "tau", "e1", "xi", "lower", "upper", "disturbance", "disturbance_estimate")
 
 
-@pytest.mark.slow
 def test_integrals_and_peaks(short_run, recorded):
     r, dt = recorded
     metrics, size, t = short_run.metrics, np.abs(r["e1"]), r["t"][:, None]
@@ -48,44 +48,25 @@ def test_integrals_and_peaks(short_run, recorded):
         "first_violation_time": np.inf,
         "first_violation_joint": -1,
         "saturated_share": np.zeros(2),
+        "settling_time": np.full(2, np.inf),
+        "overshoot": np.zeros(2),
     }
     for name, value in expected.items():
         np.testing.assert_allclose(metrics[name], value, rtol=1e-9, err_msg=name)
-    assert set(metrics) == {
-        *expected,
-        "settling_time",
-        "overshoot",
-        "numerical_error",
-        "relative_numerical_error",
-    }
+    assert set(metrics) == {*expected, "numerical_error", "relative_numerical_error"}
+    assert set(metrics.units) == set(metrics)
 
 
-def test_every_metric_has_a_unit(short_run):
-    assert set(short_run.metrics.units) == set(short_run.metrics)
-
-
-@pytest.mark.slow
-def test_settling_and_overshoot(paper_run, short_run):
-    """On a run that settles, and on one that ends outside."""
-    metrics = ij.simulate(paper_run.scenario, duration=20.0, dt=1e-3, record_every=10).metrics
-    e1, t = np.asarray(paper_run.e1), np.asarray(paper_run.t)
-    last = np.asarray([t[np.flatnonzero(np.abs(e1[:, i]) >= 0.01)[-1]] for i in range(2)])
-    assert np.all((metrics.settling_time > last) & (metrics.settling_time <= last + 0.011))
-    np.testing.assert_allclose(metrics.overshoot, np.max(-np.sign(e1[0]) * e1, axis=0), rtol=1e-2)
-    assert np.all(np.isinf(np.asarray(short_run.metrics.settling_time)))
+def sample_of(rows, i=0):
+    return jax.tree.map(lambda x: x[i], rows)
 
 
 def test_settling_counts_from_the_sample_after_the_last_one_outside():
-    from iblf_jax.testing.metrics import samples
-
     some = samples(np.random.default_rng(0))
-    fold = ij.metrics.Settling(tolerance=0.05)
     e1 = np.where(np.arange(40)[:, None] < [10, 40], 0.1, 0.01)
     some = dataclasses.replace(some, e=some.e.at[:, 0].set(e1))
-    acc = fold.init(_row(some, 0))
-    for i in range(40):
-        acc = fold.update(acc, _row(some, i))
-    np.testing.assert_allclose(fold.finish(acc)["settling_time"], [0.1, np.inf])
+    found = folded((ij.metrics.Settling(tolerance=0.05),), some)
+    np.testing.assert_allclose(found["settling_time"], [0.1, np.inf])
 
 
 @pytest.mark.parametrize(
@@ -94,9 +75,7 @@ def test_settling_counts_from_the_sample_after_the_last_one_outside():
 def test_margins_go_on_through_zero(q, slope):
     """Bounds 0.2 and 0.85: past the wall the margin is negative and its gradient still says which
     way is back."""
-    from iblf_jax.testing.metrics import samples
-
-    fold, sample = ij.metrics.Margin(), _row(samples(np.random.default_rng(0)), 0)
+    fold, sample = ij.metrics.Margin(), sample_of(samples(np.random.default_rng(0)))
 
     def margin(q):
         now = dataclasses.replace(sample, x=sample.x.at[0].set(jnp.stack([q, jnp.asarray(0.5)])))
@@ -107,60 +86,62 @@ def test_margins_go_on_through_zero(q, slope):
     assert float(gradient) == slope
 
 
-def _row(samples, i):
-    return jax.tree.map(lambda x: x[i], samples)
+@pytest.mark.parametrize(
+    ("name", "fold", "place"),
+    [
+        ("violation", ij.metrics.Margin(), {"joint": 2}),
+        ("velocity_violation", ij.metrics.VelocityMargin(), {"joint": 2}),
+        ("level_violation", ij.metrics.LevelMargin(), {"level": 3, "component": 2}),
+        ("region_violation", ij.metrics.RegionMargin(), {"region": 1}),
+    ],
+)
+def test_the_first_violation_has_its_time_and_place(name, fold, place):
+    """Component 2 of every level, and region 1, from the second instant on; at the third one all
+    others."""
+    some = jax.tree.map(lambda x: x[:3], samples(np.random.default_rng(0), 3))
+    middle = 0.5 * (some.level_lower + some.level_upper)
+    x = middle.at[1:, :, 2].add(5.0).at[2].add(6.0)
+    walls = jnp.asarray([[0.1, 0.1], [0.1, -0.1], [-0.2, -0.2]])
+    found = folded((fold,), dataclasses.replace(some, x=x, region_margin=walls))
+    assert found[f"first_{name}_time"] == some.t[1]
+    assert {key: int(found[f"first_{name}_{key}"]) for key in place} == place
 
 
 def test_metrics_do_not_depend_on_what_is_recorded(paper, short_run):
     """7 does not divide 500: the last block is incomplete."""
     sparse = ij.simulate(paper, **SHORT, record_every=7)
     assert sparse.t.size == 500 // 7 + 1
+    close = np.testing.assert_allclose
     for name in short_run.metrics:
-        np.testing.assert_allclose(
-            sparse.metrics[name], short_run.metrics[name], rtol=1e-10, err_msg=name
-        )
+        close(sparse.metrics[name], short_run.metrics[name], rtol=1e-10, err_msg=name)
     for name in ("t", "q", "dq", "tau", "e2", "V", "disturbance_estimate", "observer_state"):
-        np.testing.assert_allclose(
-            getattr(sparse, name),
-            np.asarray(getattr(short_run, name))[::7],
-            rtol=1e-9,
-            atol=1e-12,
-            err_msg=name,
-        )
+        every = np.asarray(getattr(short_run, name))[::7]
+        close(getattr(sparse, name), every, rtol=1e-9, atol=1e-12, err_msg=name)
     assert int(sparse.status) == int(short_run.status)
 
 
-def test_recorded_fields_agree_with_each_other(short_run):
-    r = short_run
-    np.testing.assert_allclose(r.e1, r.q - r.q_d, atol=1e-15)
-    np.testing.assert_allclose(r.e2, r.dq - r.alpha, atol=1e-13)
-    np.testing.assert_allclose(r.t, np.arange(501) * 1e-3, atol=1e-12)
-    xi = np.where(r.e1 > 0, r.e1 / (r.upper - r.q_d), r.e1 / (r.q_d - r.lower))
-    np.testing.assert_allclose(r.xi, xi, rtol=1e-12)
-    assert r.controller_state == ()
-    assert r.observer_state.shape == r.q.shape
+TWICE = (ij.metrics.Settling(tolerance=0.01), ij.metrics.Settling(tolerance=0.1))
 
 
-def test_folds_that_collide_or_are_not_folds_are_refused(paper):
-    twice = (ij.metrics.Settling(tolerance=0.01), ij.metrics.Settling(tolerance=0.1))
-    for bad, word in (
-        (twice, "settling_time"),
+@pytest.mark.parametrize(
+    ("folds", "words"),
+    [
+        (TWICE, "settling_time"),
         (ij.metrics.Tracking(), "brackets"),
-        (("rmse",), "metrics[0]"),
+        (("rmse",), r"metrics\[0\]"),
         ((ij.metrics.Tracking,), "instance"),
         (3, "tuple"),
-    ):
-        with pytest.raises(ValueError, match="metrics") as caught:
-            ij.simulate(paper, **SHORT, metrics=bad)
-        assert word in str(caught.value)
+    ],
+)
+def test_folds_that_collide_or_are_not_folds_are_refused(paper, folds, words):
+    with pytest.raises(ValueError, match=rf"(?s)metrics.*{words}|{words}.*metrics"):
+        ij.simulate(paper, **SHORT, metrics=folds)
 
 
 def test_access_by_name_and_by_attribute(short_run):
     metrics = short_run.metrics
     assert metrics.rmse is metrics["rmse"]
-    assert "rmse" in metrics
-    assert "rmse" in dir(metrics)
-    assert "rad" in repr(metrics)
+    assert "rmse" in metrics and "rmse" in dir(metrics) and "rad" in repr(metrics)
     with pytest.raises(KeyError, match="rmse"):
         metrics["nothing"]
     with pytest.raises(AttributeError, match="rmse"):
@@ -172,12 +153,10 @@ def test_access_by_name_and_by_attribute(short_run):
 
 @pytest.mark.slow
 def test_the_effort_above_gravity_by_hand(rng):
-    fold, samples = ij.metrics.AboveGravity(), ij.testing.metrics.samples(rng)
-    start = fold.init(jax.tree.map(lambda x: x[0], samples))
-    total, _ = jax.lax.scan(lambda acc, x: (fold.update(acc, x), None), start, samples)
-    square = np.sum((np.asarray(samples.tau) - np.asarray(samples.gravity)) ** 2, axis=1)
-    expected = np.sqrt(np.sum(samples.dt * square) / np.sum(samples.dt))
-    found = fold.finish(total)["effort_above_gravity"]
+    some = samples(rng)
+    square = np.sum((np.asarray(some.tau) - np.asarray(some.gravity)) ** 2, axis=1)
+    expected = np.sqrt(np.sum(some.dt * square) / np.sum(some.dt))
+    found = folded((ij.metrics.AboveGravity(),), some)["effort_above_gravity"]
     np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 
@@ -191,7 +170,10 @@ LOOPS = {
 }
 """Parts of scenarios in which torque and law signals jump, and in which the disturbance does,
 too."""
-INTEGRALS = ("rmse", "ise", "iae", "itae", "effort", "torque_rms", "effort_above_gravity")
+INTEGRALS = (
+    *("rmse", "ise", "iae", "itae", "estimate_rmse"),
+    *("effort", "torque_rms", "effort_above_gravity"),
+)
 
 
 @pytest.mark.slow
@@ -199,21 +181,15 @@ INTEGRALS = ("rmse", "ise", "iae", "itae", "effort", "torque_rms", "effort_above
 def test_integrals_are_of_second_order(loop):
     """Whatever jumps: the disturbance does at 0.0631 s, which is at no instant, and the command
     arrives within a step."""
-    scenario = dataclasses.replace(SLOW, **LOOPS[loop])
-    folds = (
-        ij.metrics.Tracking(),
-        ij.metrics.Torque(),
-        ij.metrics.AboveGravity(),
-        ij.metrics.Estimation(),
-    )
+    scenario, metrics = dataclasses.replace(SLOW, **LOOPS[loop]), ij.metrics
+    folds = (metrics.Tracking(), metrics.Torque(), metrics.AboveGravity(), metrics.Estimation())
 
     def integrals(parts):
-        return ij.simulate(
-            scenario, duration=0.12, dt=1e-2 / parts, metrics=folds, record_every=10_000
-        ).metrics
+        options = {"metrics": folds, "record_every": 10_000}
+        return ij.simulate(scenario, duration=0.12, dt=1e-2 / parts, **options).metrics
 
     coarse, fine, truth = (integrals(parts) for parts in (8, 32, 128))
-    for name in (*INTEGRALS, "estimate_rmse"):
+    for name in INTEGRALS:
         errors = [
             np.max(np.abs(x[name] - truth[name]) / np.abs(truth[name])) for x in (coarse, fine)
         ]
@@ -242,3 +218,17 @@ def test_one_definition_serves_runs_batches_and_losses():
     np.testing.assert_allclose(
         run.metrics["tuning_exact"], [np.sum(run.metrics.ise), run.metrics.effort], rtol=1e-12
     )
+
+
+def test_the_text_of_metrics_says_none_for_what_did_not_happen():
+    units = {"margin": "rad", "first_violation_time": "s", "first_violation_joint": "1"}
+    values = {"margin": jnp.array([0.5, -1.0]), "first_violation_time": jnp.array(jnp.inf)}
+    calm = ij.Metrics(values | {"first_violation_joint": jnp.int32(-1)}, tuple(units.items()))
+    rows = [line.split() for line in repr(calm).split("\n")[1:-1]]
+    assert rows[0] == ["margin", "[", "0.5", "-1.", "]", "rad"]
+    assert rows[1:] == [["first_violation_time", "none"], ["first_violation_joint", "none"]]
+    assert np.isinf(calm.first_violation_time) and calm.first_violation_joint == -1
+    happened = {"first_violation_time": jnp.array([0.25, jnp.inf])}
+    happened["first_violation_joint"] = jnp.array([1, -1])
+    text = repr(ij.Metrics(happened, tuple(units.items())))
+    assert "[0.25  none] s" in text and "[ 1 none] 1" in text

@@ -11,7 +11,6 @@ import iblf_jax as ij
 
 VARIANTS = [(law, variant) for law in ("integral", "log") for variant in ("printed", "corrected")]
 PRINTED = VARIANTS[0]
-pairs = pytest.mark.parametrize(("law", "variant"), [PRINTED, ("log", "corrected")])
 
 
 def reference_of(data, law, variant):
@@ -44,17 +43,7 @@ def test_all_four_variants_at_one_millisecond(reference_data, law, variant):
 
 
 @pytest.mark.slow
-@pairs
-def test_torque_at_half_a_millisecond(reference_data, law, variant):
-    scenario = ij.presets.zhang_yan_2024(law=law, variant=variant)
-    ref = reference_of(reference_data, law, variant)
-    run = ij.simulate(scenario, duration=20.0, dt=5e-4, record_every=20)
-    assert largest(run.tau, ref["tau"]) <= 2e-5
-    assert largest(run.q, ref["q"]) <= 1e-8
-
-
-@pytest.mark.slow
-@pairs
+@pytest.mark.parametrize(("law", "variant"), [PRINTED, ("log", "corrected")])
 def test_float32(reference_data, law, variant):
     scenario = ij.astype(ij.presets.zhang_yan_2024(law=law, variant=variant), "float32")
     run = ij.simulate(scenario, **PAPER)
@@ -65,30 +54,14 @@ def test_float32(reference_data, law, variant):
 
 def test_what_the_paper_shows(paper_run):
     """Section 5 of the theory page: the numbers of the paper's own law."""
-    xi, e1 = np.abs(np.asarray(paper_run.xi)), np.abs(np.asarray(paper_run.e1))
+    xi, e1 = np.abs(np.asarray(paper_run.xi)), np.asarray(paper_run.e1)
     assert np.max(xi) == pytest.approx(0.6154, abs=5e-5)
     assert np.max(xi) == xi[0, 1]
     np.testing.assert_allclose(paper_run.metrics.settling_time, [0.99, 0.71], atol=5e-3)
-    late = np.max(e1[np.asarray(paper_run.t) >= 10.0], axis=0)
+    overshoot = np.max(-np.sign(e1[0]) * e1, axis=0)
+    np.testing.assert_allclose(paper_run.metrics.overshoot, overshoot, rtol=1e-2)
+    late = np.max(np.abs(e1[np.asarray(paper_run.t) >= 10.0]), axis=0)
     assert np.all(late <= [8.9e-5 * 1.01, 1.7e-5 * 1.03])
     np.testing.assert_allclose(np.max(np.abs(paper_run.tau), axis=0), [13.5, 16.3], atol=0.05)
     np.testing.assert_allclose(paper_run.metrics.peak_torque, [13.8, 16.3], atol=0.05)
     assert float(paper_run.V[0]) == pytest.approx(0.966, abs=5e-4)
-
-
-@pytest.mark.slow
-def test_the_papers_words_hold(paper_run):
-    """Both laws keep the bounds; the integral one settles earlier, and its e2 overshoots more."""
-    log = ij.simulate(ij.presets.zhang_yan_2024(law="log"), **PAPER)
-    np.testing.assert_allclose(log.metrics.settling_time, [1.07, 0.83], atol=1e-2)
-    for run in (paper_run, log):
-        assert np.all(np.asarray(run.metrics.margin) > 0)
-    assert np.all(
-        np.asarray(paper_run.metrics.settling_time) < np.asarray(log.metrics.settling_time)
-    )
-
-    def overshoot(run):
-        e2 = np.asarray(run.e2)
-        return np.max(-np.sign(e2[0]) * e2, axis=0)
-
-    assert np.all(overshoot(paper_run) > overshoot(log))

@@ -15,15 +15,12 @@ from scipy.integrate import solve_ivp
 
 import iblf_jax as ij
 from iblf_jax.core.status import Status
-from iblf_jax.engine import RunRequest, native
-from iblf_jax.engine.execute import run_batch, sampled_jacobians
 from iblf_jax.engine.period import radius_at
 from iblf_jax.engine.step_size import start_and_along
 from iblf_jax.simulation.closed_loop import run_sampled_law
-from iblf_jax.simulation.metrics import standard
 from iblf_jax.simulation.noise import noise_key, normals
+from iblf_jax.simulation.sampling import Instant, step_commands
 from iblf_jax.simulation.scenario import canonical
-from iblf_jax.simulation.stability import jacobian
 from iblf_jax.tuning.parameters import layout
 from iblf_jax.tuning.ranges import BY_COUNT, BY_PERIOD, TIMES, TOGETHER
 from iblf_jax.tuning.result import AtLimit
@@ -148,27 +145,47 @@ def agree(scenario, program, duration=0.3, dt=5e-4, q=1e-7, tau=1e-5):
     return run
 
 
+@pytest.mark.parametrize("delay", [0.0, 1.0, 2.6, 3.0, 4.0, 5.4, 8.0, 11.0])
+def test_a_command_is_active_from_its_arrival_to_that_of_the_next(delay):
+    """tau(t) = tau_k for t_k + delay <= t < t_(k+1) + delay; times in steps, of which a period has
+    four, and every command is the number of its sample."""
+    newest, dt = 5, 5e-4
+    sampling = ij.Sampling(period=4 * dt, delay=delay * dt)
+    commands = newest - jnp.arange(sampling.queue + 1.0)[:, None]
+    for phase in range(4):
+        now = Instant(jnp.int32(newest), jnp.int32(phase))
+        found = step_commands(sampling, jnp.asarray(dt), now, commands)
+        arrivals = 4.0 * np.arange(newest + 1) + delay - (4 * newest + phase)
+        active = np.flatnonzero(arrivals <= 0.0)[-1]
+        assert float(found.first[0]) == active
+        (coming,) = np.nonzero((arrivals > 0.0) & (arrivals <= 1.0))
+        assert bool(found.arrives) == (coming.size == 1)
+        if coming.size:
+            assert float(found.next[0]) == coming[0]
+            assert float(found.arrival) == pytest.approx(arrivals[coming[0]])
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("delay", [0.0, pytest.param(3.7e-3, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("base", "timing"),
+    [
+        (PAPER, {"period": 1e-3, "delay": 1e-3}),
+        (PAPER, {"period": 2e-3, "delay": 1e-3}),
+        (SLOW, {"period": 2e-3, "delay": 2.7e-3}),
+    ],
+)
+def test_a_sampled_loop_is_that_of_an_independent_program(base, timing):
+    agree(ij.with_parts(base, sampling=ij.Sampling(**timing)), Independent)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("delay", [0.0, 3.7e-3])
 def test_a_disturbance_that_jumps_between_samples_is_that_of_an_independent_program(delay):
     """In steps as long as the period: the jump is within one, where its error was 5e-3 rad and its
     estimate 3e-5 rad."""
     late = ij.disturbances.Step(size=[20.0, 5.0], time=0.2137)
     scenario = ij.with_parts(SLOW, sampling=ij.Sampling(period=1e-2, delay=delay), disturbance=late)
-    run = agree(scenario, Independent, dt=1e-2, q=1e-6, tau=1e-3)
-    assert run.ok
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("period", [1e-3, 2e-3])
-def test_a_sampled_loop_is_that_of_an_independent_program(period):
-    agree(ij.with_parts(PAPER, sampling=ij.Sampling(period, delay=1e-3)), Independent)
-
-
-@pytest.mark.slow
-def test_a_delay_may_be_of_any_length():
-    scenario = ij.with_parts(SLOW, sampling=ij.Sampling(period=2e-3, delay=2.7e-3))
-    agree(scenario, Independent, q=1e-9, tau=1e-7)
+    assert agree(scenario, Independent, dt=1e-2, q=1e-6, tau=1e-3).ok
 
 
 @pytest.mark.slow
@@ -195,42 +212,28 @@ def test_a_drive_with_limits_is_that_of_an_independent_program():
     assert int(run.status) & int(Status.TORQUE_SATURATED)
 
 
-@pytest.mark.slow
-def test_a_short_period_is_the_continuous_loop():
-    continuous = ij.simulate(SLOW, duration=0.2, dt=2.5e-4).q
-    errors = []
-    for period in (1e-3, 5e-4, 2.5e-4):
-        run = ij.simulate(
-            ij.with_parts(SLOW, sampling=ij.Sampling(period=period)), duration=0.2, dt=2.5e-4
-        )
-        errors.append(float(np.max(np.abs(run.q - continuous))))
-    assert 1.7 < errors[0] / errors[1] < 2.3 and 1.7 < errors[1] / errors[2] < 2.3
-
-
-VELOCITIES = [ij.sensors.FilteredDifference(cutoff=700.0), ij.sensors.Tracking(bandwidth=500.0)]
+FILTERED = ij.sensors.FilteredDifference(cutoff=700.0)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("velocity", VELOCITIES)
-def test_batches_are_single_runs_and_backends_agree(velocity):
-    sensor = ij.sensors.Encoder(counts=65536, noise=1e-5, velocity=velocity)
+def test_batches_are_single_runs_and_backends_agree():
+    sensor = ij.sensors.Encoder(counts=65536, noise=1e-5, velocity=FILTERED)
     scenario = ij.with_parts(SLOW, sampling=ij.Sampling(period=1e-3), sensor=sensor)
-    method = "heun" if velocity is VELOCITIES[0] else "euler"
-    timing = {"duration": 0.08, "dt": 1e-3, "method": method}
+    timing = {"duration": 0.08, "dt": 1e-3, "method": "heun"}
     draws = {"plant.mass": ij.factor(ij.uniform(0.9, 1.1))}
     study = ij.monte_carlo(scenario, draws, runs=3, seed=4, **timing)
     run = study.replay(2)
     assert np.allclose(run.metrics.rmse, study.metrics["rmse"][2], rtol=1e-12)
-    again = np.sqrt(np.mean(run.e1**2, axis=0))
     # The trajectory has the run's own noise.
+    again = np.sqrt(np.mean(run.e1**2, axis=0))
     assert np.allclose(again, study.metrics["rmse"][2], rtol=1e-2)
     first = ij.simulate(scenario, seed=4, **timing)
     other = ij.simulate(scenario, seed=5, **timing)
     assert np.any(first.measured.dq != other.measured.dq)
-    if velocity is VELOCITIES[0]:  # where nothing but the noise differs
-        lone = ij.monte_carlo(scenario, {}, runs=2, seed=4, **timing)
-        assert np.any(lone.metrics["rmse"][0] != lone.metrics["rmse"][1])
-        assert np.allclose(lone.metrics["rmse"][0], first.metrics.rmse, rtol=1e-9)
+    # Where nothing but the noise differs.
+    lone = ij.monte_carlo(scenario, {}, runs=2, seed=4, **timing)
+    assert np.any(lone.metrics["rmse"][0] != lone.metrics["rmse"][1])
+    assert np.allclose(lone.metrics["rmse"][0], first.metrics.rmse, rtol=1e-9)
     by_scan = ij.simulate(scenario, seed=4, backend="vmap", **timing)
     assert np.allclose(by_scan.q, first.q, atol=1e-12)
 
@@ -249,14 +252,14 @@ def test_noise_is_white_and_normal():
 
 @pytest.mark.slow
 def test_derivatives_are_differences():
-    sensor = ij.sensors.Encoder(noise=1e-5, velocity=ij.sensors.FilteredDifference(cutoff=700.0))
-    scenario = ij.with_parts(
-        SLOW,
-        sampling=ij.Sampling(period=1e-3, delay=7e-4),
-        sensor=sensor,
-        actuator=ij.actuators.Motor(bandwidth=800.0),
+    scenario = canonical(
+        ij.with_parts(
+            SLOW,
+            sampling=ij.Sampling(period=1e-3, delay=7e-4),
+            sensor=ij.sensors.Encoder(noise=1e-5, velocity=FILTERED),
+            actuator=ij.actuators.Motor(bandwidth=800.0),
+        )
     )
-    scenario = canonical(scenario)
 
     def loss(values):
         changed = ij.with_parameters(scenario, values)
@@ -273,30 +276,6 @@ def test_derivatives_are_differences():
         slope = jax.grad(lambda x, path=path, unit=unit: loss({path: x * unit}))(jnp.ravel(here)[0])
         ends = [float(loss({path: here + sign * step * unit})) for sign in (1, -1)]
         assert np.isclose(slope, (ends[0] - ends[1]) / (2 * step), rtol=2e-4), path
-
-
-@pytest.mark.release  # it takes XLA's optimisation to round a batch and a lone run apart
-@pytest.mark.skipif(native.unavailable() is not None, reason="no C++ compiler")
-def test_a_run_says_the_same_alone_as_in_a_batch_to_the_bit():
-    scenario = canonical(ij.with_parts(SLOW, sampling=ij.Sampling(period=4e-3, delay=1.3e-3)))
-    varied = {
-        "initial.q": scenario.initial.q + 0.01 * jnp.arange(11.0)[:, None],
-        "plant.mass[1]": jnp.linspace(0.6, 1.1, 11),
-    }
-
-    @jax.jit
-    def runs(varied):
-        request = RunRequest(400, "rk4", backend="native")
-        found = run_batch(scenario, varied, standard()[:1], jnp.asarray(1e-3), request)
-        return found.metrics | {"mode": found.fastest_mode}
-
-    together = runs(varied)
-    for i in range(11):
-        for name, x in runs({path: values[i : i + 1] for path, values in varied.items()}).items():
-            # The estimate of the step's error, 1e-9 rad, is rounded by XLA, which compiles the
-            # start of a lone run in another way.
-            rtol = 1e-14 if "numerical_error" in name else 0
-            np.testing.assert_allclose(together[name][i], x[0], rtol=rtol, err_msg=name)
 
 
 def test_rounding_is_left_out_of_derivatives():
@@ -334,28 +313,6 @@ def test_the_radius_is_that_of_the_map():
     J = np.array([(after(z + e) - after(z - e)) / 2e-6 for e in step]).T
     found = radius_at(scenario, 2e-3, np.zeros(0))
     assert np.isclose(found, np.max(np.abs(np.linalg.eigvals(J))), rtol=1e-4)
-
-
-@pytest.mark.slow
-def test_jacobians_at_many_states_are_those_at_each():
-    """The kernel that linearizes runs gives those of `stability.jacobian`."""
-    sensor = ij.sensors.Encoder(counts=65536, velocity=VELOCITIES[0])
-    scenario = canonical(ij.with_parts(SLOW, sampling=ij.Sampling(1e-3, delay=3e-3), sensor=sensor))
-    times = jnp.asarray([0.0, 0.3, 0.7])
-    states = start_and_along(scenario, times[1:])
-    found = sampled_jacobians(scenario, times, states)
-    for k, t in enumerate(times):
-        state = jax.tree.map(lambda x, k=k: x[k], states)
-        one = jacobian(scenario, t, state)
-        np.testing.assert_allclose(found[k], one, rtol=1e-6, atol=1e-6 * np.max(np.abs(one)))
-
-
-@pytest.mark.slow
-def test_a_longer_queue_does_not_change_the_radius():
-    scenario = ij.with_parts(PAPER, sampling=ij.Sampling(2e-3, delay=1e-3))
-    longer = ij.with_parts(PAPER, sampling=ij.Sampling(2e-3, delay=1e-3, queue=7))
-    times = np.array([0.0, 0.4])
-    assert radius_at(canonical(scenario), 2e-3, times) == radius_at(canonical(longer), 2e-3, times)
 
 
 @pytest.mark.slow
@@ -463,28 +420,11 @@ def test_a_study_may_not_lengthen_the_delay_beyond_the_queue():
 
 
 @pytest.mark.slow
-def test_ranges_end_where_the_loop_grows():
-    sensor = ij.sensors.Encoder(
-        counts=65536, noise=1e-5, velocity=ij.sensors.FilteredDifference(cutoff=700.0)
-    )
-    scenario = ij.with_parts(SLOW, sampling=ij.Sampling(period=1e-3), sensor=sensor)
-    _, box = layout(canonical(scenario), ["controller.K2"], 5e-4, "rk4")
-    high = np.exp(np.max(box.high))
-    inside, outside = (
-        canonical(ij.with_parameters(scenario, {"controller.K2": share * high}))
-        for share in (0.9, 1.1)
-    )
-    times = np.linspace(0, 6, 7)
-    assert radius_at(inside, 1e-3, times) < 1.0 <= radius_at(outside, 1e-3, times)
-
-
-@pytest.mark.slow
 def test_ranges_end_where_a_count_is_more_than_the_drive_gives():
-    sensor = ij.sensors.Encoder(counts=65536, velocity=ij.sensors.FilteredDifference(cutoff=700.0))
     scenario = ij.with_parts(
         SLOW,
         sampling=ij.Sampling(period=1e-3),
-        sensor=sensor,
+        sensor=ij.sensors.Encoder(counts=65536, velocity=FILTERED),
         actuator=ij.actuators.Motor(bandwidth=600.0, rate_limit=900.0),
     )
     gains = ["controller.k1", "controller.K2", "observer.kf"]
@@ -493,8 +433,7 @@ def test_ranges_end_where_a_count_is_more_than_the_drive_gives():
     assert TOGETHER in str(AtLimit(1.0, "upper", 1.0, box.reasons[0][1]))
 
     def rate_for_a_count(factor):
-        """The largest rate that the motor is asked for when one joint moves on by a count, with the
-        sensor as it rounds."""
+        """The largest rate that is asked for when one joint moves on by a rounded count."""
         values = {b.path: factor * np.exp(box.high[b.start : b.start + b.size]) for b in blocks}
         changed = canonical(ij.with_parameters(scenario, values))
         count, rates = 2 * np.pi / 65536, []
@@ -516,27 +455,6 @@ def test_ranges_end_where_a_count_is_more_than_the_drive_gives():
 
 
 @pytest.mark.slow
-def test_held_torque_is_drawn_as_steps_and_measurements_beside_the_truth():
-    scenario = ij.with_parts(SLOW, sampling=ij.Sampling(period=2e-3), sensor=ENCODER)
-    run, driven = (
-        ij.simulate(ij.with_parts(scenario, actuator=a), duration=0.08, dt=1e-3)
-        for a in (scenario.actuator, MOTOR)
-    )
-    lines, others = (
-        {line.get_label(): line for line in ij.plotting.torques(r).axes[0].get_lines()}
-        for r in (run, driven)
-    )
-    assert lines[r"$\tau$"].get_drawstyle() == "steps-post"
-    assert others[r"$\tau$"].get_drawstyle() == "default"
-    lines = {line.get_label(): line for line in ij.plotting.velocities(run).axes[0].get_lines()}
-    np.testing.assert_array_equal(lines["measured"].get_ydata(), run.measured.dq[:, 0])
-    assert lines["measured"].get_drawstyle() == "steps-post"
-    assert any(
-        line.get_label() == "measured" for axes in run.plot().axes for line in axes.get_lines()
-    )
-
-
-@pytest.mark.slow
 def test_tuning_finds_its_way_out_of_a_loop_that_is_sampled_too_slowly():
     """Where the loop grows from sample to sample its gradient points nowhere: the search begins at
     gains with which it does not."""
@@ -551,27 +469,19 @@ def test_tuning_finds_its_way_out_of_a_loop_that_is_sampled_too_slowly():
     assert not int(run.status) & int(Status.SAMPLING_TOO_SLOW)
 
 
-def test_a_step_with_the_poles_forgets_as_momentum_does():
-    observer, T = ij.observers.Momentum(kf=np.array([50.0, 300.0])), 2e-3
-    stepped = observer.at_period(jnp.asarray(T))
-    np.testing.assert_allclose(1 - stepped.kf * T, np.exp(-observer.kf * T), rtol=1e-13)
-
-
 @pytest.mark.slow
-def test_a_step_with_the_poles_forgets_as_the_observer_does_and_has_no_bias():
-    """With complex poles."""
-    observer, T = ij.observers.ExtendedState(l1=100.0, l2=6000.0), 2e-3
-    stepped = observer.at_period(jnp.asarray(T))
-    (l1, l2), (g1, g2) = observer._gains, stepped._gains
-    poles = np.exp(T * np.roots([1.0, float(l1), float(l2)]))
-    found = np.roots([1.0, float(T * g1) - 2.0, 1.0 - float(T * g1 - T * T * g2)])
-    np.testing.assert_allclose(np.sort_complex(found), np.sort_complex(poles))
-    ways = ("exact", "poles", "euler")
-    scenario = ij.with_parts(SLOW, observer=observer)
-    loops = [ij.with_parts(scenario, sampling=ij.Sampling(T, observer=way)) for way in ways]
-    runs = [ij.simulate(loop, duration=0.3, dt=1e-3) for loop in loops]
-    exact, poles, euler = (float(np.max(run.metrics.estimate_rmse)) for run in runs)
-    assert poles < 0.5 * exact, "f_hat lags by the robot's motion over a period otherwise"
+def test_a_step_with_the_poles_has_no_bias():
+    """f_hat lags by the robot's motion over a period otherwise.  Its poles are in
+    `control/test_observers`."""
+    scenario = ij.with_parts(SLOW, observer=ij.observers.ExtendedState(l1=100.0, l2=6000.0))
+    exact, poles, euler = (
+        np.max(ij.simulate(loop, duration=0.3, dt=1e-3).metrics.estimate_rmse)
+        for loop in (
+            ij.with_parts(scenario, sampling=ij.Sampling(2e-3, observer=way))
+            for way in ("exact", "poles", "euler")
+        )
+    )
+    assert poles < 0.5 * exact
     assert poles < 1.2 * euler
 
 
@@ -580,14 +490,10 @@ def test_a_step_with_the_poles_forgets_as_the_observer_does_and_has_no_bias():
     [ij.sensors.FilteredDifference(cutoff=[300.0, 2000.0]), ij.sensors.Tracking(bandwidth=2000.0)],
 )
 def test_a_filter_above_the_nyquist_frequency_is_told_with_the_number(velocity):
-    scenario = ij.with_parts(
-        SLOW, sampling=ij.Sampling(2e-3), sensor=ij.sensors.Encoder(velocity=velocity)
-    )
-    with pytest.warns(
-        UserWarning,
-        match=r"2000 rad/s is above the Nyquist frequency of sampling.period, 1571 rad/s",
-    ):
+    sensor = ij.sensors.Encoder(velocity=velocity)
+    scenario = ij.with_parts(SLOW, sampling=ij.Sampling(2e-3), sensor=sensor)
+    words = r"2000 rad/s is above the Nyquist frequency of sampling.period, 1571 rad/s"
+    with pytest.warns(UserWarning, match=words):
         canonical(scenario)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         canonical(ij.with_parameters(scenario, {"sampling.period": 1e-3}))

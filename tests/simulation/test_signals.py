@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from plant_cases import pendulum
+from plant_cases import ANGLES, pendulum, symmetric
 
 import iblf_jax as ij
 from iblf_jax.simulation.signals import FIELDS, SIGNALS, VIEWS
@@ -10,30 +10,18 @@ from iblf_jax.simulation.signals import FIELDS, SIGNALS, VIEWS
 SHORT = {"duration": 0.02, "dt": 1e-3}
 
 
-def limits(size: float) -> ij.Bounds:
-    return ij.Bounds(ij.bounds.Constant(-size), ij.bounds.Constant(size))
-
-
-def loop(*above: ij.Bounds | None) -> ij.Scenario:
-    """The pendulum with other bounds above the first level, under a law that ignores them."""
-    law = ij.controllers.BarrierBackstepping(k=(3.0, 10.0, 30.0))
-    base = pendulum()
-    return ij.with_parts(base, controller=law, bounds=(base.bounds[0], *above))
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("above", [(), (limits(9.0),), (None, limits(90.0))])
+@pytest.mark.parametrize("above", [(), (symmetric(9.0),), (None, symmetric(90.0))])
 def test_views_are_rows_and_bounds_end_with_the_last_level_that_has_some(above):
-    run = ij.simulate(loop(*above), **SHORT)
+    law = ij.controllers.BarrierBackstepping(k=(3.0, 10.0, 30.0))
+    run = ij.simulate(pendulum(controller=law, bounds=(ANGLES, *above)), **SHORT)
     samples = run.t.size
     assert run.x.shape == run.e.shape == (samples, 3, 1)
     assert run.level_lower.shape == run.level_upper.shape == (samples, 1 + len(above), 1)
     for name, view in VIEWS.items():
         rows = np.asarray(getattr(run, view.signal))
-        if view.row < rows.shape[1]:
-            np.testing.assert_array_equal(getattr(run, name), rows[:, view.row], err_msg=name)
-        else:
-            assert getattr(run, name) == ()
+        expected = rows[:, view.row] if view.row < rows.shape[1] else ()
+        np.testing.assert_array_equal(getattr(run, name), expected, err_msg=name)
     if above and above[0] is None:
         assert np.all(np.isneginf(run.dq_lower)) and np.all(np.isposinf(run.dq_upper))
         np.testing.assert_array_equal(run.level_upper[:, 2], 90.0)

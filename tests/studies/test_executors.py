@@ -143,12 +143,6 @@ def test_a_workers_path_that_is_not_shared_is_named(tmp_path):
         workers._open_shared(shared)
 
 
-@pytest.mark.parametrize("wrong", ["dask", 3, object()])
-def test_what_is_no_executor_is_refused(wrong):
-    with pytest.raises(ValueError, match=r"executor: got .*concurrent.futures.Executor"):
-        cases.study(executor=wrong)
-
-
 def test_a_store_of_an_earlier_version_is_read():
     """Made by the code of commit d674b34: 4 points with 3 runs each."""
     folder = Path(__file__).parents[1] / "data"

@@ -37,6 +37,7 @@ def study():
 def test_the_counts_add_up(study):
     counts = study.status_counts
     assert counts["OK"] + counts["FLAGGED"] + counts["FAILED"] == len(study)
+    np.testing.assert_array_equal(study.failed, np.flatnonzero(study.status & int(FAILED)))
     assert counts["FLAGGED"] == np.sum((study.status != 0) & (study.status & int(FAILED) == 0)) >= 5
     assert (
         f"failed: {counts['FAILED']}; flagged, but not failed: {counts['FLAGGED']}; ok:"
@@ -78,6 +79,9 @@ def test_what_statistics_are_over_is_said(study):
     assert (said["runs"], said["failed_included"], said["excluded"]) == (600, failed, 0)
     said = study.quantiles(exclude_failed=True).attrs
     assert (said["runs"], said["failed_included"], said["excluded"]) == (600 - failed, 0, failed)
+    assert np.all(study.quantiles((0.0,), exclude_failed=True).margin > 0)
+    least = study.quantiles((0.0,)).margin.sel(quantile=0.0)
+    np.testing.assert_allclose(least, study.metrics.margin.min(0))
 
 
 def test_a_progress_bar_ends_where_it_should(monkeypatch):
@@ -136,9 +140,15 @@ def test_the_line_of_a_notebook_is_replaced_and_not_in_stored_outputs(monkeypatc
 
 
 @pytest.mark.parametrize(
-    ("options", "shown"), [({}, True), ({"progress": None}, True), ({"progress": False}, False)]
+    ("options", "has_bar", "shown"),
+    [
+        ({}, False, True),
+        ({"progress": None}, False, True),
+        ({"progress": False}, False, False),
+        ({}, True, False),
+    ],
 )
-def test_a_slow_call_prints_one_line(monkeypatch, capsys, options, shown):
+def test_a_slow_call_prints_one_line_or_a_bar(monkeypatch, capsys, options, has_bar, shown):
     """The functions that it calls print none."""
     monkeypatch.setattr(messages, "SLOW", 0.1)
     monkeypatch.setattr(messages, "has_reader", lambda: True)
@@ -152,22 +162,15 @@ def test_a_slow_call_prints_one_line(monkeypatch, capsys, options, shown):
         inner()
         return "sum"
 
-    assert outer(**options) == "sum"
-    assert capsys.readouterr().err == ("iblf_jax: adding up\n" if shown else "")
-
-
-def test_a_bar_takes_the_place_of_the_line(monkeypatch, capsys):
-    monkeypatch.setattr(messages, "SLOW", 0.2)
-    monkeypatch.setattr(messages, "has_reader", lambda: True)
-
     @progress.announced("adding up")
-    def outer():
-        with progress.bar(False, 3) as shown:
-            time.sleep(0.4)
-            shown.update(3)
+    def with_bar():
+        with progress.bar(False, 3) as bar:
+            time.sleep(0.3)
+            bar.update(3)
+        return "sum"
 
-    outer()
-    assert capsys.readouterr().err == ""
+    assert (with_bar() if has_bar else outer(**options)) == "sum"
+    assert capsys.readouterr().err == ("iblf_jax: adding up\n" if shown else "")
 
 
 @pytest.mark.parametrize(

@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import re
+import tomllib
 from types import SimpleNamespace
+from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import study_cases as cases
+from scipy.stats import norm
 
 import iblf_jax as ij
+from iblf_jax import cli
 from iblf_jax.core.status import Status, has_flag
+from iblf_jax.files.study import study_from_dict
 from iblf_jax.studies.rare_events import normal_space
 from iblf_jax.studies.rare_events.design_points import Pieces
 from iblf_jax.studies.rare_events.result import FailureProbability
@@ -32,21 +39,30 @@ def distances(scenario):
     return np.array([run.q[0] - run.lower[0], run.upper[0] - run.q[0]])
 
 
-def perturbed(start, mass):
+def perturbed(start, mass=None):
     """The perturbed leaves of all tests, so that one program serves them."""
-    return {"initial.q[1]": ij.offset(start), "plant.mass": ij.factor(mass)}
+    return {"initial.q[1]": ij.offset(start), "plant.mass": ij.factor(mass or ij.uniform(0.9, 1.1))}
+
+
+def failure_probability(scenario, perturbations, **options):
+    return ij.failure_probability(scenario, perturbations, **RUN | options)
+
+
+def study_of(scenario, perturbations, runs, seed=0):
+    """The smallest margin of each run of a study."""
+    options = {"duration": 0.02, "dt": 1e-3, "method": "euler", "metrics": (ij.metrics.Margin(),)}
+    study = ij.monte_carlo(scenario, perturbations, runs=runs, seed=seed, **options)
+    return study, np.asarray(study.metrics.margin).min(axis=1)
 
 
 def start_perturbations(scenario, beta, mass=None):
     """An offset of the start of joint 1 whose nearer bound is at beta standard deviations."""
     distance = distances(scenario)[:, 1]
     start = ij.normal(0.0, distance.min() / beta)
-    return perturbed(start, mass or ij.uniform(0.9, 1.1)), distance
+    return perturbed(start, mass), distance
 
 
 def exact(distance, beta):
-    from scipy.stats import norm
-
     return float(np.sum(norm.sf(beta * distance / distance.min())))
 
 
@@ -54,7 +70,7 @@ def exact(distance, beta):
 def rare(scenario):
     """The estimate of a probability near 1e-6."""
     perturbations, distance = start_perturbations(scenario, 4.8)
-    found = ij.failure_probability(scenario, perturbations, runs=1000, **RUN)
+    found = failure_probability(scenario, perturbations, runs=1000)
     return found, perturbations, exact(distance, 4.8)
 
 
@@ -67,23 +83,20 @@ def test_a_probability_of_runs_that_is_known(rare):
     assert found.coefficient_of_variation < 0.5
     assert found.started_outside == len(found.failures)
     assert found.diverged == found.excluded == 0
-    likely = found.most_likely_failure
-    assert likely.distance == pytest.approx(4.8, rel=1e-2)
-    assert likely.margin <= 0
-    z = dict(zip(likely.names, likely.z, strict=True))
-    assert abs(z["initial.q[1]"]) == pytest.approx(4.8, rel=1e-2)
     assert found.names == ("initial.q[1]", "plant.mass[0]", "plant.mass[1]")
     assert 1.0 in _failure_probability.FRACTIONS  # a sampled failure itself, with its own noise
 
 
 @pytest.mark.slow
 def test_the_most_likely_failure_fails_again(rare):
-    found, _, _ = rare
-    run = found.most_likely_failure.replay(record_every=5)
+    likely = rare[0].most_likely_failure
+    assert likely.distance == pytest.approx(4.8, rel=1e-2)
+    assert likely.margin <= 0
+    z = dict(zip(likely.names, likely.z, strict=True))
+    assert abs(z["initial.q[1]"]) == pytest.approx(4.8, rel=1e-2)
+    run = likely.replay(record_every=5)
     assert has_flag(run.status, Status.BOUND_VIOLATED)
-    np.testing.assert_allclose(
-        np.min(run.metrics.margin), found.most_likely_failure.margin, atol=1e-9
-    )
+    np.testing.assert_allclose(np.min(run.metrics.margin), likely.margin, atol=1e-9)
 
 
 @pytest.mark.slow
@@ -91,11 +104,7 @@ def test_the_words_of_a_result(rare):
     found, _, _ = rare
     text = repr(found)
     assert re.match(r"FailureProbability\(\S+e-0\d, 95% interval \S+ to \S+, coefficient", text)
-    for words in (
-        "Subset simulation with",
-        "most likely failure found: distance 4.8",
-        "initial.q[1]",
-    ):
+    for words in ("Subset simulation with", "most likely failure found: distance 4.8", "l.q[1]"):
         assert words in text
     data = found.to_xarray()
     assert data.z.shape == found.failures.z.shape
@@ -107,11 +116,11 @@ def test_the_words_of_a_result(rare):
 @pytest.mark.slow
 def test_importance_sampling_and_monte_carlo_agree(scenario, rare):
     _, perturbations, probability = rare
-    found = ij.failure_probability(scenario, perturbations, estimator="importance", runs=600, **RUN)
+    found = failure_probability(scenario, perturbations, estimator="importance", runs=600)
     assert found.interval[0] < probability < found.interval[1]
     assert found.coefficient_of_variation < 0.15
     frequent, distance = start_perturbations(scenario, 2.0)
-    crude = ij.failure_probability(scenario, frequent, estimator="monte_carlo", runs=2000, **RUN)
+    crude = failure_probability(scenario, frequent, estimator="monte_carlo", runs=2000)
     assert crude.interval[0] < exact(distance, 2.0) < crude.interval[1]
     again = ij.failure_probability(scenario, frequent, **crude.arguments, progress=False)
     assert again.estimate == crude.estimate
@@ -121,7 +130,7 @@ def test_importance_sampling_and_monte_carlo_agree(scenario, rare):
 def test_the_same_bits_for_a_seed_whatever_the_chunks(scenario, rare):
     found, perturbations, _ = rare
     chunks = ij.studies.LocalExecutor(chunk=256)
-    again = ij.failure_probability(scenario, perturbations, runs=1000, executor=chunks, **RUN)
+    again = failure_probability(scenario, perturbations, runs=1000, executor=chunks)
     assert again.estimate == found.estimate
     np.testing.assert_array_equal(again.failures.margins, found.failures.margins)
 
@@ -129,7 +138,7 @@ def test_the_same_bits_for_a_seed_whatever_the_chunks(scenario, rare):
 @pytest.mark.slow
 def test_draws_that_cannot_be_run_are_counted(scenario):
     perturbations, distance = start_perturbations(scenario, 3.2, ij.normal(1.0, 0.6))
-    found = ij.failure_probability(scenario, perturbations, runs=1000, **RUN)
+    found = failure_probability(scenario, perturbations, runs=1000)
     assert found.excluded > 50
     assert found.interval[0] < exact(distance, 3.2) < found.interval[1]
     assert "could not be run and are excluded" in repr(found)
@@ -138,8 +147,7 @@ def test_draws_that_cannot_be_run_are_counted(scenario):
 @pytest.mark.slow
 def test_a_nominal_run_that_fails_is_said(scenario):
     start = ij.normal(1.2 * distances(scenario)[1, 1], 0.01)
-    moved = perturbed(start, ij.uniform(0.9, 1.1))
-    found = ij.failure_probability(scenario, moved, runs=200, **RUN)
+    found = failure_probability(scenario, perturbed(start), runs=200)
     assert found.estimate > 0.9
     assert found.nominal_margin < 0
     assert "medians of all draws fails" in found.notes[0]
@@ -151,10 +159,8 @@ def test_a_limit_above_zero(scenario):
     """The share of the runs of a study whose margin is at most the limit."""
     perturbations, distance = start_perturbations(scenario, 4.0)
     limit = 0.3 * float(distance.min())
-    found = ij.failure_probability(scenario, perturbations, runs=1000, limit=limit, **RUN)
-    options = {"duration": 0.02, "dt": 1e-3, "method": "euler", "metrics": (ij.metrics.Margin(),)}
-    study = ij.monte_carlo(scenario, perturbations, runs=20_000, **options)
-    share = np.mean(study.metrics.margin.min(axis=1) <= limit)
+    found = failure_probability(scenario, perturbations, runs=1000, limit=limit)
+    share = np.mean(study_of(scenario, perturbations, 20_000)[1] <= limit)
     assert found.interval[0] < share < found.interval[1]
     assert len(found.levels) == 3
 
@@ -162,7 +168,7 @@ def test_a_limit_above_zero(scenario):
 @pytest.mark.slow
 def test_without_failures_the_estimate_is_a_bound(scenario):
     perturbations = perturbed(ij.uniform(-1e-3, 1e-3), ij.uniform(0.999, 1.001))
-    found = ij.failure_probability(scenario, perturbations, runs=100, **RUN)
+    found = failure_probability(scenario, perturbations, runs=100)
     assert found.is_upper_bound
     assert found.most_likely_failure is None
     assert found.margins_stagnate
@@ -171,9 +177,7 @@ def test_without_failures_the_estimate_is_a_bound(scenario):
     figure = found.plot()
     assert "No failure reachable was found" in figure.get_suptitle()
     assert [text.get_text() for text in figure.axes[1].texts] == ["no failure found"]
-    crude = ij.failure_probability(
-        scenario, perturbations, estimator="monte_carlo", runs=100, **RUN
-    )
+    crude = failure_probability(scenario, perturbations, estimator="monte_carlo", runs=100)
     assert crude.is_upper_bound and not crude.margins_stagnate
     assert "no sample failed in 101 runs; at most" in repr(crude)  # with the nominal one
     with pytest.raises(ValueError, match="draws near failure"):
@@ -184,40 +188,40 @@ def test_without_failures_the_estimate_is_a_bound(scenario):
 
 @pytest.mark.slow
 def test_discrete_distributions(scenario):
-    distance = distances(scenario)[1, 1]
-    start = ij.choice([0.0, 1.1 * distance], [0.999, 0.001])
+    start = ij.choice([0.0, 1.1 * distances(scenario)[1, 1]], [0.999, 0.001])
     perturbations = perturbed(start, ij.normal(1.0, 0.01))
-    found = ij.failure_probability(scenario, perturbations, runs=1000, **RUN)
+    found = failure_probability(scenario, perturbations, runs=1000)
     assert found.interval[0] < 0.001 < found.interval[1]
     with pytest.raises(ValueError, match="continuous distributions"):
-        ij.failure_probability(scenario, perturbations, estimator="importance", **RUN)
+        failure_probability(scenario, perturbations, estimator="importance")
 
 
-def test_bad_arguments(scenario):
-    perturbations = {"plant.mass": ij.factor(ij.uniform(0.9, 1.1))}
-    for words, given in {
-        "estimator": {"estimator": "sorm"},
-        "margin": {"margin": "torques"},
-        "runs": {"runs": 3},
-        ">= 100|100": {"runs": 99, "estimator": "importance"},
-        "confidence": {"confidence": 1.0},
-        "limit": {"limit": np.nan},
-        "method: got 'leapfrog'": {"method": "leapfrog"},
-        "region_margin|regions": {"margin": "regions"},
-    }.items():
-        with pytest.raises(ValueError, match=words):
-            ij.failure_probability(scenario, perturbations, **(RUN | given))
-    with pytest.raises(ValueError, match="at least one perturbation"):
-        ij.failure_probability(scenario, {}, **RUN)
-    with pytest.raises(ValueError, match=r"ij\.factor\(\.\.\.\)"):
-        ij.failure_probability(scenario, {"plant.mass": 3.0}, **RUN)
+MASS = {"plant.mass": ij.factor(ij.uniform(0.9, 1.1))}
+
+
+@pytest.mark.parametrize(
+    ("perturbations", "options", "words"),
+    [
+        (MASS, {"estimator": "sorm"}, "estimator"),
+        (MASS, {"margin": "torques"}, "margin"),
+        (MASS, {"runs": 3}, "runs"),
+        (MASS, {"runs": 99, "estimator": "importance"}, ">= 100|100"),
+        (MASS, {"confidence": 1.0}, "confidence"),
+        (MASS, {"limit": np.nan}, "limit"),
+        (MASS, {"method": "leapfrog"}, "method: got 'leapfrog'"),
+        (MASS, {"margin": "regions"}, "region_margin|regions"),
+        ({}, {}, "at least one perturbation"),
+        ({"plant.mass": 3.0}, {}, r"ij\.factor\(\.\.\.\)"),
+    ],
+)
+def test_bad_arguments(scenario, perturbations, options, words):
+    with pytest.raises(ValueError, match=words):
+        failure_probability(scenario, perturbations, **options)
 
 
 def test_tails_of_float32_draws():
     """Phi(6) rounds to 1 in float32; a normal draw is still finite there, and a bounded one is at
     its end."""
-    import jax.numpy as jnp
-
     z = jnp.asarray([-6.0, 6.0, 12.0], jnp.float32)
     normal = normal_space.NormalCoordinates(ij.normal(1.0, 2.0))
     np.testing.assert_allclose(normal.quantile(z), [-11.0, 13.0, 25.0])
@@ -233,9 +237,6 @@ def test_tails_of_float32_draws():
 @pytest.mark.slow
 def test_rare_values_of_a_list_in_float32():
     """u near 1 does not resolve a weight of 1e-8 in float32; z does.  Elsewhere both agree."""
-    import jax
-    import jax.numpy as jnp
-
     values, weights = jnp.asarray([0.0, 1.0, 2.0], jnp.float32), [0.0, 1 - 1e-8, 1e-8]
     limit = 5.612  # Phi(-5.612) = 1e-8
     z = jnp.asarray([-9.0, 0.0, limit - 0.01, limit + 0.01], jnp.float32)
@@ -262,26 +263,10 @@ def test_a_run_without_a_margin_fails(scenario, monkeypatch):
 
     monkeypatch.setattr(normal_space, "run_all_cases", without_margins)
     perturbations, _ = start_perturbations(scenario, 4.0)
-    found = ij.failure_probability(scenario, perturbations, estimator="monte_carlo", runs=50, **RUN)
+    found = failure_probability(scenario, perturbations, estimator="monte_carlo", runs=50)
     assert found.estimate == 1
     assert not found.is_upper_bound
     assert found.excluded == 0
-
-
-@pytest.mark.slow
-def test_gradients_of_draws_that_cannot_be_run(scenario, monkeypatch):
-    """A negative mass has no margin, and no search continues from it."""
-    pieces_at = {}
-
-    def record(pieces, failures):
-        pieces_at["z"] = pieces(np.array([[0.0, 0.0, 0.0], [0.0, -4.0, 0.0]]))
-        return np.zeros((0, failures.shape[1])), 0
-
-    monkeypatch.setattr(_failure_probability, "design_points", record)
-    perturbations, _ = start_perturbations(scenario, 4.8, ij.normal(1.0, 0.3))
-    ij.failure_probability(scenario, perturbations, runs=100, **RUN)
-    assert np.all(np.isfinite(pieces_at["z"].margins[0]))
-    assert np.all(np.isnan(pieces_at["z"].margins[1]))
 
 
 @pytest.mark.slow
@@ -295,7 +280,7 @@ def test_importance_sampling_without_failures_reports_subset_simulation(
         return sample(lambda z: np.ones(len(z)), points, **options)
 
     monkeypatch.setattr(_failure_probability, "importance_sampling", without_failures)
-    found = ij.failure_probability(scenario, perturbations, estimator="importance", runs=100, **RUN)
+    found = failure_probability(scenario, perturbations, estimator="importance", runs=100)
     assert found.estimator == "subset"
     assert not found.is_upper_bound
     assert 0.1 < found.estimate / probability < 10  # from 500 samples of a level
@@ -320,9 +305,8 @@ class AnalyticSpace:
       gradients: d of each piece by z, (m, d).
     """
 
-    prepared = SimpleNamespace(options=SimpleNamespace(seed=0))
-
-    def __init__(self, pieces, gradients):
+    def __init__(self, pieces, gradients, seed=0):
+        self.prepared = SimpleNamespace(options=SimpleNamespace(seed=seed))
         self.pieces = pieces
         self.gradients = np.asarray(gradients, float)
         self.size = self.gradients.shape[1]
@@ -338,80 +322,102 @@ class AnalyticSpace:
         return Pieces(self.pieces(z), gradients)
 
 
-class SearchedPieces:
+class SearchedPieces(NamedTuple):
     """The pieces of an `AnalyticSpace`, as the check of an estimate takes them."""
 
-    is_available = True
-
-    def __init__(self, space):
-        self.space = space
+    space: AnalyticSpace
+    is_available: bool = True
 
     def __call__(self, z):
         return self.space.of_pieces(z)
 
 
-def checked_estimate(space):
-    """The estimate of subset simulation, and the one that its check reports."""
-    options = _failure_probability.FailureOptions("subset", "positions", 0.0, 0.95, 1000)
+def options_of(estimator):
+    return _failure_probability.FailureOptions(estimator, "positions", 0.0, 0.95, 1000)
+
+
+def checked_estimate(pieces, gradients, seed=0):
+    """The estimate of subset simulation, and what its check reports."""
+    space, options = AnalyticSpace(pieces, gradients, seed), options_of("subset")
     first = _failure_probability._by_subset(space, options, options.runs)
-    reported, _ = _failure_probability._checked_by_importance(
+    checked = _failure_probability._checked_by_importance(
         space, options, SearchedPieces(space), first, 1.0
     )
-    return first, reported
+    return first, checked
 
 
-def test_failures_that_subset_simulation_misses_are_found_by_the_check():
-    """Its levels follow the piece that is small, z_0 > 5.2; most failures are at z_1 > 4."""
-    from scipy.stats import norm
+def small_and_large(z):
+    """Subset simulation follows the small piece, z_0 > 5.2; most failures are at z_1 > 4."""
+    return np.stack([0.1 * (5.2 - z[:, 0]), 10 * (4.0 - z[:, 1])], axis=1)
 
-    def pieces(z):
-        return np.stack([0.1 * (5.2 - z[:, 0]), 10 * (4.0 - z[:, 1])], axis=1)
 
-    first, reported = checked_estimate(AnalyticSpace(pieces, [[-0.1, 0.0], [0.0, -10.0]]))
-    exact = norm.sf(5.2) + norm.sf(4.0)
-    assert first.estimator == "subset"
-    assert first.high < exact
+def with_floor(z):
+    """The small piece has a floor above zero."""
+    floor = 0.1 + np.maximum(0.0, 1.0 - z[:, 0])
+    return np.stack([floor, 10 * (4.5 - z[:, 1])], axis=1)
+
+
+def with_equal_margins(z):
+    """Subset simulation has one level, from which nothing leads on."""
+    return np.stack([np.ones(len(z)), 10 * (4.5 - z[:, 1])], axis=1)
+
+
+@pytest.mark.parametrize(
+    ("pieces", "slope", "exact", "note"),
+    [
+        (small_and_large, -0.1, norm.sf(5.2) + norm.sf(4.0), "missed failures"),
+        (with_floor, 0.0, norm.sf(4.5), "reached no failure"),
+        (with_equal_margins, 0.0, norm.sf(4.5), "reached no failure"),
+    ],
+)
+def test_failures_that_subset_simulation_misses_are_found_by_the_check(pieces, slope, exact, note):
+    first, checked = checked_estimate(pieces, [[slope, 0.0], [0.0, -10.0]])
+    reported = checked.estimate
+    assert (first.estimator == "subset" and first.high < exact) or first.is_upper_bound
+    assert first.is_upper_bound == (note == "reached no failure")
+    assert len(first.levels) > 1 or pieces is with_equal_margins
     assert reported.estimator == "importance"
     assert reported.low < exact < reported.high
-    assert "missed failures" in reported.notes[0]
+    assert note in reported.notes[0]
 
 
-def test_failures_that_subset_simulation_does_not_reach_are_found_by_the_check():
-    """The small piece has a floor above zero."""
-    from scipy.stats import norm
-
-    def pieces(z):
-        floor = 0.1 + np.maximum(0.0, 1.0 - z[:, 0])
-        return np.stack([floor, 10 * (4.5 - z[:, 1])], axis=1)
-
-    first, reported = checked_estimate(AnalyticSpace(pieces, [[0.0, 0.0], [0.0, -10.0]]))
-    assert first.is_upper_bound
-    assert reported.low < norm.sf(4.5) < reported.high
-    assert "reached no failure" in reported.notes[0]
-
-
-def test_failures_behind_a_margin_that_all_draws_share_are_found_by_the_check():
-    """Subset simulation has one level, from which nothing leads on."""
-    from scipy.stats import norm
+@pytest.mark.parametrize(("share", "hides"), [(0.1, True), (1.0, False)])
+def test_the_check_names_a_design_point_without_sampled_failures(share, hides):
+    """The levels follow z_0 > 4.5 where its piece is small, and a fourth of the failures is at
+    z_1 > 4.7; both regions are sampled where neither hides the other."""
+    large = 1.0 / share
 
     def pieces(z):
-        return np.stack([np.ones(len(z)), 10 * (4.5 - z[:, 1])], axis=1)
+        return np.stack([share * (4.5 - z[:, 0]), large * (4.7 - z[:, 1])], axis=1)
 
-    first, reported = checked_estimate(AnalyticSpace(pieces, [[0.0, 0.0], [0.0, -10.0]]))
-    assert first.is_upper_bound
-    assert len(first.levels) == 1
-    assert reported.low < norm.sf(4.5) < reported.high
+    first, checked = checked_estimate(pieces, [[-share, 0.0], [0.0, -large]])
+    assert np.any(first.failures.z[:, 1] > 4.7) != hides
+    if not hides:
+        assert checked.estimate.notes == ()
+        return
+    assert checked.estimate.probability == first.probability
+    (note,) = checked.estimate.notes
+    assert "near the design point at distance 4.70, which has about 28% of" in note
+    np.testing.assert_allclose(checked.points, [[4.5, 0.0], [0.0, 4.7]], atol=1e-6)
+    assert "1024 samples around 2 design points at distances 4.50 to 4.70 gave" in checked.check
+
+
+def test_importance_sampling_without_design_points_states_none():
+    space = AnalyticSpace(lambda z: np.ones((len(z), 1)), [[0.0, 0.0]])
+    options = options_of("importance")
+    found = _failure_probability._by_importance(space, options, SearchedPieces(space), 1.0)
+    assert found.points.shape == (0, 2)
+    assert "The samples are around the medians of all draws. Check: " in found.check
+    assert found.estimate.notes[0] == _failure_probability.NO_DESIGN_POINT
 
 
 def test_the_check_keeps_an_estimate_that_it_confirms():
     """Of fifty estimates of one half space, at most a few are replaced: the check does not
     select the larger one of two estimates that agree."""
-    space = AnalyticSpace(lambda z: 4.75 - z[:, :1], [[-1.0, 0.0]])
     replaced = 0
     for seed in range(50):
-        space.prepared = SimpleNamespace(options=SimpleNamespace(seed=seed))
-        first, reported = checked_estimate(space)
-        replaced += reported.estimator != first.estimator
+        first, checked = checked_estimate(lambda z: 4.75 - z[:, :1], [[-1.0, 0.0]], seed)
+        replaced += checked.estimate.estimator != first.estimator
     assert replaced <= 2
 
 
@@ -421,13 +427,11 @@ def test_a_note_says_that_chains_cannot_follow_noise(scenario):
     perturbations, distance = start_perturbations(scenario, 4.0)
     with pytest.raises(ValueError, match=r"method: got 'rk4'.*method=.euler_maruyama"):
         ij.failure_probability(noisy, perturbations, duration=0.02)
-    options = RUN | {"method": "euler_maruyama"}
-    found = ij.failure_probability(noisy, perturbations, runs=300, **options)
+    options = {"method": "euler_maruyama", "runs": 300}
+    found = failure_probability(noisy, perturbations, **options)
     assert "Markov chains" in found.notes[-1]
     assert found.interval[0] < exact(distance, 4.0) < found.interval[1]
-    crude = ij.failure_probability(
-        noisy, perturbations, runs=300, estimator="monte_carlo", **options
-    )
+    crude = failure_probability(noisy, perturbations, estimator="monte_carlo", **options)
     assert not any("Markov chains" in note for note in crude.notes)
 
 
@@ -440,8 +444,6 @@ def test_noise_is_a_function_of_the_point():
 
 def test_joint_samples():
     """Leaves of a group are drawn from one sample; in files as the other distributions."""
-    from iblf_jax.files.study import study_from_dict
-
     values = np.arange(12.0).reshape(4, 3)
     drawn = ij.joint_samples(values, "g", [0.0, 1.0, 1.0, 0.0])
     np.testing.assert_array_equal(drawn.quantile(np.array([0.4])), values[1])
@@ -450,16 +452,12 @@ def test_joint_samples():
     for bad in ({"values": 1.0}, {"group": ""}, {"weights": [1.0]}, {"weights": np.zeros(4)}):
         with pytest.raises(ValueError, match="joint_samples"):
             ij.joint_samples(**({"values": values, "group": "g"} | bad))
-    import tomllib
-
     text = cases.STUDY.replace(
         'initial.q = { offset = "normal", std = 0.05 }',
         'initial.q = { value = "joint_samples", values = [[0.1, 0.2], [0.3, 0.4]], group = "g" }',
     )
-    file = study_from_dict(tomllib.loads(text), "study")
-    np.testing.assert_array_equal(
-        file.perturbations["initial.q"].distribution.values, [[0.1, 0.2], [0.3, 0.4]]
-    )
+    drawn = study_from_dict(tomllib.loads(text), "study").perturbations["initial.q"].distribution
+    np.testing.assert_array_equal(drawn.values, [[0.1, 0.2], [0.3, 0.4]])
 
 
 def test_leaves_of_a_group_have_the_same_draws(scenario):
@@ -467,45 +465,31 @@ def test_leaves_of_a_group_have_the_same_draws(scenario):
     the same."""
     mass = ij.joint_samples([[1.0, 1.0], [1.1, 1.1], [1.2, 1.2]], "g")
     normal = ij.joint_normal([1.0, 1.0], 0.01 * np.eye(2), "g")
-    for other in (mass, normal):
-        perturbations = {
-            "plant.mass": ij.factor(other),
-            "plant.payload": ij.value(ij.joint_samples([0.1, 0.2], "g")),
-        }
-        with pytest.raises(ValueError, match=r"group 'g'.*plant\.mass.*plant\.payload"):
-            ij.monte_carlo(scenario, perturbations, runs=8, duration=0.01, dt=1e-3)
-    weights = {"weights": [1.0, 2.0, 3.0]}
-    payload = ij.value(ij.joint_samples([0.1, 0.2, 0.3], "g", **weights))
-    with pytest.raises(ValueError, match="weights of samples"):
-        ij.monte_carlo(
-            scenario,
-            {"plant.mass": ij.factor(mass), "plant.payload": payload},
-            runs=8,
-            duration=0.01,
-            dt=1e-3,
-        )
+    two = ij.joint_samples([0.1, 0.2], "g")
+    weighted = ij.joint_samples([0.1, 0.2, 0.3], "g", weights=[1.0, 2.0, 3.0])
+    words = r"group 'g'.*plant\.mass.*plant\.payload"
+    for of_mass, of_load, message in (
+        (mass, two, words),
+        (normal, two, words),
+        (mass, weighted, "weights of samples"),
+    ):
+        perturbations = {"plant.mass": ij.factor(of_mass), "plant.payload": ij.value(of_load)}
+        with pytest.raises(ValueError, match=message):
+            study_of(scenario, perturbations, 8)
 
 
 @pytest.mark.slow
 def test_the_draws_near_failure_are_perturbations(scenario, rare):
     """All of the draws fail or nearly fail, and keep their leaves together."""
     found, _, _ = rare
-    study = ij.monte_carlo(
-        scenario,
-        found.rare_draws,
-        runs=200,
-        duration=0.02,
-        dt=1e-3,
-        method="euler",
-        metrics=(ij.metrics.Margin(),),
+    study, margins = study_of(scenario, found.rare_draws, 200)
+    expected = found.levels[-1].probability
+    assert np.mean(margins <= 0) == pytest.approx(expected, abs=0.12)
+    drawn, known = (
+        {tuple(x) for x in np.column_stack([values["initial.q[1]"], values["plant.mass"]])}
+        for values in (study.samples, found.nearby.values)
     )
-    share = np.mean(study.metrics.margin.min(axis=1) <= 0)
-    assert share == pytest.approx(found.levels[-1].probability, abs=0.12)
-    drawn = np.column_stack([study.samples["initial.q[1]"], study.samples["plant.mass"]])
-    known = np.column_stack(
-        [found.nearby.values["initial.q[1]"], found.nearby.values["plant.mass"]]
-    )
-    assert {tuple(x) for x in drawn} <= {tuple(x) for x in known}
+    assert drawn <= known
 
 
 @pytest.mark.slow
@@ -522,8 +506,6 @@ def test_the_requirement_of_a_probability(rare):
 
 @pytest.mark.slow
 def test_the_command(tmp_path, capsys, monkeypatch):
-    from iblf_jax import cli
-
     monkeypatch.chdir(tmp_path)
     text = cases.STUDY.split("[study]")[0] + '[failure]\nestimator = "monte_carlo"\nruns = 400\n'
     (tmp_path / "failure.toml").write_text(text)
@@ -557,15 +539,9 @@ def test_tuned_gains_keep_a_probability():
     scenario, perturbations = arm(36.0)
     before = ij.failure_probability(scenario, perturbations, runs=1000, **OF_ARM)
     limit = 1e-3 * before.estimate
-    best = ij.tune(
-        scenario,
-        ["controller.Kp", "controller.Kd"],
-        ij.objectives.effort() + ij.objectives.failure_probability_below(limit, before),
-        perturbations=before.rare_draws,
-        runs=32,
-        effort="quick",
-        **OF_ARM,
-    )
+    goal = ij.objectives.effort() + ij.objectives.failure_probability_below(limit, before)
+    options = OF_ARM | {"perturbations": before.rare_draws, "runs": 32, "effort": "quick"}
+    best = ij.tune(scenario, ["controller.Kp", "controller.Kd"], goal, **options)
     after = ij.failure_probability(best.scenario, perturbations, **before.arguments)
     assert after.estimate < limit < before.estimate
 
@@ -576,9 +552,8 @@ def test_fifty_estimates_of_a_few_in_a_thousand():
     three standard errors, and the 95 % interval covers in at least 90 % of the repetitions."""
     scenario, perturbations = arm(35.0)
     options = OF_ARM | {"progress": False}
-    crude = ij.failure_probability(
-        scenario, perturbations, estimator="monte_carlo", runs=200_000, **options
-    )
+    many = options | {"estimator": "monte_carlo", "runs": 200_000}
+    crude = ij.failure_probability(scenario, perturbations, **many)
     assert 1e-3 < crude.estimate < 5e-3
     found = [
         ij.failure_probability(scenario, perturbations, runs=1000, seed=seed, **options)
@@ -586,9 +561,7 @@ def test_fifty_estimates_of_a_few_in_a_thousand():
     ]
     assert {x.estimator for x in found} == {"subset"}
     estimates = np.array([x.estimate for x in found])
-    error = np.hypot(
-        np.std(estimates) / np.sqrt(50), crude.coefficient_of_variation * crude.estimate
-    )
-    assert abs(np.mean(estimates) - crude.estimate) < 3 * error
+    own, of_crude = np.std(estimates) / 50**0.5, crude.coefficient_of_variation * crude.estimate
+    assert abs(np.mean(estimates) - crude.estimate) < 3 * np.hypot(own, of_crude)
     covered = np.mean([x.interval[0] <= crude.estimate <= x.interval[1] for x in found])
     assert covered >= 0.9

@@ -19,12 +19,9 @@ SHIP = ij.presets.cybership_ii()
 # ------------------------------------------------------------ vessel
 
 
-def test_inertia_matrix_of_cybership_ii_is_the_published_one():
+def test_inertia_damping_and_coriolis_of_cybership_ii_are_the_published_ones():
     expected = [[25.8, 0.0, 0.0], [0.0, 33.8, 1.0948], [0.0, 1.0948, 2.76]]
     np.testing.assert_allclose(SHIP.inertia_matrix(), expected, rtol=1e-12)
-
-
-def test_damping_of_cybership_ii_is_the_published_one():
     u, v, r = 0.4, -0.2, 0.3
     forces = np.asarray(SHIP.damping_matrix(jnp.asarray([u, v, r]))) @ [u, v, r]
     surge = 0.72253 * u + 1.32742 * abs(u) * u + 5.86643 * u**3
@@ -35,10 +32,6 @@ def test_damping_of_cybership_ii_is_the_published_one():
         1.9 - 0.08 * abs(v) + 0.75 * abs(r)
     ) * r
     np.testing.assert_allclose(forces, [surge, sway, yaw], rtol=1e-12)
-
-
-def test_coriolis_of_cybership_ii_is_the_published_one():
-    u, v, r = 0.4, -0.2, 0.3
     C = np.asarray(SHIP.coriolis_matrix(jnp.asarray([u, v, r])))
     c13, c23 = -(33.8 * v + 1.0948 * r), 25.8 * u
     np.testing.assert_allclose(C, [[0, 0, c13], [0, 0, c23], [-c13, -c23, 0]], rtol=1e-12)
@@ -58,6 +51,21 @@ def test_the_power_of_a_vessel_is_that_of_thrust_and_damping(rng):
         assert rate[0, 2] == pytest.approx(x[1, 2])
 
 
+def test_a_mooring_pulls_a_vessel_back_by_the_force_of_its_potential(rng):
+    """nu^T g(eta) is the rate of 1/2 sum stiffness (eta - position)^2 along eta' = R nu."""
+    stiffness, rest = np.array([3.0, 5.0, 0.8]), np.array([0.2, -0.1, 0.3])
+    moored = dataclasses.replace(SHIP, restoring=ij.plants.Mooring(stiffness, rest))
+    x = jnp.asarray(rng.normal(size=(2, 3)))
+    rates = [ij.plants.level_rate(plant, 2, 0.0, x, jnp.zeros(3)) for plant in (SHIP, moored)]
+    force = SHIP.inertia_matrix() @ (rates[0] - rates[1])
+    power = stiffness * (x[0] - rest) @ (SHIP.rotation(x[0, 2]) @ x[1])
+    np.testing.assert_allclose(x[1] @ force, power, rtol=1e-11)
+    at_rest = ij.plants.level_rate(moored, 2, 0.0, jnp.stack([rest, jnp.zeros(3)]), jnp.zeros(3))
+    np.testing.assert_array_equal(at_rest, 0.0)
+    units = [p.unit for p in ij.parameters(moored) if "stiffness" in p.path]
+    assert units == ["N/m, N/m, N m/rad"]
+
+
 def test_a_vessel_with_heading_north_moves_north_in_surge():
     x = jnp.asarray([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0]])
     np.testing.assert_allclose(plants.flow(SHIP, 0.0, x, jnp.zeros(3))[0], [0.5, 0.0, 0.0])
@@ -65,10 +73,11 @@ def test_a_vessel_with_heading_north_moves_north_in_surge():
     np.testing.assert_allclose(plants.flow(SHIP, 0.0, x, jnp.zeros(3))[0], [0, 0.5, 0], atol=1e-15)
 
 
-def test_a_vessel_refuses_added_masses_of_the_wrong_sign():
-    with pytest.raises(ValueError, match=r"Vessel: got m11 = 13.*negative numbers") as caught:
+def test_a_vessel_refuses_added_masses_of_the_wrong_sign_and_what_is_no_restoring_force():
+    with pytest.raises(ValueError, match=r"Vessel: got m11 = 13.*m22 = -7.*negative numbers"):
         plants.Vessel(mass=23.0, yaw_inertia=1.7, X_du=10.0, Y_dv=30.0)
-    assert "m22 = -7" in str(caught.value)
+    with pytest.raises(ValueError, match=r"Vessel\.restoring.*RESTORING"):
+        dataclasses.replace(SHIP, restoring=3.0)
 
 
 # ------------------------------------------------------------ driven pendulum
@@ -97,31 +106,6 @@ def test_the_driven_pendulum_is_an_electric_drive_on_a_pendulum(rng):
 # ------------------------------------------------------------ a user's class
 
 
-@ij.component
-class Pendulum:
-    """x1' = x2,  D x2' = x3 - B x2 - N sin x1,  M x3' = u - H x3 - Km x2."""
-
-    D: ij.Leaf = ij.leaf("kg m^2", sign="positive")
-    B: ij.Leaf = ij.leaf("N m s/rad")
-    N: ij.Leaf = ij.leaf("N m")
-    M: ij.Leaf = ij.leaf("s", sign="positive")
-    H: ij.Leaf = ij.leaf("1")
-    Km: ij.Leaf = ij.leaf("N m s/rad")
-    n = 1  # numbers per level
-    order = 3  # levels
-
-    def drift(self, t, x):
-        load = -(self.B * x[1] + self.N * jnp.sin(x[0])) / self.D
-        return jnp.stack([0.0 * x[0], load, -(self.H * x[2] + self.Km * x[1]) / self.M])
-
-    def gain(self, t, x):
-        one = jnp.ones_like(x[0])
-        return jnp.stack([one, one / self.D, one / self.M])
-
-
-NUMBERS = {"D": 1.0, "B": 1.0, "N": 10.0, "M": 0.1, "H": 1.0, "Km": 10.0}
-
-
 def scenario_of(plant, **parts):
     return ij.Scenario(
         plant=plant,
@@ -133,24 +117,6 @@ def scenario_of(plant, **parts):
     )
 
 
-@pytest.mark.slow
-def test_a_users_class_fits_the_contract_and_runs():
-    plant = Pendulum(**NUMBERS)
-    ij.testing.check_plant(plant)
-    run = ij.simulate(scenario_of(plant), duration=3.0, dt=2e-3)
-    assert int(run.status) == 0
-    assert run.x.shape == (1501, 3, 1)
-    assert np.abs(run.e1[-1]) < 1e-3
-    assert float(run.metrics.relative_numerical_error) < 1e-5
-
-
-def test_a_users_leaves_are_parameters_with_units():
-    scenario = scenario_of(Pendulum(**NUMBERS), model=Pendulum(**NUMBERS))
-    units = {p.path: p.unit for p in ij.parameters(scenario)}
-    assert units["plant.D"] == "kg m^2"
-    assert units["model.Km"] == "N m s/rad"
-
-
 # ------------------------------------------------------------ the structure, at the entry points
 
 
@@ -160,25 +126,30 @@ def with_drift(drift):
     )
 
 
+COUPLED = plants.StrictFeedback(lambda t, x: -x, lambda t, x: 1.0 + x[::-1] ** 2, n=1, order=3)
+
+
 @pytest.mark.parametrize(
-    ("drift", "words"),
+    ("plant", "words"),
     [
-        (lambda t, x: jnp.stack([x[1], -x[0], -x[2]]), "row 0.*x.1.*belongs in row 0 of the gain"),
-        (lambda t, x: jnp.stack([-x[0], x[2] ** 2, -x[2]]), "row 1 that depends on x.2."),
-        (lambda t, x: jnp.stack([x[2] * x[0], -x[1], -x[2]]), "row 0.*x.2.*other levels"),
+        (
+            with_drift(lambda t, x: jnp.stack([x[1], -x[0], -x[2]])),
+            "drift.*row 0.*x.1.*belongs in row 0 of the gain",
+        ),
+        (
+            with_drift(lambda t, x: jnp.stack([-x[0], x[2] ** 2, -x[2]])),
+            "drift.*row 1 that depends on x.2.",
+        ),
+        (
+            with_drift(lambda t, x: jnp.stack([x[2] * x[0], -x[1], -x[2]])),
+            "drift.*row 0.*x.2.*other levels",
+        ),
+        (COUPLED, r"gain\(t, x\): got row 0 that depends on x\[2\]"),
     ],
-    ids=["complete-equation", "square-at-a-start-of-0", "two-levels-up"],
+    ids=["complete-equation", "square-at-a-start-of-0", "two-levels-up", "gain"],
 )
-def test_a_drift_that_depends_on_later_levels_is_refused(drift, words):
-    with pytest.raises(ValueError, match=rf"plant.drift\(t, x\): got {words}"):
-        canonical(scenario_of(with_drift(drift)))
-
-
-def test_a_gain_that_depends_on_later_levels_is_refused():
-    plant = plants.StrictFeedback(
-        drift=lambda t, x: -x, gain=lambda t, x: 1.0 + x[::-1] ** 2, n=1, order=3
-    )
-    with pytest.raises(ValueError, match=r"plant.gain\(t, x\): got row 0 that depends on x\[2\]"):
+def test_rows_that_depend_on_later_levels_are_refused(plant, words):
+    with pytest.raises(ValueError, match=f"plant.{words}"):
         canonical(scenario_of(plant))
 
 

@@ -11,7 +11,6 @@ from conftest import ROOT
 from iblf_jax.controllers import Saturated
 
 import iblf_jax as ij
-from iblf_jax.cli import main
 from iblf_jax.files import scenario as scenario_file
 from iblf_jax.files.study import load_study_file
 from iblf_jax.files.tuning import load_tuning_file
@@ -55,11 +54,10 @@ def test_what_the_file_leaves_out_follows_from_the_arm(folder):
     np.testing.assert_array_equal(scenario.controller.limit, arm.effort)
     np.testing.assert_allclose(scenario.initial.q, scenario.reference.position(np.zeros(())))
     assert jax.tree.structure(scenario.plant) == jax.tree.structure(arm)
-    middle = np.array([0.0, -1.2, 1.6, -1.4, -1.57, 0.0])
-    near = "".join(
-        f"[bounds.{side}]\nkind = 'constant'\nvalue = {(middle + distance).tolist()}\n"
-        for side, distance in (("lower", -0.35), ("upper", 0.35))
-    )
+    near = ""
+    for side, distance in (("lower", -0.35), ("upper", 0.35)):
+        value = (np.array([0.0, -1.2, 1.6, -1.4, -1.57, 0.0]) + distance).tolist()
+        near += f"[bounds.{side}]\nkind = 'constant'\nvalue = {value}\n"
     bounded = ij.load_scenario(written(folder, ROBOT + REFERENCE + near))
     expected = ij.presets.arm_scenario(arm, bounded.reference, bounds=bounded.bounds[0])
     weight = bounded.controller.law.weight
@@ -88,8 +86,6 @@ def test_joints_have_one_name_in_paths_and_messages(folder):
     high = ij.with_parameters(scenario, {"bounds.lower.value[elbow_joint]": 5.0})
     with pytest.raises(ValueError, match=r"^bounds of joint elbow_joint: got"):
         ij.simulate(high, duration=0.01)
-    with pytest.raises(ValueError, match=r"controller\.K2\[elbow\]"):
-        ij.with_parameters(scenario, {"controller.K2[elbow]": 9.0})
     assert scenario.loop.plant.notation.left_bounds(1, 2) == "Joint elbow_joint left its bounds"
 
 
@@ -116,18 +112,6 @@ def test_saved_it_needs_no_other_file(folder):
     assert "urdf" not in (folder / "saved.toml").read_text()
 
 
-@pytest.mark.slow
-def test_simulate_from_the_command_line(folder, capsys):
-    path = written(folder, ROBOT + REFERENCE + RUN)
-    changed = ["--set", "plant.link[wrist_1_link].mass=1.3", "--out", str(folder / "out")]
-    assert main(["simulate", str(path), *changed]) == 0
-    assert "status: ok" in capsys.readouterr().out
-    saved = ij.load_scenario(folder / "out" / "scenario.toml")
-    assert float(saved.plant.mass[3]) == 1.3
-    assert main(["parameters", str(path)]) == 0
-    assert "plant.link[forearm_link].mass" in capsys.readouterr().out
-
-
 def test_studies_and_tuning_read_it_too(folder):
     mass, base = "plant.link[forearm_link].mass", ROBOT + REFERENCE + RUN
     draws = f'[perturbations]\n"{mass}" = {{ factor = "uniform", low = 0.8, high = 1.2 }}\n'
@@ -147,10 +131,8 @@ def test_studies_and_tuning_read_it_too(folder):
         ('[robot]\nfile = "ur5.urdf"\ntip = "hand"\n', r"robot\.file: tip: got 'hand'"),
         ('[robot]\nfile = "ur5.urdf"\nmass = 2.0\n', r"robot\.mass: got an unknown key"),
         ("[robot]\nfile = 3\n", r"robot\.file: got 3, expected a string"),
-        (
-            '[robot]\nfile = "ur5.urdf"\ntip = "tool0"\nlocked = { elbow = 0.1 }\n',
-            r"robot\.file: .*elbow",
-        ),
+        (ROBOT + "locked = { elbow = 0.1 }\n", r"robot\.file: .*elbow"),
+        (ROBOT + "repair = 1\n", r"robot\.repair: got 1, expected true or false"),
         (ROBOT + '[plant]\nfile = "ur5.urdf"\n', "beside"),
         ('[model]\nfile = "ur5.urdf"\n', "plant: got nothing"),
     ],
@@ -159,11 +141,6 @@ def test_what_is_wrong_is_said(folder, text, message):
     with pytest.raises(ValueError, match=message) as error:
         ij.load_scenario(written(folder, text + REFERENCE))
     assert "scenario.toml" in str(error.value)
-
-
-def test_a_reference_is_needed(folder):
-    with pytest.raises(ValueError, match="reference: got nothing"):
-        ij.load_scenario(written(folder, ROBOT))
 
 
 def test_without_the_extra_it_says_so(folder, monkeypatch):
@@ -184,6 +161,3 @@ def test_repair(folder):
     ij.save_scenario(scenario, folder / "saved.toml")
     again = ij.load_scenario(folder / "saved.toml")
     assert again.plant.repaired == scenario.plant.repaired
-    assert jax.tree.structure(again) == jax.tree.structure(scenario)
-    with pytest.raises(ValueError, match=r"robot\.repair: got 1, expected true or false"):
-        ij.load_scenario(written(folder, ROBOT + "repair = 1\n" + REFERENCE))

@@ -7,14 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from iblf_jax.robots import (
-    PlanarChain,
-    TwoLink,
-    energy_gradient,
-    inverse_dynamics,
-    mass_matrix_rate,
-    momentum,
-)
+from iblf_jax.robots import PlanarChain, TwoLink, energy_gradient, inverse_dynamics, momentum
 
 import iblf_jax as ij
 
@@ -51,22 +44,6 @@ def test_chain_of_two_is_the_closed_form(rng):
         pair = (everything(kind(**links), q, v, u) for kind in (PlanarChain, TwoLink))
         for a, b in zip(*pair, strict=True):
             np.testing.assert_allclose(a, b, rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize("n", [1, 3, 7])
-def test_mass_rate_minus_two_c_is_skew(n, rng):
-    robot = PlanarChain(**random_links(n, rng))
-
-    @jax.jit
-    def symmetric_part(q, v):
-        C = jax.vmap(lambda e: robot.coriolis(q, v, e), out_axes=1)(jnp.eye(n))
-        N = mass_matrix_rate(robot, q, v) - 2 * C
-        return N + N.T, jnp.linalg.eigvalsh(robot.mass_matrix(q))
-
-    for _ in range(5):
-        S, modes = symmetric_part(rng.uniform(-3, 3, n), rng.normal(size=n))
-        assert np.max(np.abs(S)) <= 1e-12 * max(1.0, float(modes[-1]))
-        assert modes[0] > 0
 
 
 def test_kinetic_and_potential_energy_from_positions(rng):

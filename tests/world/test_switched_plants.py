@@ -47,10 +47,8 @@ def independent_end(duration):
     """The state at the end, by an adaptive method that restarts at each switch."""
     x, edges = np.array([0.2, 0.5]), [0.0, *TIMES, duration]
     for mass, begin, end in zip(MASSES, edges[:-1], edges[1:], strict=True):
-        solved = solve_ivp(
-            independent_rate, (begin, end), x, args=(mass,), rtol=1e-12, atol=1e-13, method="DOP853"
-        )
-        x = solved.y[:, -1]
+        how = {"args": (mass,), "rtol": 1e-12, "atol": 1e-13}
+        x = solve_ivp(independent_rate, (begin, end), x, "DOP853", **how).y[:, -1]
     return x
 
 
@@ -104,14 +102,22 @@ def test_members_of_the_inner_plant_are_passed_through():
 
 # --- a Markov chain -------------------------------------------------------------------------------
 
+PAIR = {"mass[0]": (1.0, 2.0)}
+
+
+def markov(**fields):
+    return plants.MarkovSwitched(LINK, {"mass[0]": MASSES}, rates=Q, **fields)
+
+
+def paths_of(scenario, seed, count):
+    """The plants of many runs, each with a path of its own."""
+    keys = jax.vmap(lambda i: noise_key(jax.random.PRNGKey(seed), i))(jnp.arange(count))
+    return jax.jit(jax.vmap(lambda key: realised(scenario, key).plant))(keys.astype(float))
+
 
 @pytest.mark.slow
 def test_distribution_of_the_path():
-    scenario = canonical(
-        scenario_of(plants.MarkovSwitched(LINK, {"mass[0]": MASSES}, rates=Q, switches=3))
-    )
-    keys = jax.vmap(lambda i: noise_key(jax.random.PRNGKey(2), i))(jnp.arange(20_000))
-    found = jax.jit(jax.vmap(lambda key: realised(scenario, key).plant))(keys.astype(float))
+    found = paths_of(canonical(scenario_of(markov(switches=3))), 2, 20_000)
     times, modes = np.asarray(found.times), np.asarray(found.sequence)
     before = np.concatenate([np.zeros((len(modes), 1)), modes[:, :-1]], axis=1)
     dwell = np.diff(times, axis=1, prepend=0.0)
@@ -129,18 +135,15 @@ def test_distribution_of_the_path():
 @pytest.mark.slow
 def test_a_rate_that_is_varied_alone_changes_the_dwell_time():
     """A study varies q_ij without q_ii: the mean time in mode i is 1/sum_{j != i} q_ij."""
-    one = scenario_of(plants.MarkovSwitched(LINK, {"mass[0]": MASSES}, rates=Q, switches=1))
-    scenario = canonical(ij.with_parameters(one, {"plant.rates[0][1]": 9.0}))
-    keys = jax.vmap(lambda i: noise_key(jax.random.PRNGKey(3), i))(jnp.arange(4_000))
-    found = jax.jit(jax.vmap(lambda key: realised(scenario, key).plant))(keys.astype(float))
+    one = scenario_of(markov(switches=1))
+    found = paths_of(canonical(ij.with_parameters(one, {"plant.rates[0][1]": 9.0})), 3, 4_000)
     assert np.mean(found.times[:, 0]) == pytest.approx(0.1, rel=4 / np.sqrt(4_000))
     assert np.mean(np.asarray(found.sequence)[:, 0] == 1) == pytest.approx(0.9, abs=0.02)
 
 
 def test_the_code_of_a_path_does_not_grow_with_its_switches():
     def size(switches):
-        markov = plants.MarkovSwitched(LINK, {"mass[0]": MASSES}, rates=Q, switches=switches)
-        scenario = canonical(scenario_of(markov))
+        scenario = canonical(scenario_of(markov(switches=switches)))
         path = jax.make_jaxpr(lambda key: realised(scenario, key).plant.times)(jnp.zeros(4))
         return len(str(path).splitlines())
 
@@ -149,12 +152,12 @@ def test_the_code_of_a_path_does_not_grow_with_its_switches():
 
 @pytest.mark.slow
 def test_every_run_of_a_study_has_a_path_of_its_own():
-    plant = plants.MarkovSwitched(LINK, {"mass[0]": MASSES}, rates=Q, switches=2)
+    scenario = scenario_of(markov(switches=2))
 
     def make(runs, chunk):
         how = {"duration": 0.5, "dt": 1e-2, "metrics": (ij.metrics.Tracking(),), "progress": False}
         executor = ij.studies.LocalExecutor(chunk=chunk)
-        return ij.monte_carlo(scenario_of(plant), {}, runs=runs, executor=executor, **how)
+        return ij.monte_carlo(scenario, {}, runs=runs, executor=executor, **how)
 
     every, some = make(600, None), make(300, 256)
     for name in ("ise", "switches", "shortest_dwell_time"):
@@ -178,20 +181,8 @@ def test_every_run_of_a_study_has_a_path_of_its_own():
         (lambda: plants.Switched(LINK, {"mass[0]": (1.0, 2.0, 3.0)}, [0.6, 0.5]), "increasing"),
         (lambda: plants.Switched(3.0, {"mass[0]": (1.0, 2.0)}, [0.5]), "Robot"),
         (lambda: plants.Switched(LINK, {}, [0.5]), "parameters"),
-        (
-            lambda: plants.MarkovSwitched(LINK, {"mass[0]": (1.0, 2.0)}, [[-1.0, 2.0], [0, 0]]),
-            "sum",
-        ),
-        (
-            lambda: scenario_of(
-                plants.Switched(
-                    plants.MarkovSwitched(LINK, {"mass[0]": MASSES}, rates=Q),
-                    {"mass[0]": (1.0, 2.0)},
-                    [0.5],
-                )
-            ),
-            "as the plant itself",
-        ),
+        (lambda: plants.MarkovSwitched(LINK, PAIR, [[-1.0, 2.0], [0, 0]]), "sum"),
+        (lambda: scenario_of(plants.Switched(markov(), PAIR, [0.5])), "as the plant itself"),
     ],
 )
 def test_modes_that_do_not_fit_are_refused(make, words):

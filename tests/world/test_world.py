@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from iblf_jax.bounds import tube_at
+from independent import Loop
 from scipy.interpolate import make_interp_spline
 
 import iblf_jax as ij
@@ -26,58 +27,25 @@ def derivatives(function, order):
     return jax.jit(lambda t: [f(t) for f in functions])
 
 
-def test_sinusoidal_reference(rng):
-    offset, amplitude, frequency, phase = rng.uniform(0.1, 2, (4, 2))
-    at = derivatives(references.Sinusoid(offset, amplitude, frequency, phase).position, 2)
-    for t in (0.0, 0.7, 12.0):
-        q, v, a = at(t)
-        angle = frequency * t + phase
-        np.testing.assert_allclose(q, offset + amplitude * np.sin(angle), rtol=1e-13)
-        np.testing.assert_allclose(v, amplitude * frequency * np.cos(angle), atol=1e-12)
-        np.testing.assert_allclose(a, -amplitude * frequency**2 * np.sin(angle), atol=1e-12)
-
-
-def test_quintic_is_at_rest_at_both_ends():
-    start, end = np.asarray([0.1, 0.5]), np.asarray([0.9, -0.2])
-    at = derivatives(references.Quintic(start, end, 2.5).position, 2)
-    for t, expected in ((-1.0, start), (0.0, start), (2.5, end), (9.0, end)):
-        q, v, a = at(t)
-        np.testing.assert_allclose(q, expected, atol=1e-14)
-        np.testing.assert_allclose([v, a], 0, atol=1e-12)
-    q, v, _ = at(1.25)
-    np.testing.assert_allclose(q, (start + end) / 2, atol=1e-14)
-    np.testing.assert_allclose(
-        v, 15 / 8 * (end - start) / 2.5, rtol=1e-12
-    )  # peak speed of a minimum-jerk motion
-
-
-TIMES, POINTS = (
-    (0.5, 1.0, 2.2, 3.0, 4.5),
-    np.asarray([[0.0, 0.1], [0.4, 0.3], [0.2, 0.8], [0.6, 0.4], [0.5, 0.5]]),
-)
+TIMES = (0.5, 1.0, 2.2, 3.0, 4.5)
+POINTS = np.asarray([[0.0, 0.1], [0.4, 0.3], [0.2, 0.8], [0.6, 0.4], [0.5, 0.5]])
 
 
 def test_spline_passes_its_waypoints_and_rests_at_the_ends():
     spline = references.WaypointSpline(TIMES, POINTS)
-    at = derivatives(spline.position, 5)
+    at = derivatives(spline.position, 2)
     for t, point in zip(TIMES, POINTS, strict=True):
         np.testing.assert_allclose(at(t)[0], point, atol=1e-12)
     for t, point in ((0.0, POINTS[0]), (0.5, POINTS[0]), (4.5, POINTS[-1]), (20.0, POINTS[-1])):
-        q, v, a, *_ = at(t)
+        q, v, a = at(t)
         np.testing.assert_allclose(q, point, atol=1e-12)
         np.testing.assert_allclose([v, a], 0, atol=1e-9)
-    for t in TIMES[1:-1]:  # four continuous derivatives at the inner waypoints
-        before, after = at(t - 1e-9)[:5], at(t + 1e-9)[:5]
-        for order in range(5):
-            np.testing.assert_allclose(before[order], after[order], atol=1e-5 * 10**order)
     rest = [(1, np.zeros(2)), (2, np.zeros(2))]
     expected = make_interp_spline(TIMES, POINTS, k=5, bc_type=(rest, rest))
     for t in np.linspace(0.5, 4.5, 23)[1:-1]:
         got = at(t)
         for order in range(3):
-            np.testing.assert_allclose(
-                got[order], expected.derivative(order)(t) if order else expected(t), atol=1e-9
-            )
+            np.testing.assert_allclose(got[order], expected(t, order), atol=1e-9)
 
 
 @pytest.mark.slow
@@ -99,7 +67,7 @@ def test_spline_with_more_derivatives_rests_at_its_ends(m):
             np.testing.assert_allclose(before[order], after[order], atol=1e-5 * 10**order)
 
 
-@pytest.mark.parametrize("m", [1, 4])
+@pytest.mark.parametrize("m", [1, 2, 4])
 def test_smooth_step_has_the_derivatives_that_it_states(m):
     start, end, duration = np.asarray([0.1, 0.5]), np.asarray([0.9, -0.2]), 2.5
     step = references.SmoothStep(start, end, duration, derivatives=m)
@@ -142,16 +110,6 @@ def test_the_heading_on_an_ellipse_is_along_its_tangent():
     turn = 2.0 * np.pi / 0.4
     grown = ellipse.position(1.0 + turn)[2] - ellipse.position(1.0)[2]
     assert grown == pytest.approx(2.0 * np.pi)
-
-
-@pytest.mark.slow
-def test_spline_is_differentiable_by_its_waypoints():
-    gradient = jax.jacobian(lambda w: references.WaypointSpline(TIMES, w).position(1.7)[0])(
-        jnp.asarray(POINTS)
-    )
-    assert gradient.shape == POINTS.shape
-    np.testing.assert_allclose(gradient[:, 1], 0)
-    assert float(jnp.sum(gradient)) == pytest.approx(1.0)  # lifting all waypoints lifts the spline
 
 
 @pytest.mark.parametrize(
@@ -216,33 +174,21 @@ def test_a_reference_needs_two_derivatives_and_no_third():
 
     for law in ("integral", "computed_torque", "pd"):
         scenario = ij.with_parts(ij.presets.zhang_yan_2024(law=law), reference=Outside())
-        rate = jax.eval_shape(
-            lambda s: closed_loop.rate(s, jnp.asarray(0.3), closed_loop.initial_state(s)), scenario
-        )
+        start = closed_loop.initial_state(scenario)
+        rate = jax.eval_shape(closed_loop.rate, scenario, jnp.asarray(0.3), start)
         assert rate.x.shape == (2, 2)
 
 
-def test_funnel_shrinks_onto_the_reference():
-    funnel = bounds.Funnel(initial=0.5, final=0.1, rate=2.0)
-    q_d = jnp.asarray([0.3, -0.2])
-    np.testing.assert_allclose(funnel.at(0.0, q_d), q_d + 0.5)
-    np.testing.assert_allclose(funnel.at(1.0, q_d), q_d + 0.4 * np.exp(-2.0) + 0.1)
-    np.testing.assert_allclose(funnel.at(50.0, q_d), q_d + 0.1)
-
-
 def torque(disturbance, t, q, dq, plant=TWO_LINK):
-    return np.asarray(
-        disturbance.torque(jnp.asarray(t), jnp.asarray(q), jnp.asarray(dq), plant, TWO_LINK)
-    )
+    return np.asarray(disturbance.torque(*map(jnp.asarray, (t, q, dq)), plant, TWO_LINK))
 
 
 def test_disturbances_by_hand(rng):
     q, dq = rng.uniform(-1, 1, (2, 2))
     np.testing.assert_array_equal(torque(disturbances.Nothing(), 1.0, q, dq), 0)
     wave = disturbances.Sinusoids(amplitude=[1.0, 2.0], frequency=3.0, phase=0.4, offset=0.2)
-    np.testing.assert_allclose(
-        torque(wave, 0.9, q, dq), 0.2 + np.asarray([1, 2]) * np.sin(2.7 + 0.4)
-    )
+    expected = 0.2 + np.asarray([1, 2]) * np.sin(2.7 + 0.4)
+    np.testing.assert_allclose(torque(wave, 0.9, q, dq), expected)
     step = disturbances.Step(size=[1.0, -2.0], time=3.0)
     np.testing.assert_array_equal(torque(step, 2.999, q, dq), 0)
     np.testing.assert_array_equal(torque(step, 3.0, q, dq), [1.0, -2.0])
@@ -250,39 +196,24 @@ def test_disturbances_by_hand(rng):
     friction = disturbances.Friction(viscous=0.5, coulomb=0.2, width=0.01)
     np.testing.assert_allclose(torque(friction, 0.0, q, np.asarray([2.0, -1.0])), [-1.2, 0.7])
     both = disturbances.Sum((friction, step, disturbances.Step(1.0, 5.0)))
-    np.testing.assert_allclose(
-        torque(both, 4.0, q, dq), torque(friction, 4.0, q, dq) + np.asarray([1.0, -2.0])
-    )
+    expected = torque(friction, 4.0, q, dq) + np.asarray([1.0, -2.0])
+    np.testing.assert_allclose(torque(both, 4.0, q, dq), expected)
     np.testing.assert_array_equal(both.jump_times(), [3.0, 5.0])
 
 
 def test_tip_force_does_the_work_that_it_should(rng):
     """Virtual work: F . d tip = tau . dq."""
-    push = disturbances.TipForce(
-        amplitude=[3.0, -2.0], frequency=[1.0, 2.0], phase=0.3, offset=[0.0, -1.0]
-    )
+    push = disturbances.TipForce([3.0, -2.0], [1.0, 2.0], phase=0.3, offset=[0.0, -1.0])
     q, dq, t = rng.uniform(-1, 1, 2), rng.normal(size=2), 0.8
-    force = np.asarray([0.0, -1.0]) + np.asarray([3.0, -2.0]) * np.sin(
-        np.asarray([1.0, 2.0]) * t + 0.3
-    )
-    moved = (
-        np.asarray(TWO_LINK.tip(q + 1e-6 * dq)) - np.asarray(TWO_LINK.tip(q - 1e-6 * dq))
-    ) / 2e-6
+    force = np.array([3.0 * np.sin(t + 0.3), -1.0 - 2.0 * np.sin(2.0 * t + 0.3)])
+    ahead, behind = (np.asarray(TWO_LINK.tip(q + h * dq)) for h in (1e-6, -1e-6))
+    moved = (ahead - behind) / 2e-6
     assert torque(push, t, q, dq) @ dq == pytest.approx(force @ moved, rel=1e-8)
 
 
-def test_the_papers_disturbance(rng):
-    """(4.3): f = M0 (0.3 sin t, 0.3 cos t) + C0 (0.3 cos 0.5t, 0.3 sin 0.5t), and with the model's
-    matrices, not the plant's."""
-    import independent
-
-    f = ij.presets.zhang_yan_2024().disturbance
-    q, dq, t = rng.uniform(-1, 1, 2), rng.normal(size=2), 1.7
-    M, C, _, _ = independent.Loop().arm(q)
-    for phase in (0.0, 1.0):
-        a = 0.3 * np.asarray([np.sin(t + phase), np.cos(t + phase)])
-        b = 0.3 * np.asarray([np.cos(t / 2 + phase), np.sin(t / 2 + phase)])
-        shifted = dataclasses.replace(f, phase=phase)
-        np.testing.assert_allclose(torque(shifted, t, q, dq), M @ a + C(dq) @ b, rtol=1e-12)
-    heavy = dataclasses.replace(TWO_LINK, mass=[5.0, 5.0])
-    np.testing.assert_array_equal(torque(f, t, q, dq, heavy), torque(f, t, q, dq))
+def test_the_papers_disturbance_has_the_matrices_of_the_model(rng):
+    """(4.3) itself is in `independent.Loop`."""
+    f, heavy = ij.presets.zhang_yan_2024().disturbance, dataclasses.replace(TWO_LINK, mass=5.0)
+    q, dq = rng.uniform(-1, 1, 2), rng.normal(size=2)
+    np.testing.assert_allclose(torque(f, 1.7, q, dq), Loop().disturbance(1.7, q, dq), rtol=1e-12)
+    np.testing.assert_array_equal(torque(f, 1.7, q, dq, heavy), torque(f, 1.7, q, dq))

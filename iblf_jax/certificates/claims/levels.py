@@ -187,6 +187,8 @@ class Levels(MainClaim):
         if not isinstance(law, BarrierBackstepping):
             about = f"(S.3) is about BarrierBackstepping; {type(law).__name__} has no claim of this"
             return f"{about} kind"
+        if law.addition:
+            return f"(S.3) is about (S.2), and the law has {law.addition}"
         if adaptive_law(scenario) is not None:
             return "(S.3) is about a constant model, and AdaptiveParameters changes it"
         for i, (barrier, k) in enumerate(zip(law.barriers, law.k, strict=True)):

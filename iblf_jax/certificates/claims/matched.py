@@ -111,6 +111,8 @@ class Matched(Theorem):
         law: TrackingLaw = unwrapped(scenario.controller)
         if not isinstance(law, BarrierBackstepping) or law.order != 2 or law.filter is not None:
             return "(F.3) is about BarrierBackstepping of order 2 with exact derivatives"
+        if law.addition:
+            return f"(F.3) is about (F.1), and the law has {law.addition}"
         if scenario.loop.model.uncertain_levels:
             return "(F.3) is about the torque on a robot"
         if not (checks.is_concrete(law.c) and np.all(np.asarray(law.c)[-1] > 0)):

@@ -211,6 +211,8 @@ class Settling(Claim):
             return f"(D.2) is about laws with decays, not about {type(law).__name__}"
         if law.filter is not None:
             return "(D.2) is about exact derivatives, and the law has filters"
+        if law.addition:
+            return f"(D.2) is about (S.2), and the law has {law.addition}"
         if any(part.rate(part.gain) is None for part in parts_of(law)):
             return "a barrier states no decay rate of its V"
         if all(decay.constant for decay in law.decays):

@@ -171,6 +171,8 @@ class TrackingLaw(Timed):
     """Of a law of the paper, "printed" or "corrected"."""
     filter: Leaf = None
     """Time constants of filters in place of exact derivatives [s]; None without filters."""
+    filter_form: str = "surface"
+    """What the errors of a law with filters contain."""
 
     @attribute
     def takes_shift(self) -> bool:
@@ -178,6 +180,11 @@ class TrackingLaw(Timed):
         rate (`LawContext.shifted`).
         """
         return False
+
+    @attribute
+    def addition(self) -> str:
+        """What it has that no claim about its plain form contains, in words; "" for nothing."""
+        return ""
 
     @attribute
     def has_auxiliary(self) -> bool:

@@ -1,7 +1,7 @@
 """The equations of barrier backstepping, level by level, for a plant in strict-feedback form.
 
 `exact_levels` computes (S.2) with the derivatives of the virtual controls along the flow of the
-model, and `surface_levels` with filters in their place; `barrier_backstepping` has the equations.
+model, and `filtered_levels` with filters in their place; `barrier_backstepping` has the equations.
 
 All derivatives are along one trajectory (`core.taylor`): those of x_j of the orders up to r - j,
 those of the reference and of the bounds, and then, level by level, those of alpha_i and of w_i s_i
@@ -23,6 +23,7 @@ from iblf_jax.control.controllers._base import LawContext
 from iblf_jax.control.decays import Decay, Exponential
 from iblf_jax.control.decays._base import gain_at
 from iblf_jax.core import taylor
+from iblf_jax.core.linalg import matvec, solve_spd
 from iblf_jax.world import plants
 from iblf_jax.world.bounds import Tube, bounds_at
 from iblf_jax.world.plants import Plant
@@ -41,7 +42,60 @@ class Design(NamedTuple):
     weight: jax.Array | None = None
     """w_i, (n,); None for 1."""
     decay: Decay = Exponential()
-    """Of V_i, which makes the gain a function of the time and of V_i."""
+    """Of V_i; it makes the gain a function of the time and of V_i."""
+    gain_matrix: jax.Array | None = None
+    """K of (S.6), (n, n); None for W."""
+    weight_matrix: jax.Array | None = None
+    """W of (S.6), (n, n); None for the unit matrix."""
+    damping: jax.Array | None = None
+    """gamma of the nonlinear damping (S.5), (n,); None for none."""
+    regressor: Callable | None = None
+    """phi(t, x), (r, n, m), of the nonlinear damping."""
+
+    def slope(self, tube: Tube, position: jax.Array) -> jax.Array:
+        """The slope of the level without its weight w, (n,)."""
+        if self.weight_matrix is None:
+            return self.barrier.slope(tube, position)
+        return matvec(self.weight_matrix, position - tube.q_d)
+
+    def value(self, tube: Tube, position: jax.Array) -> jax.Array:
+        """V_i without its weight w, (n,); with a matrix only the sum over the components has a
+        meaning.
+        """
+        if self.weight_matrix is None:
+            return self.barrier.value(tube, position)
+        error = position - tube.q_d
+        return 0.5 * error * matvec(self.weight_matrix, error)
+
+    def virtual_velocity(self, t: jax.Array, tube: Tube, position: jax.Array) -> jax.Array:
+        """The virtual velocity a_i of the level, (n,), by its gain at this time."""
+        gain = gain_at(self.decay, t, self.k, self.barrier, tube, position)
+        if self.gain_matrix is None:
+            return self.barrier.virtual_velocity(tube, position, gain, self.o)
+        feedback = matvec(self.gain_matrix, gain * (position - tube.q_d))
+        if self.weight_matrix is not None:
+            feedback = solve_spd(self.weight_matrix, feedback)
+        return tube.dq_d - feedback
+
+    def coupling(self, tube: Tube, position: jax.Array, power: jax.Array) -> jax.Array:
+        """The rate a, (n,), for which (w s) . a is e . power: power e/(w s), or W^-1 power/w."""
+        if self.weight_matrix is not None:
+            rate = solve_spd(self.weight_matrix, power)
+        else:
+            ratio: Any = self.barrier.error_over_slope(tube, position)
+            rate = power * ratio
+        if self.weight is not None:
+            rate = rate / self.weight
+        return rate
+
+    def slope_gain(self, i: int, t: jax.Array, x: jax.Array) -> jax.Array | None:
+        """The gain c + gamma |phi|^2 of the slope (S.5), (n,), of the level in row i of x; None for
+        0.
+        """
+        if self.damping is None or self.regressor is None:
+            return self.c
+        added = self.damping * jnp.sum(self.regressor(t, x)[i] ** 2, axis=-1)
+        return added if self.c is None else self.c + added
 
 
 class Level(NamedTuple):
@@ -96,38 +150,72 @@ def exact_levels(
     return levels, tubes
 
 
-def surface_levels(
+def filtered_levels(
     designs: Sequence[Design],
     time_constants: jax.Array,
+    form: str,
     t: jax.Array,
     x: jax.Array,
     d_hat: jax.Array,
     context: LawContext,
     state: jax.Array,
 ) -> tuple[list[Level], list[Tube]]:
-    """All levels of a dynamic surface and their tubes; arguments as `exact_levels`.
+    """All levels with filters in the place of exact derivatives, and the tubes of x_i - xi_i;
+    arguments as `exact_levels`.
 
     Args:
       time_constants: mu_i of the filters, (r - 1, n) [s].
-      state: beta_i, (r - 1, n).
+      form: one of `barrier_backstepping.FORMS`.
+      state: beta_i, (r - 1, n), and below them xi_i, (r - 1, n), of the form "compensated".
     """
     model = plants.as_plant(context.model)
+    last = len(designs) - 1
+    compensations: Any = [None] * len(designs)
+    if form == "compensated":
+        compensations = compensations_of(state)
     levels: list[Level] = []
     tubes = [context.tube(t, acceleration=False)]
     slope = None
     for i, design in enumerate(designs):
-        levels.append(_level(design, i, model, d_hat, t, x, tubes[i], slope))
+        levels.append(_level(design, i, model, d_hat, t, x, tubes[i], slope, compensations[i]))
         slope = levels[i].slope
-        if i < len(designs) - 1:
-            rate = (levels[i].alpha - state[i]) / time_constants[i]
-            # The tube of the next level is around the output of the filter.
-            times = taylor.curve_of_time(t, 2)
-            lower, upper = _curve_of_bounds(context, i + 2, times, [state[i], rate])
-            tube = _tube_of([state[i], rate], lower, upper, 0)
-            if i == len(designs) - 2:
-                tube = context.shifted_tube(tube)
-            tubes.append(tube)
+        if i == last:
+            break
+        alpha = levels[i].alpha
+        rate = (alpha - state[i]) / time_constants[i]
+        # The tube of the next level is around the virtual control or around its filter's output.
+        centre = alpha if form == "derivative" else state[i]
+        times = taylor.curve_of_time(t, 2)
+        lower, upper = _curve_of_bounds(context, i + 2, times, [centre, rate])
+        tube = _tube_of([centre, rate], lower, upper, 0)
+        if i + 1 == last:
+            tube = context.shifted_tube(tube)
+        tubes.append(tube)
     return levels, tubes
+
+
+def compensations_of(state: jax.Array) -> jax.Array:
+    """xi_i of all levels, (r, n), from the state of a compensated law; xi_r is 0."""
+    below_the_last = state[len(state) // 2 :]
+    return jnp.concatenate([below_the_last, jnp.zeros_like(below_the_last[:1])])
+
+
+def compensation_rates(
+    designs: Sequence[Design],
+    levels: Sequence[Level],
+    t: jax.Array,
+    x: jax.Array,
+    context: LawContext,
+    state: jax.Array,
+) -> jax.Array:
+    """xi_i' of a compensated law (S.4), (r - 1, n); arguments as `filtered_levels`."""
+    model, xi = plants.as_plant(context.model), compensations_of(state)
+    rates = []
+    for i, design in enumerate(designs[:-1]):
+        lag_of_filter = state[i] - levels[i].alpha
+        effect = plants.gain_times(model, i + 1, t, x, lag_of_filter + xi[i + 1])
+        rates.append(effect - design.k * xi[i])
+    return jnp.stack(rates)
 
 
 def _level(
@@ -139,6 +227,7 @@ def _level(
     x: jax.Array,
     tube: Tube,
     slope_below: jax.Array | None,
+    compensation: jax.Array | None = None,
 ) -> Level:
     """The virtual control alpha and the weighted slope of level i + 1 of (S.2).
 
@@ -150,21 +239,21 @@ def _level(
       tube: of x[i] around the virtual control of the level below; its positions are in the unit of
         the level.
       slope_below: the weighted slope of the level below, (n,); None for the first level.
+      compensation: xi_i of a compensated law, (n,); None for other laws.
     """
     level = i + 1
     below = level - 1
-    barrier = design.barrier
-    slope = barrier.slope(tube, x[i])
-    gain = gain_at(design.decay, t, design.k, barrier, tube, x[i])
-    rate = barrier.virtual_velocity(tube, x[i], gain, design.o)
+    position = x[i] if compensation is None else x[i] - compensation
+    slope = design.slope(tube, position)
+    rate = design.virtual_velocity(t, tube, position)
     if slope_below is not None:
-        ratio: Any = barrier.error_over_slope(tube, x[i])
-        coupling = plants.transposed_gain(model, below, t, x, slope_below) * ratio
-        if design.weight is not None:
-            coupling = coupling / design.weight
-        rate = rate - coupling
-    if design.c is not None:
-        rate = rate - design.c * slope
+        power = plants.transposed_gain(model, below, t, x, slope_below)
+        rate = rate - design.coupling(tube, position, power)
+    slope_gain = design.slope_gain(i, t, x)
+    if slope_gain is not None:
+        rate = rate - slope_gain * slope
+    if compensation is not None:
+        rate = rate - design.k * compensation
     rates, torque = _rates_and_torque(d_hat)
     if rates is not None:
         rate = rate - rates[i]

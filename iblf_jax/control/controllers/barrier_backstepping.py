@@ -21,9 +21,37 @@ energies (`weights`); for others w = 1.
 **Derivatives.**  alpha_{i-1}' is the derivative along the flow of the model, x_j' = f_j + G_j
 x_{j+1} + d_hat_j, with the output of the observer held.
 
-**Dynamic surface.**  With a `filter`, mu_i beta_i' + beta_i = alpha_i, e_{i+1} = x_{i+1} - beta_i,
-and beta_i' = (alpha_i - beta_i)/mu_i takes the place of alpha_i'.  No derivative is formed; the lag
-of the filters remains as an error, and the bound above becomes ultimate boundedness.
+**Filters.**  With a `filter`, mu_i beta_i' + beta_i = alpha_i, beta_i(0) = alpha_i(0) of (S.2),
+and beta_i' = (alpha_i - beta_i)/mu_i takes the place of alpha_i'.  No derivative is formed.  The
+`filter_form` says what the errors contain:
+
+    surface       e_{i+1} = x_{i+1} - beta_i
+    derivative    e_{i+1} = x_{i+1} - alpha_i
+    compensated   e_{i+1} = x_{i+1} - beta_i - xi_{i+1},   the bracket of (S.2) has the further
+                  term -k_i xi_i, with the compensating signals xi_i of
+                  xi_i' = -k_i xi_i + G_i (beta_i - alpha_i + xi_{i+1}),                     (S.4)
+                  xi_i(0) = 0,   xi_r = 0
+
+The first is the dynamic surface; there the lag of the filters remains as an error, and the bound
+above becomes ultimate boundedness.  In the second the error of the derivative, beta_i' - alpha_i',
+does.  In the third the barriers act on the compensated states y_i = x_i - xi_i, for which
+y_i' = a_i - c_i s_i + G_i e_{i+1} - (the third term of (S.2)): the bound above holds for
+V_i(e_i) exactly, whatever mu is, and lower_i < x_i - xi_i < upper_i is what is kept.
+
+**Nonlinear damping.**  With a `regressor` phi_i(t, x_1 .. x_i), (n, m), and `damping` gamma_i,
+
+    c_i + gamma_i |phi_i|^2   takes the place of c_i.                                        (S.5)
+
+A disturbance phi_i theta of level i with an unknown bounded theta, (m,), then adds at most
+w_i |theta|^2/(4 gamma_i) for each component to (sum w_i V_i)'.
+
+**Matrices.**  A level without a barrier may have a gain K_i and a weight W_i that are matrices:
+
+    V_i = 1/2 e_i^T W_i e_i,   s_i = W_i e_i,   a_i = alpha_{i-1}' - W_i^-1 K_i k_i e_i,
+    and W_i^-1 G_{i-1}^T (w_{i-1} s_{i-1})/w_i as the third term of (S.2),                   (S.6)
+
+so that with equal k_i the decay is w_i k_i e_i^T K_i e_i.  With W_2 = M and k_2 = 1 1/s, the force
+of a vessel contains -K_2 e_2.
 
 **Decays.**  The gain k_i of a level may depend on the time and on V_i (`decays`, for settling in
 finite, fixed or prescribed time); decay_i then is that of the gain of the instant, and u contains
@@ -65,6 +93,7 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import jax
@@ -77,7 +106,14 @@ from iblf_jax.control.barriers._base import (
     has_ratio,
 )
 from iblf_jax.control.controllers._base import Command, Law, LawContext, State, decay_of
-from iblf_jax.control.controllers._levels import Design, Level, exact_levels, surface_levels
+from iblf_jax.control.controllers._levels import (
+    Design,
+    Level,
+    compensation_rates,
+    compensations_of,
+    exact_levels,
+    filtered_levels,
+)
 from iblf_jax.control.controllers.backstepping import (
     check_barrier,
     fit_decays,
@@ -86,10 +122,14 @@ from iblf_jax.control.controllers.backstepping import (
 )
 from iblf_jax.control.decays import Decay
 from iblf_jax.core import checks
-from iblf_jax.core.pytree import Leaf, component, leaf
+from iblf_jax.core.linalg import inner, matvec
+from iblf_jax.core.pytree import Leaf, component, leaf, static
 from iblf_jax.core.units import ByLevel, PlantUnit, resolved
 from iblf_jax.world import plants
 from iblf_jax.world.bounds import Bounds, Funnel, Tube
+
+FORMS = ("surface", "derivative", "compensated")
+"""What the errors of a law with filters contain."""
 
 
 @component
@@ -126,15 +166,29 @@ class BarrierBackstepping(Law):
         is large in a narrow tube.
       o: margin under the root of kappa, one number, r numbers or (r, n) [1/s^2], > 0, for barriers
         that have it and for no others; 0.1 for these, if not given.
-      filter: mu_i of the filters of a dynamic surface, r - 1 numbers or (r - 1, n) [s], > 0; exact
-        derivatives if not given.
+      filter: mu_i of the filters, r - 1 numbers or (r - 1, n) [s], > 0; exact derivatives if not
+        given.  They start at the virtual controls of (S.2), beta_i(0) = alpha_i(0).
+      filter_form: "surface" (e_{i+1} = x_{i+1} - beta_i), "derivative" (e_{i+1} = x_{i+1} -
+        alpha_i, with beta_i' for alpha_i') or "compensated" (S.4); "surface" if not given.
       decays: a `Decay` for each level, by which its gain depends on the time and on V_i; one alone
         is that of every level; exponential in k if not given.
+      damping: gamma_i of the nonlinear damping (S.5), one number, r numbers or (r, n) [1], >= 0;
+        none if not given.  In tables its unit is that for a phi_i in the unit of x_i'.
+      regressor: function (t, x) -> phi, (r, n, m), of the time [s] and the state (r, n), for
+        `damping`.  Row i may depend on t and on x[0] ... x[i] only.  None if not given.
+      gain_matrices: K_i of (S.6), (r, n, n) [1], in the unit of W_i, with a positive definite
+        symmetric part; the unit matrix for a level with a barrier.  W_i if not given, and k_i is
+        the gain.  Tables state the unit 1, because the entries have different ones.
+      weight_matrices: W_i of (S.6), (r, n, n) [1], symmetric and positive definite; the unit matrix
+        for a level with a barrier.  The unit matrix if not given.  With them the default of
+        `weights` is 1 on the levels without a barrier.
 
     Source: M. Krstic, I. Kanellakopoulos, P. Kokotovic, Nonlinear and Adaptive Control Design,
       1995 (backstepping); K. P. Tee, S. S. Ge, Automatica 47 (2011) 2511-2516 (barriers); W. He,
       Y. Chen, Z. Yin, IEEE Trans. Cybernetics 46 (2016) 620-629 (robots with bounds on positions
-      and velocities); weights and full-state bounds of this package.
+      and velocities); J. A. Farrell, M. Polycarpou, M. Sharma, W. Dong, IEEE Trans. Automatic
+      Control 54 (2009) 1391-1395 (compensated filters, there of the second order); weights and
+      full-state bounds of this package.
     """
 
     k: Leaf = leaf("1/s", sign="positive", shape="level")
@@ -144,6 +198,11 @@ class BarrierBackstepping(Law):
     o: Leaf = leaf("1/s^2", sign="positive", shape="level", default=None)
     filter: Leaf = leaf("s", sign="positive", shape="level", default=None)
     decays: tuple[Decay, ...] = ()
+    filter_form: str = static(default="surface")
+    damping: Leaf = leaf("1", sign="nonnegative", shape="level", default=None)
+    regressor: Callable[[jax.Array, jax.Array], jax.Array] | None = static(default=None)
+    gain_matrices: Leaf = leaf("1", shape="any", default=None)
+    weight_matrices: Leaf = leaf("1", shape="any", default=None)
     gains: ClassVar[tuple[str, ...]] = ("k",)
     factors: ClassVar[tuple[str, ...]] = ("c", "weights")
     takes_shift: ClassVar[bool] = True
@@ -169,9 +228,50 @@ class BarrierBackstepping(Law):
         for i, barrier in enumerate(self.barriers):
             check_barrier(self, f"barriers[{i}]", barrier, "TransformedError")
         fit_o(self, *self.barriers, like=jnp.zeros(order, self.k.dtype))
-        for name, rows in (("c", order), ("weights", order), ("o", order), ("filter", order - 1)):
+        levels = {"c": order, "weights": order, "o": order, "filter": order - 1, "damping": order}
+        for name, rows in levels.items():
             self._fit_rows(name, rows)
         fit_decays(self, order)
+        self._check_filter_form()
+        self._check_damping()
+        self._check_matrices()
+
+    def _check_filter_form(self) -> None:
+        """Raises ValueError for an unknown form, or a form without filters."""
+        checks.one_of("BarrierBackstepping.filter_form", self.filter_form, FORMS)
+        if self.filter is None and self.filter_form != "surface":
+            remedy = "A form is one of filters; give their time constants, such as filter=0.01."
+            expected = "filters"
+            raise checks.fail("BarrierBackstepping.filter", None, expected, remedy)
+
+    def _check_damping(self) -> None:
+        """Raises ValueError for one of `damping` and `regressor` alone."""
+        if self.damping is None and self.regressor is None:
+            return
+        if self.damping is None:
+            expected = "the gain of the nonlinear damping, because a regressor is given"
+            raise checks.fail("BarrierBackstepping.damping", None, expected)
+        if not callable(self.regressor):
+            expected = "a function (t, x) -> phi, (r, n, m), because damping is given"
+            raise checks.fail("BarrierBackstepping.regressor", self.regressor, expected)
+
+    def _check_matrices(self) -> None:
+        """Raises ValueError for matrices of another shape, or for some that are not positive
+        definite or belong to a level with a barrier.
+        """
+        for name in ("gain_matrices", "weight_matrices"):
+            value = vars(self)[name]
+            if value is None:
+                continue
+            field = f"BarrierBackstepping.{name}"
+            shape = jnp.shape(value)
+            if len(shape) != 3 or shape[0] != self.order or shape[1] != shape[2]:
+                expected = f"one matrix a level, shape ({self.order}, n, n)"
+                raise checks.fail(field, checks.Words(f"shape {shape}"), expected)
+            if not checks.is_concrete(value):
+                continue
+            for i, matrix in enumerate(np.asarray(value)):
+                _check_matrix(f"{field}[{i}]", matrix, self.barriers[i], name)
 
     def _check_gains(self) -> int:
         """The order r, which is the number of rows of `k`; ValueError for a single number."""
@@ -200,16 +300,21 @@ class BarrierBackstepping(Law):
 
     def leaf_units(self) -> dict[str, ByLevel]:
         """The units of c and of the weights, by those of each level's V_i."""
-        c, weights = [], []
+        c, weights, damping = [], [], []
         for i, barrier in enumerate(self.barriers):
             level = f"x{i + 1}"
             if barrier.value_unit == "1":
                 c.append(PlantUnit("1", f"{level}^2/s"))
+                damping.append(PlantUnit("1", "s"))
                 weights.append(PlantUnit("1", "energy"))
             else:
                 c.append(PlantUnit("1", "1/s"))
+                damping.append(PlantUnit("1", f"s/{level}^2"))
                 weights.append(PlantUnit("1", f"energy/{level}^2"))
-        return {"c": ByLevel(c), "weights": ByLevel(weights)}
+        units = {"c": ByLevel(c), "weights": ByLevel(weights)}
+        if self.damping is not None:
+            units["damping"] = ByLevel(damping)
+        return units
 
     def symbols_of_part(self, field: str, index: int, symbols: Any) -> Any:
         """The units of the symbols in a part of the law: that of z = sqrt(2V) in a decay."""
@@ -237,6 +342,9 @@ class BarrierBackstepping(Law):
                 tube = _tube_at_rest(context.bounds[i], t, jnp.zeros_like(x[i]))
                 ratios.append(_ratio(self.barriers[i], tube, tube.q_d))
             weights = scale * jnp.stack(ratios)
+        if self.weight_matrices is not None:
+            free = [isinstance(barrier, Quadratic) for barrier in self.barriers]
+            weights = jnp.where(jnp.array(free)[:, None], 1.0, weights)
         # The fields are checked already; `dataclasses.replace` would check them again.
         found = copy.copy(self)
         object.__setattr__(found, "weights", weights)
@@ -255,6 +363,7 @@ class BarrierBackstepping(Law):
             expected = f"filters in place of the derivatives that {kind} does not have"
             remedy = "Such as BarrierBackstepping(..., filter=0.01)."
             raise checks.fail("controller.filter", None, expected, remedy)
+        self._check_regressor(context)
         smooth = context.reference.continuous_derivatives
         if self.filter is None and smooth < self.order:
             expected = f"a reference with {self.order} continuous derivatives, as u contains them"
@@ -268,6 +377,19 @@ class BarrierBackstepping(Law):
             self._check_sides(context, i)
             self._check_level(context, i, barrier)
             self._check_decay(i)
+
+    def _check_regressor(self, context: LawContext) -> None:
+        """Raises ValueError for a regressor of another shape."""
+        if self.regressor is None:
+            return
+        t = jax.ShapeDtypeStruct((), self.k.dtype)
+        shape = (self.order, context.model.n)
+        found = jax.eval_shape(self.regressor, t, jax.ShapeDtypeStruct(shape, self.k.dtype))
+        if jnp.ndim(found) == 3 and found.shape[:2] == shape:
+            return
+        expected = f"phi of shape (r, n, m) = ({shape[0]}, {shape[1]}, m)"
+        got = checks.Words(f"shape {found.shape}")
+        raise checks.fail("controller.regressor", got, expected)
 
     def _check_sides(self, context: LawContext, i: int) -> None:
         """Raises ValueError for bounds of level i + 1 with too few continuous derivatives."""
@@ -352,10 +474,37 @@ class BarrierBackstepping(Law):
             o = [None] * self.order
         decays = [decay_of(self, i) for i in range(self.order)]
         rows = zip(self.barriers, self.k, o, self.c, self.weights, decays, strict=True)
-        return [Design(*row) for row in rows]
+        return [Design(*row)._replace(**self._optional_fields(i)) for i, row in enumerate(rows)]
+
+    def _optional_fields(self, i: int) -> dict[str, Any]:
+        """The matrices and the nonlinear damping of level i + 1, by their names in `Design`."""
+        found: dict[str, Any] = {}
+        if self.damping is not None:
+            found |= {"damping": self.damping[i], "regressor": self.regressor}
+        if not isinstance(self.barriers[i], Quadratic):
+            return found
+        if self.gain_matrices is not None:
+            found["gain_matrix"] = self.gain_matrices[i]
+        if self.weight_matrices is not None:
+            W = self.weight_matrices[i]
+            found["weight_matrix"] = 0.5 * (W + W.T)  # a derivative by W may be asymmetric
+            found.setdefault("gain_matrix", found["weight_matrix"])
+        return found
+
+    @property
+    def addition(self) -> str:
+        """What the law has that no claim about (S.2) contains, in words; "" for nothing."""
+        if self.filter is not None and self.filter_form != "surface":
+            return f'filters of the form "{self.filter_form}"'
+        if self.damping is not None:
+            return "nonlinear damping"
+        if self.gain_matrices is not None or self.weight_matrices is not None:
+            return "matrices as gains or weights"
+        return ""
 
     def init(self, x: jax.Array, context: LawContext) -> Any:
-        """beta_i(0) = alpha_i(0) of (S.2), (r - 1, n), of a dynamic surface; no state otherwise.
+        """beta_i(0) = alpha_i(0) of (S.2), (r - 1, n), of a law with filters, and below them
+        xi_i(0) = 0, (r - 1, n), of a compensated one; no state otherwise.
 
         With the derivatives of the virtual controls at the start, the filters begin without a
         transient, and the motion tends to that of (S.2) as they become faster.
@@ -364,7 +513,10 @@ class BarrierBackstepping(Law):
             return ()
         t = jnp.zeros((), x.dtype)
         levels, _ = exact_levels(self._designs, t, x, jnp.zeros_like(x), context)
-        return jnp.stack([level.alpha for level in levels[:-1]])
+        beta = jnp.stack([level.alpha for level in levels[:-1]])
+        if self.filter_form != "compensated":
+            return beta
+        return jnp.concatenate([beta, jnp.zeros_like(beta)])
 
     def command(
         self, t: jax.Array, x: jax.Array, d_hat: jax.Array, context: LawContext, state: State
@@ -377,27 +529,37 @@ class BarrierBackstepping(Law):
           d_hat: estimate of the disturbance of each level, (r, n); or of the torque on the robot
             inside the plant, (n,) [N m].
           context: model, reference and bounds.
-          state: beta, (r - 1, n), of a dynamic surface.
+          state: as `init`.
         """
         levels, tubes = self.levels(t, x, d_hat, context, state)
         rates: Any = ()
+        y = x
         if self.filter is not None:
-            alphas = jnp.stack([level.alpha for level in levels[:-1]])
-            rates = (alphas - state) / self.filter
+            # Row by row, because `filter` may have one number a level.
+            steps = zip(levels, state, self.filter, strict=False)
+            rates = jnp.stack([(level.alpha - beta) / mu for level, beta, mu in steps])
+        if self.filter_form == "compensated":
+            y = x - compensations_of(state)
+            of_xi = compensation_rates(self._designs, levels, t, x, context, state)
+            rates = jnp.concatenate([rates, of_xi])
         V = jnp.zeros_like(x[0])
         guard_active = jnp.zeros(x[0].shape, bool)
-        for i, (barrier, tube) in enumerate(zip(self.barriers, tubes, strict=True)):
-            V = V + self.weights[i] * barrier.value(tube, x[i])
-            guard_active |= guard_is_active(tube, x[i], barrier.guard)
+        for i, (design, tube) in enumerate(zip(self._designs, tubes, strict=True)):
+            V = V + self.weights[i] * design.value(tube, y[i])
+            guard_active |= guard_is_active(tube, y[i], design.barrier.guard)
         saturated = jnp.zeros_like(guard_active)
         model = plants.as_plant(context.model)
         slope = plants.transposed_gain(model, self.order, t, x, levels[-1].slope)
+        centres = [tube.q_d for tube in tubes]
+        if self.filter_form == "compensated":
+            # The error of a level is its state less what records show as alpha.
+            centres = [centre + x[i] - y[i] for i, centre in enumerate(centres)]
         alpha_higher: Any = ()
         if self.order > 2:
-            alpha_higher = jnp.stack([tube.q_d for tube in tubes[2:]])
+            alpha_higher = jnp.stack(centres[2:])
         command = Command(
             tau=levels[-1].alpha,
-            alpha=tubes[1].q_d,
+            alpha=centres[1],
             V1=V,
             guard_active=guard_active,
             saturated=saturated,
@@ -409,12 +571,14 @@ class BarrierBackstepping(Law):
     def levels(
         self, t: jax.Array, x: jax.Array, d_hat: jax.Array, context: LawContext, state: State
     ) -> tuple[list[Level], list[Tube]]:
-        """What each level computes, and the tube of x_i around alpha_{i-1}, or around beta_{i-1}
-        with filters; arguments as `command`.
+        """What each level computes, and the tube of x_i around alpha_{i-1}, or that of x_i - xi_i
+        around beta_{i-1} with filters; arguments as `command`.
         """
         if self.filter is None:
             return exact_levels(self._designs, t, x, d_hat, context)
-        return surface_levels(self._designs, self.filter, t, x, d_hat, context, state)
+        return filtered_levels(
+            self._designs, self.filter, self.filter_form, t, x, d_hat, context, state
+        )
 
     def energy(self, t: jax.Array, x: jax.Array, context: LawContext) -> jax.Array:
         """Sum w_i V_i, (), of the law without filters."""
@@ -422,21 +586,27 @@ class BarrierBackstepping(Law):
         return jnp.sum(self._weighted_values(x, tubes))
 
     def energy_decay(self, t: jax.Array, x: jax.Array, context: LawContext) -> jax.Array:
-        """Sum w_i decay_i + c_i w_i |s_i|^2, (), of the law without filters; the decay of a barrier
-        that states none is 0.
+        """Sum w_i decay_i + (c_i + gamma_i |phi_i|^2) w_i |s_i|^2, (), of the law without filters;
+        the decay of a barrier that states none is 0.
         """
         levels, tubes = self.levels(t, x, jnp.zeros_like(x), context, ())
         values = self._weighted_values(x, tubes)
         total = jnp.zeros_like(t)
-        for i, level in enumerate(levels):
-            decay = stated_decay(self.barriers[i], self.k[i], values[i])
-            total += jnp.sum(decay + self.c[i] * level.slope**2 / self.weights[i])
+        for i, (level, design) in enumerate(zip(levels, self._designs, strict=True)):
+            slope_gain: Any = design.slope_gain(i, t, x)
+            total += jnp.sum(slope_gain * level.slope**2 / self.weights[i])
+            if design.gain_matrix is None:
+                total += jnp.sum(stated_decay(self.barriers[i], self.k[i], values[i]))
+                continue
+            error = x[i] - tubes[i].q_d
+            feedback = matvec(design.gain_matrix, self.k[i] * error)
+            total += inner(self.weights[i] * error, feedback)
         return total
 
     def _weighted_values(self, x: jax.Array, tubes: list[Tube]) -> jax.Array:
         """w_i V_i, (r, n)."""
-        pairs = zip(self.barriers, tubes, strict=True)
-        values = [barrier.value(tube, x[i]) for i, (barrier, tube) in enumerate(pairs)]
+        pairs = zip(self._designs, tubes, strict=True)
+        values = [design.value(tube, x[i]) for i, (design, tube) in enumerate(pairs)]
         return jnp.stack([w * value for w, value in zip(self.weights, values, strict=True)])
 
     def switching(
@@ -450,6 +620,24 @@ class BarrierBackstepping(Law):
 
 
 # --- checks ---------------------------------------------------------------------------------------
+
+
+def _check_matrix(field: str, matrix: np.ndarray, barrier: Barrier, name: str) -> None:
+    """Raises ValueError unless a matrix fits (S.6): positive definite, symmetric as a weight, and
+    the unit matrix for a level with a barrier.
+    """
+    if not isinstance(barrier, Quadratic):
+        if not np.array_equal(matrix, np.eye(len(matrix))):
+            expected = f"the unit matrix, as the level has the barrier {type(barrier).__name__}"
+            remedy = "A barrier acts on every component alone; its gains are k and weights."
+            raise checks.fail(field, matrix, expected, remedy)
+        return
+    if name == "weight_matrices" and not np.allclose(matrix, matrix.T, rtol=1e-9, atol=0.0):
+        raise checks.fail(field, matrix, "a symmetric matrix")
+    smallest = np.min(np.linalg.eigvalsh(0.5 * (matrix + matrix.T)))
+    if smallest <= 0.0:
+        got = f"a matrix whose symmetric part has the eigenvalue {smallest:.4g}"
+        raise checks.fail(field, checks.Words(got), "a positive definite symmetric part")
 
 
 def _ratio(barrier: Barrier, tube: Tube, x: jax.Array) -> jax.Array:

@@ -9,19 +9,19 @@ between two events
 With z = G_r^T w_r s_r, the derivative of the Lyapunov function along the input, and the input v of
 the law in continuous time, the command
 
-    u = -(1 + delta) (v tanh(z v/epsilon) + m_bar tanh(z m_bar/epsilon)),                    (E.1)
+    u = -(1 + delta) (v tanh(z v/epsilon) + m_bar tanh(z m_bar/epsilon)),                    (E.2)
     m_bar > m/(1 - delta),
 
 has z_i u_i <= 0, and |y| - y tanh(y/epsilon) <= 0.2785 epsilon for every y gives
 
-    z . u_held <= z . v + 0.557 epsilon n,                                                   (E.2)
+    z . u_held <= z . v + 0.557 epsilon n,                                                   (E.3)
 
-so that V' exceeds that of the law in continuous time by 0.557 epsilon n at most.  (E.2) holds where
+so that V' exceeds that of the law in continuous time by 0.557 epsilon n at most.  (E.3) holds where
 the condition of the trigger is checked: at the samples.
 
 Without the compensation V' grows by at most
 
-    sum_i |z_i| (delta_i |u_held,i| + m_i),                                                   (E.3)
+    sum_i |z_i| (delta_i |u_held,i| + m_i),                                                   (E.1)
 
 which vanishes with z as fast as z: the error e_r stays in a band whose size grows with the
 threshold.  The compensation replaces v by (1 + delta) |v| with the sign of -z: a command of the
@@ -87,7 +87,7 @@ class EventCompensated(Wrapping):
     def command(
         self, t: jax.Array, x: jax.Array, d_hat: jax.Array, context: LawContext, state: State
     ) -> tuple[Command, State]:
-        """The wrapped law's command with the input (E.1).
+        """The wrapped law's command with the input (E.2).
 
         Raises:
           ValueError: a law without a Lyapunov function, or with another input than its torque.
@@ -103,7 +103,7 @@ class EventCompensated(Wrapping):
 
 
 def excess(law: EventCompensated) -> jax.Array:
-    """The largest growth of V' by the trigger, sum_i 2 0.2785 epsilon_i, of (E.2), ()."""
+    """The largest growth of V' by the trigger, sum_i 2 0.2785 epsilon_i, of (E.3), ()."""
     return jnp.sum(2.0 * TANH_GAP * law.epsilon)
 
 

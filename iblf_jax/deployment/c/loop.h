@@ -30,7 +30,7 @@ typedef struct {
   int64_t index;
 } ${name}_state;
 
-/* Outputs of a step, one number for each joint: ${outputs}; then the status of the run so far. */
+/* Outputs of a step, one number for each joint: ${outputs}; then the status of the run so far${shape}. */
 void ${name}_start(const ${name}_parameters *p, const ${name}_real *settings, ${name}_state *s);
 void ${name}_step(const ${name}_parameters *p, const ${name}_real *settings, ${name}_state *s, ${name}_real *outputs);
 

@@ -32,7 +32,7 @@ class Loops {
     new Reals(loop.memory.buffer, loop.settings(), table.settings.length).set(table.settings);
     const parameters = new Reals(loop.memory.buffer, loop.parameters(), table.count);
     for (const each of this.controlled(table)) {
-      const text = this.requested(each.words);
+      const text = this.requested(each.key);
       if (this.isUsed(each, text)) for (const k of each.places) parameters[k] = Number(text);
     }
     return {loop, table, Reals, parameters};
@@ -47,21 +47,22 @@ class Loops {
 
   // Of some names of the address, those that set nothing in a loop.
   unused(name, names) {
-    const sliders = new Map(this.controlled(this.opened(name).table).map(each => [each.words, each]));
+    const sliders = new Map(this.controlled(this.opened(name).table).map(each => [each.key, each]));
     return names.filter(each => !sliders.has(each) || !this.isUsed(sliders.get(each), this.requested(each)));
   }
 
-  // What has a slider: its name, the places of its numbers among the parameters, its range.
+  // What has a slider: its key in the address, its words, the places of its numbers among the parameters, its range.
   controlled(table) {
     const found = [];
     for (const p of table.parameters.filter(p => p.slider)) {
       const size = p.shape.reduce((product, length) => product * length, 1);
       const all = Array.from({length: size}, (_, k) => p.offset + k);
-      const separate = all.map((place, i) => [p.path + "[" + i + "]", [place]]);
-      const groups = p.each ? separate : [[p.path, all]];
-      groups.forEach(([words, places], i) => {
+      const separate = all.map((place, i) => [p.path + "[" + i + "]", p.words + ", " + table.names[i], [place]]);
+      const sets = p.each ? separate : [[p.path, p.words, all]];
+      const units = p.unit.split(", ");  // one, or one a component
+      sets.forEach(([key, words, places], i) => {
         const [low, high] = p.slider[Math.min(i, p.slider.length - 1)];
-        found.push({words, places, low, high, unit: p.unit, positive: p.positive});
+        found.push({key, words, group: p.group, places, low, high, unit: units.length === size ? units[i] : p.unit, positive: p.positive});
       });
     }
     return found;
@@ -99,5 +100,19 @@ class Loops {
     for (const {name: column, offset, size} of table.records)
       found[column] = Array.from({length: size}, (_, i) => columnAt(offset + i));
     return found;
+  }
+
+  // Where a run is outside of its bounds: a component, the side, the first recorded time there, and the first one inside again (null: it stays outside).
+  outside(name, found) {
+    const {table} = this.opened(name);
+    const sides = [["above its upper bound", (q, i, k) => q > found.upper[i][k]], ["below its lower bound", (q, i, k) => q < found.lower[i][k]]];
+    const places = [];
+    for (let i = 0; i < table.joints; i++) for (const [words, isOutside] of sides) {
+      const first = found.q[i].findIndex((q, k) => isOutside(q, i, k));
+      if (first < 0) continue;
+      const back = found.q[i].findIndex((q, k) => k > first && !isOutside(q, i, k));
+      places.push({joint: i, words, from: found.t[first], to: back < 0 ? null : found.t[back]});
+    }
+    return places;
   }
 }

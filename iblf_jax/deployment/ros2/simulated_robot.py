@@ -111,7 +111,7 @@ def robot_node(
     """
     names = tuple(
         checks.string("joints", name, "names of joints")
-        for name in checks.nonempty_list("joints", list(joints), '["shoulder", "elbow"]')
+        for name in checks.nonempty_list("joints", joints, '["shoulder", "elbow"]')
     )
     if integrator is not None:
         checks.one_of("integrator", integrator, INTEGRATORS)

@@ -2,7 +2,10 @@
    SERIES (sizes), record_arrays, shared_constants, shared_signals (a table of what only time decides) and advance (W runs over some steps).
 
    A group of blocks goes through all steps before the next one, a stretch of steps at a time: its states and the stretch's table stay
-   in the cache; the caller says how many (STRETCH, GROUP).  A block that has fewer than W runs repeats its last one; the copies are not written back. */
+   in the cache; the caller says how many (STRETCH, GROUP).  A block that has fewer than W runs repeats its last one; the copies are not written back.
+
+   Callers fill up a batch with copies of its last run, so that they compile one shape, or of its last two, if two are those of one case.  The
+   blocks at the end that hold only copies are not computed, if nothing is recorded. */
 
 typedef struct {
   const real *shared, *leaves, *floats_in, *series;
@@ -35,6 +38,33 @@ static void write_block(const job *j, workspace *w, int g, int64_t run) {
   for (int i = 0; i < FLOATS; i++) memcpy(j->floats_out + i * j->runs + run, &w->floats[g][i], count * sizeof(real));
   for (int i = 0; i < INTS; i++)
     for (int l = 0; l < count; l++) j->ints_out[i * j->runs + run + l] = (int32_t)w->ints[g][i][l];
+}
+
+/* How many runs there are without those at the end that are copies of the run `period` before them: the index after the last run of which
+   a number differs, at least `least`. */
+static int64_t runs_without_copies(const void *numbers, int64_t rows, int64_t runs, int64_t size, int64_t period, int64_t least) {
+  for (int64_t i = 0; i < rows; i++) {
+    const char *row = (const char *)numbers + i * runs * size;
+    int64_t run = runs;
+    while (run > least && !memcmp(row + (run - 1) * size, row + (run - 1 - period) * size, size)) run--;
+    least = run;
+  }
+  return least;
+}
+
+static int64_t different_runs(const job *j, int64_t period) {
+  int64_t found = at_most(period, j->runs);
+  found = runs_without_copies(j->leaves, LEAVES, j->runs, sizeof(real), period, found);
+  found = runs_without_copies(j->floats_in, FLOATS, j->runs, sizeof(real), period, found);
+  return runs_without_copies(j->ints_in, INTS, j->runs, sizeof(int32_t), period, found);
+}
+
+/* Gives the runs from `first` on the results of those `period` before them. */
+static void copy_results(const job *j, int64_t first, int64_t period) {
+  for (int64_t i = 0; i < FLOATS; i++)
+    for (int64_t run = first; run < j->runs; run++) j->floats_out[i * j->runs + run] = j->floats_out[i * j->runs + run - period];
+  for (int64_t i = 0; i < INTS; i++)
+    for (int64_t run = first; run < j->runs; run++) j->ints_out[i * j->runs + run] = j->ints_out[i * j->runs + run - period];
 }
 
 static void run_group(const job *j, workspace *w, int64_t group) {
@@ -73,7 +103,13 @@ static void run_all(job *j, int64_t threads) {
   pthread_t started[256];
   int64_t count = 0;
   if (j->runs <= 0) return;
-  j->blocks = (j->runs + W - 1) / W;
+  int64_t different = j->runs, period = 1;
+  if (j->every <= 0 && SERIES == 0) {
+    int64_t of_pairs = different_runs(j, 2);
+    different = different_runs(j, 1);
+    if (of_pairs < different) different = of_pairs, period = 2;
+  }
+  j->blocks = (different + W - 1) / W;
   if (threads > 256) threads = 256;
   if (threads < 1) threads = 1;
   j->group_blocks = at_most(GROUP, (j->blocks + threads - 1) / threads);
@@ -82,6 +118,7 @@ static void run_all(job *j, int64_t threads) {
     if (pthread_create(&started[count], NULL, worker, j)) break;
   worker(j);
   for (int64_t i = 0; i < count; i++) pthread_join(started[i], NULL);
+  copy_results(j, j->blocks * W, period);
 }
 
 /* Operands: shared (1, n), leaves (LEAVES, runs), floats (FLOATS, runs), ints (INTS, runs), settings (1, 4) = first step, steps, record

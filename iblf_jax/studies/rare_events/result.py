@@ -144,6 +144,12 @@ class FailureProbability(Result):
     """Number of failures that were drawn outside their bounds at t = 0, where no law can act."""
     notes: tuple[str, ...]
     """What limits the estimate, in sentences."""
+    check: str
+    """What a second method saw of the failures, in a sentence: importance sampling around the
+    design points for subset simulation, and the reverse."""
+    design_points: np.ndarray
+    """The nearest failures that searches by gradients found, nearest first, (K, d); the samples of
+    importance sampling are around them."""
     estimator: str
     """What gave the estimate: "subset", "importance", or "monte_carlo", which is also
     that of a probability so large that subset simulation needs no second level."""
@@ -217,6 +223,7 @@ class FailureProbability(Result):
             "diverged": self.diverged,
             "started_outside": self.started_outside,
             "notes": "\n".join(self.notes),
+            "check": self.check,
         }
         return xarray.Dataset(variables, coordinates, attributes)
 
@@ -239,7 +246,7 @@ class FailureProbability(Result):
                 f" {high:.2g}, coefficient of variation {self.coefficient_of_variation:.2f};"
                 f" {self.runs} runs)"
             )
-        lines = [first, f"  {self._method_in_words()}"]
+        lines = [first, f"  {self._method_in_words()}", f"  {self.check}"]
         notes = [f"  {note}" for note in self.notes]
         if self.is_upper_bound:  # the notes say what the bound is about
             lines[1:1] = notes

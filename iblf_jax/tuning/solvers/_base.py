@@ -65,8 +65,11 @@ class Constraints(NamedTuple):
         """G_r, (R,), from the pieces' values, (B, M)."""
         found = np.zeros(len(self.worst))
         for r, k in enumerate(self.worst):
-            by_run = np.max(pieces[:, self.owner == r], axis=1)
-            found[r] = np.sort(by_run)[-k:].mean()
+            by_run = pieces[:, self.owner == r].max(axis=1)
+            if k == 1:
+                found[r] = by_run.max()
+            else:
+                found[r] = np.sort(by_run)[-k:].mean()
         return found
 
 

@@ -192,6 +192,6 @@ def _cholesky(matrix: np.ndarray) -> np.ndarray:
 
 def _longest(x: np.ndarray, change: np.ndarray, most: float) -> np.ndarray:
     """The longest steps along changes, (N, m), with which x >= 0 remains, at most `most`, (N,)."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.where(change < 0, -x / change, most)
-    return np.minimum(most, np.min(ratio, axis=1))
+    ratio = np.full_like(x, most)
+    np.divide(-x, change, out=ratio, where=change < 0)
+    return np.minimum(most, ratio.min(axis=1))

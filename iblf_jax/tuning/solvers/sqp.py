@@ -198,21 +198,20 @@ def subproblem(
     high = np.maximum(high, 1e-12)
     reach = np.maximum(-low, high)
     size = len(gradient)
+    change = np.abs(piece_gradients).transpose(0, 2, 1) @ reach
     selected = [
-        _pieces_that_may_bind(constraints, r, pieces, piece_gradients, reach)
-        for r in range(len(constraints.worst))
+        _pieces_that_may_bind(constraints, r, pieces, change) for r in range(len(constraints.worst))
     ]
     runs_and_counts = zip(selected, constraints.worst, strict=True)
     own_columns = [_own_columns(chosen.run, k) for chosen, k in runs_and_counts]
-    rows, limits = _rows_of_pieces(selected, own_columns, pieces, piece_gradients)
-    own_block, violation_columns = _columns_of_requirements(size, own_columns, constraints)
-    A = np.hstack([np.vstack([np.eye(size), -np.eye(size), *rows]), own_block])
+    A, violation_columns = _columns_of_requirements(size, own_columns, constraints)
+    limits = _set_rows_of_pieces(A, selected, own_columns, pieces, piece_gradients)
     H = np.zeros((A.shape[1], A.shape[1]))
     H[:size, :size] = matrix
     c = np.zeros(A.shape[1])
     c[:size] = gradient
     c[violation_columns] = penalty
-    x, y = yield quadratic.Programme(H, c, A, np.concatenate([high, -low, *limits]))
+    x, y = yield quadratic.Programme(H, c, A, np.concatenate([high, -low, limits]))
     step = np.clip(x[:size], low, high)
     piece_multipliers = _multipliers_of_pieces(y[2 * size :], selected, own_columns, pieces.shape)
     multipliers = np.zeros(len(selected))
@@ -227,23 +226,26 @@ def subproblem(
     )
 
 
-def _rows_of_pieces(
+def _set_rows_of_pieces(
+    A: np.ndarray,
     selected: list[Selected],
     own_columns: list[np.ndarray],
     pieces: np.ndarray,
     piece_gradients: np.ndarray,
-) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """The rows of each requirement in the columns of the step, and their right-hand sides: a_j and
-    -c_j - TARGET_EXCESS for its pieces, and zeros for the conditions on its own unknowns.
+) -> np.ndarray:
+    """Sets the columns of the step in the rows of the requirements, a_j for each piece and zeros
+    for the conditions on the unknowns of the requirement itself, and returns the right-hand sides
+    of these rows, -c_j - TARGET_EXCESS and zeros.
     """
-    rows = []
-    limits = []
+    size = piece_gradients.shape[1]
+    limits = np.zeros(len(A) - 2 * size)
+    row = 0  # the first row of the pieces of a requirement
     for chosen, own in zip(selected, own_columns, strict=True):
-        added = len(own) - len(chosen.run)
-        gradients = piece_gradients[chosen.run, :, chosen.piece]
-        rows.append(np.pad(gradients, ((0, added), (0, 0))))
-        limits.append(np.pad(-pieces[chosen.run, chosen.piece] - TARGET_EXCESS, (0, added)))
-    return rows, limits
+        end = row + len(chosen.run)
+        A[2 * size + row : 2 * size + end, :size] = piece_gradients[chosen.run, :, chosen.piece]
+        limits[row:end] = -pieces[chosen.run, chosen.piece] - TARGET_EXCESS
+        row += len(own)
+    return limits
 
 
 def _multipliers_of_pieces(
@@ -266,21 +268,23 @@ def _multipliers_of_pieces(
 def _columns_of_requirements(
     size: int, own_columns: list[np.ndarray], constraints: Constraints
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The columns of the unknowns of all requirements, with zeros in the 2 p rows of the step's
-    bounds, and the index of the column of v_r, (R,).
+    """The matrix of the programme with the bounds of the step and the columns of the unknowns of
+    all requirements, and the index of the column of v_r, (R,).
 
     Where only the largest excess counts, all requirements share one unknown v.
     """
     rows = np.cumsum([2 * size, *(len(own) for own in own_columns)])
-    columns = np.cumsum([0, *(own.shape[1] for own in own_columns)])
-    block = np.zeros((rows[-1], columns[-1]))
+    columns = np.cumsum([size, *(own.shape[1] for own in own_columns)])
+    A = np.zeros((rows[-1], columns[-1]))
+    A[:size, :size] = np.eye(size)
+    A[size : 2 * size, :size] = -np.eye(size)
     for own, row, column in zip(own_columns, rows[:-1], columns[:-1], strict=True):
-        block[row : row + own.shape[0], column : column + own.shape[1]] = own
+        A[row : row + own.shape[0], column : column + own.shape[1]] = own
     if not constraints.largest_only:
-        return block, size + columns[:-1]
-    shared = block[:, columns[:-1]].sum(axis=1, keepdims=True)
-    others = np.delete(block, columns[:-1], axis=1)
-    return np.hstack([shared, others]), np.full(len(own_columns), size)
+        return A, columns[:-1]
+    shared = A[:, columns[:-1]].sum(axis=1, keepdims=True)
+    others = np.delete(A[:, size:], columns[:-1] - size, axis=1)
+    return np.hstack([A[:, :size], shared, others]), np.full(len(own_columns), size)
 
 
 def _own_columns(run: np.ndarray, k: int) -> np.ndarray:
@@ -307,19 +311,21 @@ def _own_columns(run: np.ndarray, k: int) -> np.ndarray:
 
 
 def _pieces_that_may_bind(
-    constraints: Constraints,
-    r: int,
-    pieces: np.ndarray,
-    piece_gradients: np.ndarray,
-    reach: np.ndarray,
+    constraints: Constraints, r: int, pieces: np.ndarray, change: np.ndarray
 ) -> Selected:
-    """The pieces of a requirement that may become active within steps |s_i| <= reach.  Of more than
-    MAX_PIECES the worst ones are taken.
+    """The pieces of a requirement that may become active within the bounds of the step.  Of more
+    than MAX_PIECES the worst ones are taken.
+
+    Args:
+      constraints: the requirements.
+      r: index of the requirement.
+      pieces: c, (B, M).
+      change: the largest change of each linear piece within the bounds, (B, M).
     """
     own = constraints.pieces_of(r)
     k = constraints.worst[r]
     values = pieces[:, own]
-    change = np.einsum("bpm,p->bm", np.abs(piece_gradients[:, :, own]), reach)
+    change = change[:, own]
     # A piece may become the largest of its run if the largest value that it can reach is at least
     # the smallest value that the largest piece can reach.
     threshold = np.max(values - change, axis=1, keepdims=True)
@@ -382,7 +388,7 @@ class Point(NamedTuple):
     @property
     def is_finite(self) -> bool:
         """Whether all numbers are finite."""
-        return all(bool(np.all(np.isfinite(x))) for x in self)
+        return all(bool(np.isfinite(x).all()) for x in self)
 
     def linear_change(self, step: np.ndarray) -> np.ndarray:
         """a_j.s of every piece, (B, M)."""
@@ -676,30 +682,57 @@ def _curvatures_kept(constraints: Constraints) -> list[int]:
     return [min(constraints.runs * count, MAX_CURVATURES) for count in counts]
 
 
-def _solve(
-    space: SearchSpace, state: SQPState, pieces: np.ndarray, penalty: float
-) -> quadratic.Task[Step]:
-    """The subproblem at the accepted point, with `pieces` as c."""
+class Model(NamedTuple):
+    """What the subproblems of one trial have in common."""
+
+    matrix: np.ndarray
+    """B + sum_j y_j C_j, positive definite, (p, p)."""
+    low: np.ndarray
+    """Bounds of the step: trust region and ranges of the gains, (p,)."""
+    high: np.ndarray
+    constraints: Constraints
+    """With the pieces of the rejected trials as further pieces of the same requirements."""
+    cuts: list[np.ndarray]
+    """The pieces of each of these trials, linearised there and evaluated at the accepted point,
+    (B, M)."""
+    piece_gradients: np.ndarray
+    """a_j of all pieces, (B, p, (1 + cuts) M)."""
+
+
+def _model(space: SearchSpace, state: SQPState) -> Model:
+    """The model at the accepted point, with the present multipliers."""
     multipliers = state.piece_multipliers.ravel()[state.curved]
     curvature_of_pieces = np.einsum("k,kpq->pq", multipliers, state.curvatures)
     scale = float(np.max(np.abs(np.linalg.eigvalsh(state.here.matrix))))
-    matrix = positive_definite(state.here.matrix + state.correction + curvature_of_pieces, scale)
-    low = np.maximum(space.box.low - state.z, -state.radius)
-    high = np.minimum(space.box.high - state.z, state.radius)
     cuts = _near_cuts(state)
     owner = np.tile(space.constraints.owner, 1 + len(cuts))
+    gradients = [state.here.piece_gradients, *state.cut_gradients[cuts]]
+    return Model(
+        matrix=positive_definite(state.here.matrix + state.correction + curvature_of_pieces, scale),
+        low=np.maximum(space.box.low - state.z, -state.radius),
+        high=np.minimum(space.box.high - state.z, state.radius),
+        constraints=space.constraints._replace(owner=owner),
+        cuts=[_cut_values(state, c) for c in cuts],
+        piece_gradients=np.concatenate(gradients, axis=2),
+    )
+
+
+def _solve(
+    model: Model, state: SQPState, pieces: np.ndarray, penalty: float
+) -> quadratic.Task[Step]:
+    """The subproblem at the accepted point, with `pieces` as c."""
     found = yield from subproblem(
         state.here.gradient,
-        matrix,
-        low,
-        high,
-        space.constraints._replace(owner=owner),
-        np.concatenate([pieces, *(_cut_values(state, c) for c in cuts)], axis=1),
-        np.concatenate([state.here.piece_gradients, *state.cut_gradients[cuts]], axis=2),
+        model.matrix,
+        model.low,
+        model.high,
+        model.constraints,
+        np.concatenate([pieces, *model.cuts], axis=1),
+        model.piece_gradients,
         penalty,
     )
     # A piece and its copies from rejected trials are one constraint, which has one multiplier.
-    by_point = found.piece_multipliers.reshape(len(pieces), 1 + len(cuts), -1)
+    by_point = found.piece_multipliers.reshape(len(pieces), 1 + len(model.cuts), -1)
     return found._replace(piece_multipliers=by_point.sum(axis=1))
 
 
@@ -719,12 +752,14 @@ def _cut_values(state: SQPState, c: int) -> np.ndarray:
     return np.minimum(state.cut_pieces[c] + change, state.here.pieces)
 
 
-def _predicted_decrease(space: SearchSpace, state: SQPState, step: np.ndarray) -> float:
+def _predicted_decrease(
+    space: SearchSpace, state: SQPState, model: Model, step: np.ndarray
+) -> float:
     """Decrease of the penalty function by the quadratic models of objective and pieces."""
-    pieces = state.here.pieces + state.here.linear_change(step) + state.curvature_along(step)
-    for c in _near_cuts(state):
-        change = np.einsum("p,bpm->bm", step, state.cut_gradients[c])
-        pieces = np.maximum(pieces, _cut_values(state, c) + change)
+    linear = np.split(np.einsum("p,bpm->bm", step, model.piece_gradients), 1 + len(model.cuts), 1)
+    pieces = state.here.pieces + linear[0] + state.curvature_along(step)
+    for values, linear_change in zip(model.cuts, linear[1:], strict=True):
+        pieces = np.maximum(pieces, values + linear_change)
     matrix = state.here.matrix + state.correction
     change = float(state.here.gradient @ step + 0.5 * step @ matrix @ step)
     return _merit(space, state, 0.0, state.here.pieces) - _merit(space, state, change, pieces)
@@ -734,14 +769,15 @@ def _with_penalty(space: SearchSpace, state: SQPState) -> quadratic.Task[tuple[S
     """The step of the subproblem and rho, which is increased as long as that reduces the predicted
     violation.
     """
+    model = _model(space, state)
     size = state.size
     largest = LARGEST_PENALTY * size
     smallest = max(2.0 * float(np.max(state.multipliers, initial=0.0)), MIN_PENALTY * size)
     penalty = min(smallest, largest)
     total = space.constraints.violation
-    found = yield from _solve(space, state, state.here.pieces, penalty)
+    found = yield from _solve(model, state, state.here.pieces, penalty)
     while total(found.violation) > TARGET_EXCESS and penalty < largest:
-        other = yield from _solve(space, state, state.here.pieces, PENALTY_FACTOR * penalty)
+        other = yield from _solve(model, state, state.here.pieces, PENALTY_FACTOR * penalty)
         if total(other.violation) > 0.99 * total(found.violation):
             break
         found = other
@@ -759,20 +795,21 @@ def _plan(space: SearchSpace, state: SQPState, tolerance: float) -> quadratic.Ta
     state.piece_multipliers = found.piece_multipliers
     state.multipliers = found.multipliers
 
+    model = _model(space, state)
     excess = space.constraints.excess(state.here.pieces)
     violation = space.constraints.violation(excess + TARGET_EXCESS)
     reduction = violation - predicted_violation
     linear_decrease = -found.change + state.penalty * reduction
     step = found.step
-    decrease = _predicted_decrease(space, state, step)
+    decrease = _predicted_decrease(space, state, model, step)
     if np.any(state.curvatures):
         # The step with the largest predicted decrease, among the one found and those of
         # subproblems with the curvature of the pieces, becomes the trial.
         last = found
         for _ in range(CURVATURE_SOLVES):
             curved = state.here.pieces + state.curvature_along(last.step)
-            last = yield from _solve(space, state, curved, penalty)
-            other = _predicted_decrease(space, state, last.step)
+            last = yield from _solve(model, state, curved, penalty)
+            other = _predicted_decrease(space, state, model, last.step)
             if other > decrease:
                 step = last.step
                 decrease = other
@@ -882,7 +919,8 @@ def _correct(
     """
     if not len(space.constraints.owner):
         return False
-    found = yield from _solve(space, state, pieces - state.here.linear_change(step), state.penalty)
+    pieces = pieces - state.here.linear_change(step)
+    found = yield from _solve(_model(space, state), state, pieces, state.penalty)
     state.trial = np.clip(state.z + found.step, space.box.low, space.box.high)
     state.corrected = True
     difference = np.max(np.abs(state.trial - state.z - step))

@@ -48,6 +48,8 @@ from iblf_jax.world.plants.driven_pendulum import DrivenPendulum as DrivenPendul
 from iblf_jax.world.plants.electric_drive import ElectricDrive as ElectricDrive
 from iblf_jax.world.plants.flexible_joint import FlexibleJoint as FlexibleJoint
 from iblf_jax.world.plants.markov_switched import MarkovSwitched as MarkovSwitched
+from iblf_jax.world.plants.restoring import Mooring as Mooring
+from iblf_jax.world.plants.restoring import Restoring as Restoring
 from iblf_jax.world.plants.rigid import Rigid as Rigid
 from iblf_jax.world.plants.rigid import RobotPlant as RobotPlant
 from iblf_jax.world.plants.strict_feedback import StrictFeedback as StrictFeedback
@@ -76,16 +78,21 @@ MEMBERS = {
     "vessel": Vessel,
 }
 """Every plant by the name that a scenario file gives it."""
+RESTORING = {"mooring": Mooring}
+"""Every restoring force of a vessel by the name that a scenario file gives it."""
 
 __all__ = [
     "MEMBERS",
+    "RESTORING",
     "Agents",
     "DrivenPendulum",
     "ElectricDrive",
     "FlexibleJoint",
     "MarkovSwitched",
+    "Mooring",
     "NeighbourModel",
     "Plant",
+    "Restoring",
     "Rigid",
     "StrictFeedback",
     "Switched",

@@ -11,6 +11,7 @@ from iblf_jax.core import checks
 from iblf_jax.core.linalg import matvec, solve_spd
 from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.world.plants._base import Plant, Units
+from iblf_jax.world.plants.restoring import Restoring
 
 EXCHANGE_RATE = 0.1
 """Square of the frequency at which the levels exchange energy in the default weights [1/s^2]: slow
@@ -20,7 +21,7 @@ of its length, and needs weights of its own."""
 
 @component
 class Vessel(Plant):
-    """eta' = R(psi) nu,   M nu' + C(nu) nu + D(nu) nu = u   (3 degrees of freedom).
+    """eta' = R(psi) nu,   M nu' + C(nu) nu + D(nu) nu + g(eta) = u   (3 degrees of freedom).
 
     The levels are eta = (north, east, heading psi) and nu = (surge u, sway v, yaw rate r) in the
     axes of the body; the input is the force and moment of the thrusters in these axes.
@@ -35,7 +36,8 @@ class Vessel(Plant):
 
     The names of the hydrodynamic derivatives are those of SNAME: X_du is the surge force per
     surge acceleration, Y_rv the factor of |r| v in the sway force.  C is skew-symmetric, so that
-    nu^T M nu' = nu^T (u - D(nu) nu).  `presets.cybership_ii` has the numbers of a model ship.
+    nu^T M nu' = nu^T (u - D(nu) nu - g(eta)).  `presets.cybership_ii` has the numbers of a model
+    ship.
 
     Args:
       mass: of the vessel, () [kg], > 0.
@@ -63,6 +65,7 @@ class Vessel(Plant):
       N_rr: quadratic damping in yaw, () [N m s^2/rad^2]; 0 if not given.
       length: of the hull, for drawings only, () [m], > 0; 1 if not given.
       beam: width of the hull, for drawings only, () [m], > 0; 0.25 if not given.
+      restoring: g(eta), any of `iblf_jax.plants.RESTORING`; none if not given.
 
     Source: T. I. Fossen, Handbook of Marine Craft Hydrodynamics and Motion Control, 2011,
       chapters 6 and 7; R. Skjetne, O. Smogeli, T. I. Fossen, Modeling, Identification and Control
@@ -93,6 +96,7 @@ class Vessel(Plant):
     N_rr: Leaf = leaf("N m s^2/rad^2", shape="scalar", default=0.0)
     length: Leaf = leaf("m", sign="positive", shape="scalar", default=1.0)
     beam: Leaf = leaf("m", sign="positive", shape="scalar", default=0.25)
+    restoring: Restoring | None = None
     n: ClassVar[int] = 3
     order: ClassVar[int] = 2
     known_structure = True
@@ -106,7 +110,12 @@ class Vessel(Plant):
     component_names: ClassVar[tuple[str, ...]] = ("north", "east", "heading")
 
     def check(self) -> None:
-        """Raises ValueError for an inertia matrix that is not positive definite."""
+        """Raises ValueError for an inertia matrix that is not positive definite, or something that
+        is no restoring force.
+        """
+        if self.restoring is not None:
+            remedy = "iblf_jax.plants.RESTORING has them."
+            checks.conforms("Vessel.restoring", self.restoring, Restoring, remedy)
         if not checks.is_concrete(self):
             return
         m11, m22, m23, m33 = (float(x) for x in self._inertias())
@@ -169,14 +178,17 @@ class Vessel(Plant):
         rows = [[cosine, -sine, zero], [sine, cosine, zero], [zero, zero, one]]
         return jnp.stack([jnp.stack(row) for row in rows])
 
-    def _resistance(self, nu: jax.Array) -> jax.Array:
-        """C(nu) nu + D(nu) nu, (3,) [N, N, N m]."""
-        return matvec(self.coriolis_matrix(nu) + self.damping_matrix(nu), nu)
+    def _resistance(self, x: jax.Array) -> jax.Array:
+        """C(nu) nu + D(nu) nu + g(eta), (3,) [N, N, N m], for x, (2, 3)."""
+        force = matvec(self.coriolis_matrix(x[1]) + self.damping_matrix(x[1]), x[1])
+        if self.restoring is None:
+            return force
+        return force + self.restoring.forces(x[0])
 
     # --- the plant ------------------------------------------------------------------------------
 
     def drift(self, t: jax.Array, x: jax.Array) -> jax.Array:
-        """f, (2, 3): 0 and -M^-1 (C nu + D nu)."""
+        """f, (2, 3): 0 and -M^-1 (C nu + D nu + g)."""
         zero = jnp.zeros_like(x[0])
         return jnp.stack([zero, self.level_rate(2, t, x, zero, 0.0)])
 
@@ -192,7 +204,7 @@ class Vessel(Plant):
         """x_i', (3,); `torque` is added to the forces, (3,) [N, N, N m]."""
         if level == 1:
             return matvec(self.rotation(x[0, 2]), above)
-        return solve_spd(self.inertia_matrix(), above + torque - self._resistance(x[1]))
+        return solve_spd(self.inertia_matrix(), above + torque - self._resistance(x))
 
     def level_input(
         self, level: int, t: jax.Array, x: jax.Array, rate: jax.Array, torque: jax.Array | float
@@ -200,7 +212,7 @@ class Vessel(Plant):
         """The velocity nu, or the forces, (3,), for which x_i' is `rate`."""
         if level == 1:
             return matvec(self.rotation(x[0, 2]).T, rate)
-        return matvec(self.inertia_matrix(), rate) + self._resistance(x[1]) - torque
+        return matvec(self.inertia_matrix(), rate) + self._resistance(x) - torque
 
     def transposed_gain(self, level: int, t: jax.Array, x: jax.Array, s: jax.Array) -> jax.Array:
         """G_i^T s, (3,)."""

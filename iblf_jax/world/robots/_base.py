@@ -231,7 +231,11 @@ def coriolis_from_mass_matrix(mass_matrix, q: jax.Array, v: jax.Array, u: jax.Ar
             "Such as robot.mass_matrix, without brackets.",
         )
     q, v, u = checks.vectors(q=q, v=v, u=u)
-    _, M_along_v = jax.jvp(mass_matrix, (q,), (v,))
+    try:
+        _, M_along_v = jax.jvp(mass_matrix, (q,), (v,))
+    except TypeError as error:
+        expected = "a function q -> M(q) of JAX arrays"
+        raise checks.fail("mass_matrix", mass_matrix, expected, str(error)) from error
     _, M_along_u = jax.jvp(mass_matrix, (q,), (u,))
     energy_gradient = jax.grad(lambda x: inner(u, matvec(mass_matrix(x), v)))(q)
     return 0.5 * (matvec(M_along_v, u) + matvec(M_along_u, v) - energy_gradient)

@@ -71,7 +71,6 @@ class Client:
         self.node.create_subscription(DiagnosticArray, "diagnostics", self._diagnostic, 10)
 
     def reset(self) -> None:
-        """Forgets what earlier processes sent."""
         self.spin(0.05)
         self.efforts.clear()
         self.diagnostics = {}
@@ -88,13 +87,11 @@ class Client:
         self.diagnostics = {value.key: value.value for value in status.values}
 
     def spin(self, duration: float) -> None:
-        """Receives for a duration."""
         end = time.monotonic() + duration
         while time.monotonic() < end:
             rclpy.spin_once(self.node, timeout_sec=0.005)
 
     def wait(self, condition: Callable[[], object], what: str) -> None:
-        """Receives until a condition holds."""
         end = time.monotonic() + TIMEOUT
         while not condition():
             assert time.monotonic() < end, f"{what}; {self.diagnostics}"
@@ -120,7 +117,6 @@ class Client:
         self.states.publish(message)
 
     def drive(self, until: Callable[[], object], what: str, **state) -> None:
-        """Publishes a state every period until a condition holds."""
         end = time.monotonic() + TIMEOUT
         while not until():
             assert time.monotonic() < end, f"{what}; {self.diagnostics}"
@@ -128,7 +124,6 @@ class Client:
             self.spin(PERIOD)
 
     def drive_for(self, duration: float, **state) -> None:
-        """Publishes a state every period for a duration."""
         end = time.monotonic() + duration
         self.drive(lambda: time.monotonic() > end, "time", **state)
 
@@ -167,7 +162,6 @@ class Client:
         return result.successful, result.reason
 
     def get(self, name: str) -> list[float]:
-        """The numbers of a parameter."""
         request = GetParameters.Request(names=[name])
         value = self._called(GetParameters, f"/{NAME}/get_parameters", request).values[0]
         return list(value.double_array_value) or [value.double_value]
@@ -177,7 +171,6 @@ class Client:
         return self.diagnostics.get("mode", "")
 
     def reach(self, mode: str, **state) -> None:
-        """Publishes states until the node reports a mode."""
         self.drive(lambda: self.mode == mode, f"not {mode}", **state)
 
 
@@ -225,29 +218,17 @@ def nodes(package, context):
         process.communicate(timeout=TIMEOUT)
 
 
-def shuffled(q, dq):
-    """The joints among others in another order."""
-    names = ["gripper", "joint_2", "camera", "joint_1"]
-    return {"names": names, "q": (9.0, q[1], 8.0, q[0]), "dq": (7.0, dq[1], 6.0, dq[0])}
-
-
-def send_random_states(client):
-    """States at and outside of the bounds, for which the law uses all torque."""
-    rng = np.random.default_rng(0)
-    for _ in range(100):
-        q, dq = rng.normal(0.5, 1.0, 2), rng.normal(0.0, 20.0, 2)
-        client.state(q=q.tolist(), dq=dq.tolist())
-        client.spin(PERIOD)
-
-
 def test_in_lock_step_the_efforts_are_those_of_the_simulation(client, nodes, package):
-    """The states of a simulated run with joints in another order: the node repeats its torques."""
+    """The states of a simulated run with other joints and in another order: the node repeats its
+    torques."""
+    names = ["gripper", "joint_2", "camera", "joint_1"]
     run = ij.simulate(package.scenario, duration=3.0, dt=1e-3, record_every=10)
     nodes.begin(trigger="state", start_automatically="true")
     client.connect()
     for k in range(len(run.t) - 1):
         q, dq = run.measured.q[k].tolist(), run.measured.dq[k].tolist()
-        client.state(stamp=1000.0 + k * PERIOD, **shuffled(q, dq))
+        state = {"q": (9.0, q[1], 8.0, q[0]), "dq": (7.0, dq[1], 6.0, dq[0])}
+        client.state(stamp=1000.0 + k * PERIOD, names=names, **state)
         client.wait(lambda: len(client.efforts) == k + 1, f"no answer {k}")  # noqa: B023
     np.testing.assert_allclose(client.efforts, run.tau[:-1], rtol=0, atol=1e-6)
     client.spin(0.3)
@@ -256,43 +237,17 @@ def test_in_lock_step_the_efforts_are_those_of_the_simulation(client, nodes, pac
     assert client.diagnostics["samples"] == str(len(run.t) - 1)
 
 
-def test_without_the_executor_in_cpp_the_node_uses_that_in_python(client, nodes):
-    """As with rclpy before ROS 2 Kilted."""
-    hidden = "import sys; sys.modules['rclpy.experimental'] = None; "
-    program = f"{hidden}from {NAME}.law_node import main; sys.exit(main())"
-    process = nodes.begin(program=["-c", program], start_automatically="true")
+def test_start_hold_and_stop(client, nodes):
+    """Nothing is published before the first complete and fresh state."""
+    nodes.begin(hold_stiffness="[10.0, 5.0]", hold_damping="[0.0, 0.0]")
     client.connect()
-    client.reach("running")
-    assert client.call("stop").success
-    client.reach("stopped")
-    process.terminate()
-    assert process.wait(TIMEOUT) == 0
-
-
-def test_nothing_is_published_before_a_complete_state(client, nodes):
-    nodes.begin()
-    client.connect()
-    client.spin(0.3)
-    client.drive_for(0.3, names=("joint_1",), q=(0.5,), dq=(0.0,))
-    client.drive_for(0.3, q=(0.5, math.nan))
-    client.drive_for(0.3, names=("gripper", "camera"))
-    client.drive_for(0.3, stamp=1.0)
-    client.state(dq=())
-    client.spin(0.3)
-    assert client.efforts == []
+    for state in ({"names": ("joint_1",), "q": (0.5,)}, {"q": (0.5, math.nan)}, {"stamp": 1.0}):
+        client.drive_for(0.2, **state)
     assert client.mode == "waiting"
-    assert not client.call("hold", drives=False).success
     assert not client.call("start", drives=False).success
     assert client.efforts == []
     client.reach("stopped")
-    assert client.efforts
     assert set(map(tuple, client.efforts)) == {(0.0, 0.0)}
-
-
-def test_start_hold_and_stop(client, nodes):
-    nodes.begin(hold_stiffness="[10.0, 5.0]", hold_damping="[0.0, 0.0]")
-    client.connect()
-    client.reach("stopped")
     response = client.call("start")
     assert response.success and "runs from t = 0 s" in response.message
     client.reach("running")
@@ -310,12 +265,6 @@ def test_start_hold_and_stop(client, nodes):
     client.reach("stopped")
     client.drive_for(0.2)
     assert client.efforts[-1] == [0.0, 0.0]
-
-
-def test_a_start_outside_of_the_bounds_can_be_allowed(client, nodes):
-    nodes.begin(start_outside_bounds="true", start_automatically="true")
-    client.connect()
-    client.reach("running", q=(5.0, INSIDE[1]))
 
 
 @pytest.mark.parametrize("trigger", ["timer", "state"])
@@ -345,41 +294,23 @@ def test_the_parameter_file_holds_in_a_namespace_and_under_another_name(client, 
     nodes.begin(remap=[*names, *topics], start_automatically="true")
     client.connect()
     client.reach("running")
-    send_random_states(client)
+    # At and outside of the bounds the law uses all torque.
+    rng = np.random.default_rng(0)
+    for _ in range(100):
+        client.state(q=rng.normal(0.5, 1.0, 2).tolist(), dq=rng.normal(0.0, 20.0, 2).tolist())
+        client.spin(PERIOD)
     np.testing.assert_array_equal(np.abs(client.efforts).max(axis=0), [5.0, 3.0])
 
 
-FAULTS = {"a NaN": {"q": (math.nan, 0.5)}, "a missing joint": {"names": ("joint_1", "joint2")}}
-"""`test_supervisor` has all of them."""
-
-
-@pytest.mark.parametrize(("name", "policy"), zip(FAULTS, ["zero", "hold"], strict=True))
-def test_one_bad_state_is_a_fault_until_start(client, nodes, name, policy):
-    nodes.begin(on_fault=policy, start_automatically="true")
+def test_without_states_the_policy_takes_over(client, nodes):
+    """The law may start outside of the bounds here."""
+    nodes.begin(on_fault="hold", start_automatically="true", start_outside_bounds="true")
     client.connect()
-    client.reach("running")
-    client.state(**FAULTS[name])
-    client.reach("fault")
-    assert client.level == b"\2"
-    assert client.diagnostics["last_fault"] != "none"
-    client.drive_for(0.2)
-    assert (client.efforts[-1] == [0.0, 0.0]) == (policy == "zero")
-    assert not client.call("hold").success
-    client.drive_for(0.3)
-    assert client.mode == "fault"
-    assert client.call("start").success
-    client.reach("running")
-
-
-@pytest.mark.parametrize(("trigger", "policy"), [("timer", "hold"), ("state", "zero")])
-def test_without_states_the_policy_takes_over(client, nodes, trigger, policy):
-    nodes.begin(on_fault=policy, start_automatically="true", trigger=trigger)
-    client.connect()
-    client.reach("running")
+    client.reach("running", q=(5.0, INSIDE[1]))
     client.wait(lambda: client.mode == "fault", "no fault")
     count = len(client.efforts)
     client.wait(lambda: len(client.efforts) > count, "no torques of the policy")
-    assert (client.efforts[-1] == [0.0, 0.0]) == (policy == "zero")
+    assert client.efforts[-1] != [0.0, 0.0]
     assert "stale" in client.diagnostics["last_fault"]
 
 
@@ -432,10 +363,9 @@ def node_with(change: str) -> list[str]:
 @pytest.mark.parametrize(
     ("trigger", "policy", "change"),
     [
-        pytest.param("timer", "zero", "pass", id="timer"),
         pytest.param("state", "hold", "pass", id="state"),
         pytest.param("timer", "hold", HIDES_EXECUTOR, id="executor in Python"),
-        pytest.param("state", "zero", HIDES_IDENTITY, id="numbers only"),
+        pytest.param("timer", "zero", HIDES_IDENTITY, id="numbers only"),
     ],
 )
 def test_a_second_publisher_of_joint_states_is_a_fault(
@@ -450,7 +380,6 @@ def test_a_second_publisher_of_joint_states_is_a_fault(
     client.drive_for(0.2)
     node = rclpy.create_node("second_driver")
     second, first = node.create_publisher(JointState, "joint_states", 10), client.states
-    before = len(client.efforts)
 
     def both_send(until):
         while not until():
@@ -464,24 +393,15 @@ def test_a_second_publisher_of_joint_states_is_a_fault(
         end = time.monotonic() + TIMEOUT
         both_send(lambda: client.mode == "fault" or time.monotonic() > end)
         assert client.diagnostics["last_fault"].startswith("states of several publishers: a second")
+        assert client.level == b"\2"
         assert int(client.diagnostics["publishers"]) >= 2
         count = len(client.efforts)
         end = time.monotonic() + 0.5
         both_send(lambda: time.monotonic() > end)
         # Both send on: the torques of the fault are constant.
-        balance = [0.0, 0.0]
-        if policy == "hold":
-            balance = load_law(package.modules / NAME).balance(INSIDE)
+        law = load_law(package.modules / NAME)
+        balance = law.balance(INSIDE) if policy == "hold" else [0.0, 0.0]
         np.testing.assert_allclose(client.efforts[count:], [balance] * len(client.efforts[count:]))
-        if change is not HIDES_IDENTITY:
-            # No torque of the law answers a state of the second publisher.
-            law = load_law(package.modules / NAME)
-            assert law.init(INSIDE, (0.0, 0.0))
-            right, wrong = (law.step(0.0, q, (0.0, 0.0))[0] for q in (INSIDE, ELSEWHERE))
-            running = [x for x in client.efforts[before - 10 : count] if x != client.efforts[count]]
-            assert len(running) >= 10
-            steps = np.abs(np.diff(running, axis=0)).max()
-            assert steps < 0.1 * np.abs(np.subtract(right, wrong)).max()
         refused = client.call("start", drives=False)
         assert not refused.success and "second publisher" in refused.message
     finally:
@@ -517,22 +437,22 @@ def test_a_gain_changes_while_the_law_runs_and_is_refused_outside_of_its_range(c
     client.connect()
     moving = {"dq": (0.3, -0.4)}
     client.reach("running", **moving)
-    succeeded, reason = client.set("controller.K2", [4.5, 2.0])
-    assert not succeeded
-    assert "got 4.5, expected a number from 1 to 4" in reason
+    for name, value, words in (
+        ("controller.K2", [4.5, 2.0], "got 4.5, expected a number from 1 to 4"),
+        ("controller.K2", [2.0], ""),
+        ("controller.K2", [math.nan, 2.0], ""),
+        ("controller.k1", 4.1, ""),
+        ("time_origin", -math.inf, "time_origin: got -inf, expected a stamp"),
+        ("time_origin", 1e300, "NaN is the stamp at the start"),
+        # These are read-only.
+        ("torque_limits", [1.0, 1.0], ""),
+        ("period", 0.02, ""),
+        ("state_timeout", math.inf, ""),
+        ("arrival_timeout", math.inf, ""),
+    ):
+        succeeded, reason = client.set(name, value)
+        assert not succeeded and words in reason, name
     assert client.get("controller.K2") == [2.0, 2.0]
-    assert not client.set("controller.K2", [2.0])[0]
-    assert not client.set("controller.K2", [math.nan, 2.0])[0]
-    assert not client.set("controller.k1", 4.1)[0]
-    assert not client.set("torque_limits", [1.0, 1.0])[0], "read-only"
-    assert not client.set("period", 0.02)[0], "read-only"
-    for value in (math.inf, -math.inf, 1e300):
-        succeeded, reason = client.set("time_origin", value)
-        assert not succeeded
-        assert f"time_origin: got {value}, expected a stamp" in reason
-        assert "NaN is the stamp at the start" in reason
-    assert not client.set("state_timeout", math.inf)[0], "read-only"
-    assert not client.set("arrival_timeout", math.inf)[0], "read-only"
     assert client.set("controller.K2", [4.0, 3.5]) == (True, "")
     assert client.set("controller.k1", 2.0) == (True, "")
     assert client.get("controller.K2") == [4.0, 3.5]
@@ -618,10 +538,7 @@ def test_a_second_signal_ends_the_node_at_once(client, nodes):
     assert time.monotonic() - before < 30.0
 
 
-@pytest.mark.parametrize("policy", ["zero", "hold"])
-def test_a_node_whose_callback_fails_sends_the_torques_of_its_policy(
-    client, nodes, package, policy
-):
+def test_a_node_whose_callback_fails_sends_the_torques_of_its_policy(client, nodes, package):
     """The law's function raises an error at its thirtieth call."""
     program = (
         f"import sys; from {NAME} import c_law; from {NAME}.law_node import main\n"
@@ -633,15 +550,13 @@ def test_a_node_whose_callback_fails_sends_the_torques_of_its_policy(
         "c_law.CLaw.step = failing\n"
         "sys.exit(main())"
     )
-    process = nodes.begin(program=["-c", program], on_fault=policy, start_automatically="true")
+    process = nodes.begin(program=["-c", program], on_fault="hold", start_automatically="true")
     client.connect()
     client.drive(lambda: process.poll() is not None, "the process goes on")
     assert process.returncode == 1
     assert "an error of the test" in process.stderr.read()
     client.spin(0.2)
-    balance = [0.0, 0.0]
-    if policy == "hold":
-        balance = load_law(package.modules / NAME).balance(INSIDE)
+    balance = load_law(package.modules / NAME).balance(INSIDE)
     np.testing.assert_allclose(client.efforts[-1], balance)
     assert len(client.efforts) >= 30
     assert np.abs(client.efforts[-2]).max() > 0
@@ -654,7 +569,6 @@ REFUSED = {
     "a limit above the export": ({"torque_limits": "[41.0, 1.0]"}, "at most [40.0, 15.0] N m"),
     "integers": ({"torque_limits": "[10, 1]"}, "decimal point"),
     "a policy": ({"on_fault": "brake"}, "on_fault: got brake, expected one of ['hold', 'zero']"),
-    "a trigger": ({"trigger": "clock"}, "trigger: got clock"),
     "a negative stiffness": ({"hold_stiffness": "[-1.0, 1.0]"}, "hold_stiffness: got [-1.0"),
     "a time beyond all stamps": ({"time_origin": 1e300}, "time_origin: got 1e+300"),
     "an infinite age": ({"state_timeout": ".inf"}, "state_timeout: got inf, expected a time > 0"),
@@ -662,9 +576,7 @@ REFUSED = {
         {"arrival_timeout": ".inf", "trigger": "state"},
         "arrival_timeout: got inf, expected a time > 0 and at most 3600 s. The default is 0.5 s.",
     ),
-    "a timeout of zero": ({"state_timeout": 0.0}, "state_timeout: got 0.0"),
     "a gain": ({"controller.K2": "[9.0, 2.0]"}, "controller.K2: got 9, expected a number from 1"),
-    "a scalar gain": ({"controller.k1": 9.0}, "controller.k1: got"),
 }
 
 

@@ -29,6 +29,10 @@ def test_a_planar_arm_moves_in_mujoco_as_in_simulate(scenario, payload):
     run = ij.simulate(scenario, duration=0.2, dt=1e-3)
     other = ij.cosimulate(scenario, plant, duration=0.2, dt=1e-3)
     np.testing.assert_allclose(other.q, run.q, atol=1e-8)
+    np.testing.assert_allclose(other.disturbance, run.disturbance, atol=1e-7)
+    if payload:  # of which the law does not know
+        light = ij.simulate(PAPER, duration=0.2, dt=1e-3)
+        assert np.max(np.abs(np.asarray(light.q - run.q))) > 1e-3
 
 
 def test_the_joints_of_a_file_have_its_names_unless_others_are_given():

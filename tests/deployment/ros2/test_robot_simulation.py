@@ -4,6 +4,7 @@ does without efforts."""
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +18,7 @@ from iblf_jax.simulation.scenario import canonical
 
 mujoco = pytest.importorskip("mujoco", reason='needs the extra "robots"')
 from iblf_jax.deployment.mujoco_plant import MujocoPlant
+from iblf_jax.deployment.ros2 import simulated_robot
 from iblf_jax.deployment.ros2.robot_motion import RobotMotion, recorded
 from iblf_jax.deployment.ros2.robot_simulation import RobotSimulation
 
@@ -28,59 +30,41 @@ PAPER = ij.with_parts(
     disturbance=ij.disturbances.Nothing(),
     sampling=ij.Sampling(PERIOD),
 )
+VELOCITY = ij.sensors.FilteredDifference(cutoff=400.0)
 NOISY = ij.with_parts(
     PAPER,
     sampling=ij.Sampling(PERIOD, delay=2.7e-3),
-    sensor=ij.sensors.Encoder(
-        counts=65536, noise=1e-5, velocity=ij.sensors.FilteredDifference(cutoff=400.0)
-    ),
+    sensor=ij.sensors.Encoder(counts=65536, noise=1e-5, velocity=VELOCITY),
 )
 
 
 def robot(q=(0.8, 0.8), *, payload=None, **options) -> RobotSimulation:
     plant = MujocoPlant(ARM, JOINTS, 2, {}, "RK4", payload)
-    settings = {
-        "period": PERIOD,
-        "dt": DT,
-        "sensor": ij.sensors.Ideal(),
-        "delay": 0.0,
-        "effort_timeout": 0.1,
-        "brake": "start",
-        "seed": 0,
-    }
+    settings = {"period": PERIOD, "dt": DT, "sensor": ij.sensors.Ideal(), "delay": 0.0}
+    settings |= {"effort_timeout": 0.1, "brake": "start", "seed": 0}
     return RobotSimulation(plant, np.array(q), np.zeros(2), **(settings | options))
 
 
 def motion_of(simulation: RobotSimulation) -> RobotMotion:
     simulation.finish()
-    samples = len(simulation.samples)
-    return recorded(
-        simulation.robot,
-        simulation.rows,
-        simulation.samples,
-        joints=JOINTS,
-        period=PERIOD,
-        dt=DT,
-        origin=0.0,
-        ended=0.0,
-        published=np.ones(samples, bool),
-        latency=np.zeros(samples),
-        lateness=np.zeros(samples),
-        effort_t=np.array(simulation.efforts.times) - simulation.efforts.delay,
-        counts={"expired efforts": simulation.timeouts},
-        diverged=simulation.diverged,
-    )
+    samples = simulation.samples
+    known = {"joints": JOINTS, "period": PERIOD, "dt": DT, "origin": 0.0, "ended": 0.0}
+    known |= {name: np.zeros(len(samples)) for name in ("latency", "lateness")}
+    known |= {"published": np.ones(len(samples), bool), "diverged": simulation.diverged}
+    known["effort_t"] = np.array(simulation.efforts.times) - simulation.efforts.delay
+    known["counts"] = {"expired efforts": simulation.timeouts}
+    return recorded(simulation.robot, simulation.rows, samples, **known)
+
+
+law = jax.jit(sample)
 
 
 def closed_with_law(simulation: RobotSimulation, scenario, periods: int) -> RobotMotion:
     """The motion of a robot whose every reading the law answers at once, as a node would."""
-    scenario = canonical(scenario)
-    state = None
-    law = jax.jit(sample)
+    scenario, state = canonical(scenario), None
     for k in range(periods + 1):
         reading = simulation.measure()
-        numbers = (jnp.asarray(x) for x in (reading.t, reading.q, reading.dq))
-        inputs = SampleInputs(*numbers)
+        inputs = SampleInputs(*(jnp.asarray(x) for x in (reading.t, reading.q, reading.dq)))
         if state is None:
             state = start(scenario, inputs)[0]
         state, outputs = law(scenario, inputs, state)
@@ -99,9 +83,8 @@ def test_a_robot_answered_at_once_moves_as_in_cosimulate(scenario):
     np.testing.assert_allclose(motion.q[motion.instant], run.q, atol=1e-9)
     rollout = motion.rollout(scenario)
     for name in ("q", "dq", "alpha", "disturbance_estimate", "t"):
-        np.testing.assert_allclose(
-            getattr(rollout, name), getattr(run, name), atol=2e-7, err_msg=name
-        )
+        left, right = getattr(rollout, name), getattr(run, name)
+        np.testing.assert_allclose(left, right, atol=2e-7, err_msg=name)
     # The brake, and not a torque, holds the robot until the first effort acts.
     acts = np.asarray(run.t) > scenario.sampling.delay
     for name in ("tau", "disturbance", "V"):
@@ -109,15 +92,18 @@ def test_a_robot_answered_at_once_moves_as_in_cosimulate(scenario):
         np.testing.assert_allclose(left, right, atol=2e-7, err_msg=name)
     if scenario is PAPER:
         for name, value in run.metrics.items():
-            np.testing.assert_allclose(
-                rollout.metrics[name], value, rtol=1e-6, atol=1e-6, err_msg=name
-            )
+            left = rollout.metrics[name]
+            np.testing.assert_allclose(left, value, rtol=1e-6, atol=1e-6, err_msg=name)
     assert int(rollout.status) == int(run.status)
 
 
 @pytest.mark.slow
 def test_a_motion_survives_its_file(tmp_path):
     motion = closed_with_law(robot(), PAPER, periods=5)
+    last = robot()
+    last.is_recording = False
+    np.testing.assert_array_equal(closed_with_law(last, PAPER, 5).q, motion.q[-1:])
+    assert len(last.rows) == len(last.samples) == 1
     motion.save(tmp_path / "motion.npz")
     loaded = ij.load(tmp_path / "motion.npz")
     assert loaded.joints == JOINTS
@@ -132,43 +118,26 @@ def test_the_timing_of_a_motion_is_that_of_its_messages():
     lateness = np.array([0.0, 0.1, 0.0, 0.0, 0.3, 0.0]) * 1e-3
     # Five periods from the first to the last effort, one of them without an effort.
     arrivals = np.array([0.5, 2.8, 6.5, 9.2, 10.6]) * 1e-3
-    timing = dataclasses.replace(
-        motion, latency=latency, lateness=lateness, effort_t=arrivals
-    ).timing()
-    assert timing["missed"] == pytest.approx(0.2)
-    assert timing["gap"] == pytest.approx(3.7e-3)
-    assert timing["latency, longest"] == pytest.approx(0.9e-3)
-    assert timing["lateness, longest"] == pytest.approx(0.3e-3)
-    assert timing["jitter, median"] == pytest.approx(0.65e-3)
-
-
-def test_without_a_recording_the_last_instant_is_kept():
-    recording, other = robot(), robot()
-    other.is_recording = False
-    complete, last = closed_with_law(recording, PAPER, 5), closed_with_law(other, PAPER, 5)
-    np.testing.assert_array_equal(last.q, complete.q[-1:])
-    assert len(other.rows) == len(other.samples) == 1
-
-
-def free_fall(duration: float, q=(0.8, 0.8)) -> np.ndarray:
-    """Positions of the arm without torque, by MuJoCo alone."""
-    model = mujoco.MjModel.from_xml_path(str(ARM))
-    model.opt.timestep, model.opt.integrator = DT, mujoco.mjtIntegrator.mjINT_RK4
-    data = mujoco.MjData(model)
-    data.qpos[:] = q
-    for _ in range(round(duration / DT)):
-        mujoco.mj_step(model, data)
-    return data.qpos.copy()
+    changes = {"latency": latency, "lateness": lateness, "effort_t": arrivals}
+    timing = dataclasses.replace(motion, **changes).timing()
+    expected = {"missed": 0.2, "gap": 3.7e-3, "latency, longest": 0.9e-3}
+    expected |= {"lateness, longest": 0.3e-3, "jitter, median": 0.65e-3}
+    assert {name: timing[name] for name in expected} == pytest.approx(expected)
 
 
 def test_without_efforts_the_brake_holds_and_without_brake_the_torque_is_zero():
+    model = mujoco.MjModel.from_xml_path(str(ARM))
+    model.opt.timestep, model.opt.integrator = DT, mujoco.mjtIntegrator.mjINT_RK4
+    data = mujoco.MjData(model)
+    data.qpos[:] = 0.8
+    mujoco.mj_step(model, data, nstep=round(10 * PERIOD / DT))
     held, free = robot(brake="start"), robot(brake="never")
     for _ in range(10):
         held.measure()
         held.advance()
         free.advance()
     np.testing.assert_array_equal(held.robot.q, [0.8, 0.8])
-    np.testing.assert_allclose(free.robot.q, free_fall(10 * PERIOD), atol=1e-12)
+    np.testing.assert_allclose(free.robot.q, data.qpos, atol=1e-12)
     assert np.max(np.abs(free.robot.q - 0.8)) > 1e-3
     np.testing.assert_array_equal(motion_of(held).ddq, 0.0)
 
@@ -227,19 +196,46 @@ def test_a_payload_changes_the_motion_as_that_of_the_plant_does():
     assert np.max(np.abs(np.asarray(light.q - run.q))) > 1e-3
 
 
-@pytest.mark.parametrize(
-    ("payload", "words"),
-    [
-        (0.3, "payload: got 0.3, expected an iblf_jax.robots.Payload"),
-        (ij.robots.Payload(mass=0.3, start=1.0), "payload.start: got"),
-    ],
-)
-def test_a_payload_that_mujoco_does_not_have_is_refused(payload, words):
-    with pytest.raises(ValueError, match=words):
-        MujocoPlant(ARM, JOINTS, 2, {}, "RK4", payload)
+def test_a_payload_that_mujoco_does_not_have_is_refused():
+    compiled = mujoco.MjModel.from_xml_path(str(ARM))
+    for model, payload, words in (
+        (ARM, 0.3, "payload: got 0.3, expected an iblf_jax.robots.Payload"),
+        (ARM, ij.robots.Payload(mass=0.3, start=1.0), "payload.start: got"),
+        (compiled, ij.robots.Payload(mass=0.3), r"payload: got .* Give the file or an MjSpec"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            MujocoPlant(model, JOINTS, 2, {}, "RK4", payload)
 
 
-def test_a_compiled_model_takes_no_payload():
-    model = mujoco.MjModel.from_xml_path(str(ARM))
-    with pytest.raises(ValueError, match=r"payload: got .* Give the file or an MjSpec"):
-        MujocoPlant(model, JOINTS, 2, {}, "RK4", ij.robots.Payload(mass=0.3))
+def test_the_clock_of_a_robot_goes_on_while_it_waits_for_the_law(monkeypatch):
+    """In lock step, with a law in the same process in place of ROS 2: it answers every state, the
+    first two with torques of zero, which do not release the brake."""
+    stamps, made = [], []
+
+    def publish(message):
+        stamp = message.header.stamp
+        stamps.append(stamp.sec + 1e-9 * stamp.nanosec)
+        made[0]._receive(SimpleNamespace(data=[0.1 * (len(stamps) > 2)] * 2))
+
+    node = SimpleNamespace(
+        create_publisher=lambda *_: SimpleNamespace(publish=publish),
+        create_subscription=lambda *_: SimpleNamespace(topic_name="efforts"),
+        count_publishers=lambda _: 1,
+    )
+    rclpy = SimpleNamespace(
+        context=SimpleNamespace(Context=object),
+        init=lambda **_: None,
+        create_node=lambda *_, **__: node,
+    )
+    state = lambda name: SimpleNamespace(header=SimpleNamespace(stamp=SimpleNamespace()))  # noqa: E731
+    messages = SimpleNamespace(JointState=state, Float64MultiArray=None)
+    monkeypatch.setattr(simulated_robot, "ros_packages", lambda: (rclpy, messages, messages))
+    executor = SimpleNamespace(add_node=lambda _: None, spin_once=lambda **_: None)
+    monkeypatch.setattr(simulated_robot, "_executor", lambda *_: executor)
+    monkeypatch.setattr(simulated_robot, "DISCOVERY_TIME", 0.0)
+    dropouts = simulated_robot.Dropouts(0.0, 0.0, seed=0)
+    made.append(simulated_robot.SimulatedRobot(robot(), JOINTS, dropouts, False, ()))
+    motion = made[0].run(5 * PERIOD)
+    np.testing.assert_allclose(stamps, PERIOD * np.arange(8), atol=1e-9)
+    assert motion.origin == pytest.approx(2 * PERIOD)
+    np.testing.assert_allclose(motion.state_t, PERIOD * np.arange(6), atol=1e-12)

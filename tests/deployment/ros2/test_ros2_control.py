@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import iblf_jax as ij
-from iblf_jax.deployment.control_law import control_law, sample, start
+from iblf_jax.deployment.control_law import control_law, inputs_at_start, sample, start
 from iblf_jax.deployment.export import vectors
 from iblf_jax.deployment.ros2.ros2_control import cpp_string, ros2_control_files
 from iblf_jax.deployment.write_c import CHECK_INTERVAL, Law, generate
@@ -36,16 +36,6 @@ pytestmark = [
 ]
 
 
-def places_of(generated, path):
-    """The places of the numbers of a leaf in the struct of parameters."""
-    first = 0
-    for field in generated.parameters.fields:
-        if field.path == path:
-            return [[first + i] for i in range(field.value.size)]
-        first += field.value.size
-    raise AssertionError(path)
-
-
 class Built:
     """A law, its package, and the harness around its controller."""
 
@@ -59,27 +49,22 @@ class Built:
             self.generated = generate(self.law)
         else:
             self.vectors, self.law, self.generated = like.vectors, like.law, like.generated
-        law, generated = self.law, self.generated
+        fields = self.generated.parameters.fields
+        number = [field.path for field in fields].index("controller.K2")
+        first = sum(field.value.size for field in fields[:number])
+        gain = {"path": "controller.K2", "unit": "N m s/rad", "offsets": [[first], [first + 1]]}
         self.description = {
             "joints": list(JOINTS),
             "has_joint_names": False,
-            "reads_velocity": "dq" not in law.unread_levels,
+            "reads_velocity": "dq" not in self.law.unread_levels,
             "torque_limits": [500.0, 400.0],
             "on_fault": "hold",
             "hold_stiffness": [3.0, 2.0],
             "hold_damping": [0.5, 0.25],
-            "gains": [
-                {
-                    "path": "controller.K2",
-                    "unit": "N m s/rad",
-                    "low": [5.0, 5.0],
-                    "high": [20.0, 20.0],
-                    "offsets": places_of(generated, "controller.K2"),
-                }
-            ],
+            "gains": [gain | {"low": [5.0, 5.0], "high": [20.0, 20.0]}],
             **changes,
         }
-        self.files = ros2_control_files(law, generated, self.description)
+        self.files = ros2_control_files(self.law, self.generated, self.description)
         self.package = folder / "package"
         for name, text in self.files.items():
             (self.package / name).parent.mkdir(parents=True, exist_ok=True)
@@ -88,14 +73,16 @@ class Built:
         include = self.package / "include"
         own = ("-I", include / "iblf_law_controller")
         paths = [*own, "-I", include, "-isystem", HERE / "stubs"]
-        law_object, controller = folder / "law.o", folder / "controller.o"
+        objects = [folder / "law.o", folder / "controller.o"]
         sources = self.package / "src"
-        run(["cc", "-std=c99", "-O1", *own, "-c", sources / "iblf_law.c", "-o", law_object])
         compiler = ["c++", "-std=c++17", *flags]
-        source = sources / "law_controller.cpp"
-        run([*compiler, *FLAGS, *paths, "-c", source, "-o", controller])
         harness = HERE / "ros2_control_harness.cpp"
-        run([*compiler, *paths, harness, controller, law_object, "-o", self.program])
+        for command in (
+            ["cc", "-std=c99", "-O1", *own, "-c", sources / "iblf_law.c", "-o", objects[0]],
+            [*compiler, *FLAGS, *paths, "-c", sources / "law_controller.cpp", "-o", objects[1]],
+            [*compiler, *paths, harness, *objects, "-o", self.program],
+        ):
+            subprocess.run(command, check=True)
 
     def states(self, q, dq):
         """The values of the state interfaces as `activated` claims them."""
@@ -105,15 +92,13 @@ class Built:
     def activated(self, *parameters):
         """The commands until the controller is active."""
         kinds = ("position", "velocity") if self.description["reads_velocity"] else ("position",)
-        names = [f"{x}/{kind}" for x in JOINTS for kind in kinds]
-        efforts = [f"{x}/effort" for x in JOINTS]
-        return [
-            "rate 500",
-            *parameters,
-            "init",
-            "configure",
-            f"activate {' '.join(names + efforts)}",
-        ]
+        names = " ".join(f"{x}/{kind}" for x in JOINTS for kind in kinds)
+        names += "".join(f" {x}/effort" for x in JOINTS)
+        return ["rate 500", *parameters, "init", "configure", f"activate {names}"]
+
+    def update_commands(self, updates):
+        """The commands of updates (time [ns], q, dq)."""
+        return [f"update {t} {self.states(q, dq)}" for t, q, dq in updates]
 
     def answers(self, commands):
         """What the harness prints."""
@@ -124,36 +109,20 @@ class Built:
 
     def efforts(self, updates, *parameters):
         """The efforts of updates (time [ns], q, dq), (K, n)."""
-        steps = [f"update {t} {self.states(q, dq)}" for t, q, dq in updates]
-        lines = self.answers([*self.activated(*parameters), *steps])
-        return efforts_of(lines)
+        commands = [*self.activated(*parameters), *self.update_commands(updates)]
+        return efforts_of(self.answers(commands))
 
-    def law_torques(self, updates):
-        """The torques of the package for the same samples, (K, n)."""
-        q0, dq0 = np.asarray(updates[0][1]), np.asarray(updates[0][2])
-        rows = [np.array(x) for x in zip(*updates, strict=True)]
-        return reference_torques(self.scenario, q0, dq0, rows)
-
-
-def reference_torques(scenario, q0, dq0, rows):
-    """By JAX: the torques of a law that starts at q0 and dq0."""
-    from iblf_jax.deployment.control_law import inputs_at_start
-
-    t, q, dq = rows
-    first = inputs_at_start(scenario)._replace(q=q0, dq=dq0)
-    state = start(scenario, first)[0]
-    found = []
-    step = jax.jit(sample)
-    for k in range(len(t)):
-        inputs = first._replace(t=1e-9 * (t[k] - t[0]), q=q[k], dq=dq[k])
-        state, outputs = step(scenario, inputs, state)
-        found.append(np.asarray(outputs.tau))
-    return np.array(found)
-
-
-def run(command):
-    done = subprocess.run([str(x) for x in command], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+    def law_torques(self, updates, **values):
+        """The torques of the package for the same samples, by JAX, (K, n)."""
+        scenario = ij.with_parameters(self.scenario, values)
+        t, q, dq = (np.array(x) for x in zip(*updates, strict=True))
+        first = inputs_at_start(scenario)._replace(q=q[0], dq=dq[0])
+        state, found, step = start(scenario, first)[0], [], jax.jit(sample)
+        for k in range(len(t)):
+            inputs = first._replace(t=1e-9 * (t[k] - t[0]), q=q[k], dq=dq[k])
+            state, outputs = step(scenario, inputs, state)
+            found.append(np.asarray(outputs.tau))
+        return np.array(found)
 
 
 def efforts_of(lines):
@@ -219,18 +188,7 @@ def test_a_law_that_does_not_read_velocities_does_not_claim_them(scenario, tmp_p
     assert "velocity`" not in built.files["README.md"]
 
 
-def test_the_order_of_the_claimed_interfaces_does_not_matter(built, updates):
-    names = "joint_2/velocity joint_1/position joint_2/position joint_1/velocity"
-    efforts = "joint_2/effort joint_1/effort"
-    commands = ["rate 500", "init", "configure", f"activate {names} {efforts}"]
-    for t, q, dq in updates[:20]:
-        values = (dq[1], q[0], q[1], dq[0])
-        commands.append(f"update {t} {' '.join(repr(float(x)) for x in values)}")
-    found = efforts_of(built.answers(commands))
-    np.testing.assert_array_equal(found[:, ::-1], built.efforts(updates[:20]))
-
-
-def test_what_is_claimed(built):
+def test_interfaces_are_claimed_in_any_order(built, updates):
     lines = built.answers(["rate 500", "init", "configure", "names"])
     assert lines[2:] == [
         "names joint_1/effort joint_2/effort",
@@ -239,6 +197,14 @@ def test_what_is_claimed(built):
     lines = built.answers(["rate 500", "init", "configure", "activate joint_1/effort"])
     assert "activate ERROR" in lines
     assert any("joint_2/effort: got no such interface" in line for line in lines)
+    names = "joint_2/velocity joint_1/position joint_2/position joint_1/velocity"
+    efforts = "joint_2/effort joint_1/effort"
+    commands = ["rate 500", "init", "configure", f"activate {names} {efforts}"]
+    for t, q, dq in updates[:20]:
+        values = (dq[1], q[0], q[1], dq[0])
+        commands.append(f"update {t} {' '.join(repr(float(x)) for x in values)}")
+    found = efforts_of(built.answers(commands))
+    np.testing.assert_array_equal(found[:, ::-1], built.efforts(updates[:20]))
 
 
 def test_there_is_no_command_before_the_first_complete_state(built, updates):
@@ -259,32 +225,32 @@ def hold_torque(built, q, q_hold, dq, is_fresh):
 
 
 def faulty(updates):
-    """Fault -> updates whose last four are in fault, and whether their states are finite."""
-    good = [list(x) for x in updates[:20]]
-    nan = [[t, q.copy(), dq.copy()] for t, q, dq in good]
+    """Faults with updates whose last four are in fault."""
+    nan, velocity = ([[t, q.copy(), dq.copy()] for t, q, dq in updates[:20]] for _ in range(2))
     nan[16][1][0] = np.nan
-    velocity = [[t, q.copy(), dq.copy()] for t, q, dq in good]
     velocity[16][2][1] = -np.inf
-    late = [[t + 3 * NANOSECONDS * (k >= 16), q, dq] for k, (t, q, dq) in enumerate(good)]
-    back = [[t - 3 * NANOSECONDS * (k >= 16), q, dq] for k, (t, q, dq) in enumerate(good)]
-    return {
-        "a state is not finite": nan,
-        "a state is not finite ": velocity,
-        "more than two periods passed": late,
-        "the time jumped back": back,
-    }
+    late, back = (
+        [[t + jump * (k >= 16), q, dq] for k, (t, q, dq) in enumerate(updates[:20])]
+        for jump in (3 * NANOSECONDS, -3 * NANOSECONDS)
+    )
+    return [
+        ("a state is not finite", nan),
+        ("a state is not finite", velocity),
+        ("more than two periods passed", late),
+        ("the time jumped back", back),
+    ]
 
 
 @pytest.mark.parametrize("case", range(4))
 @pytest.mark.parametrize("policy", ["hold", "zero"])
 def test_a_fault_leads_to_the_torques_of_the_policy(case, policy, built, updates):
-    reason, samples = list(faulty(updates).items())[case]
-    steps = [f"update {t} {built.states(q, dq)}" for t, q, dq in samples]
-    lines = built.answers([*built.activated(f"text on_fault {policy}"), *steps, "timer", "timer"])
+    reason, samples = faulty(updates)[case]
+    steps = [*built.update_commands(samples), "timer", "timer"]
+    lines = built.answers([*built.activated(f"text on_fault {policy}"), *steps])
     found = efforts_of(lines)
     np.testing.assert_array_equal(found[:16], built.efforts(updates[:16]))
     (message,) = logged(lines)
-    assert message.startswith(f"fault: {reason.strip()}")
+    assert message.startswith(f"fault: {reason}")
     if policy == "zero":
         np.testing.assert_array_equal(found[16:], 0.0)
         return
@@ -301,7 +267,7 @@ def test_a_torque_that_is_not_finite_is_a_fault(built, updates):
     """Positions of 1e300 rad are finite, but not the law at them; gravity is."""
     samples = [list(x) for x in updates[:6]]
     samples[3][2] = np.array([1e300, 1e300])
-    steps = [f"update {t} {built.states(q, dq)}" for t, q, dq in samples]
+    steps = built.update_commands(samples)
     lines = built.answers([*built.activated("text on_fault zero"), *steps, "timer"])
     found = efforts_of(lines)
     np.testing.assert_array_equal(found[3:], 0.0)
@@ -315,7 +281,7 @@ def test_a_start_outside_of_the_bounds_is_a_fault(policy, built, updates):
     """The first sample is outside by 1 rad, the later ones are inside."""
     samples = [(t, np.asarray(q), np.asarray(dq)) for t, q, dq in updates[:6]]
     samples[0] = (samples[0][0], samples[0][1] + [0.0, 1.0], samples[0][2])
-    steps = [f"update {t} {built.states(q, dq)}" for t, q, dq in samples]
+    steps = built.update_commands(samples)
     lines = built.answers([*built.activated(f"text on_fault {policy}"), *steps, "timer"])
     (message,) = logged(lines)
     assert message.startswith("fault: a joint is outside of its bounds at the start. Move")
@@ -334,8 +300,8 @@ def test_a_start_outside_of_the_bounds_is_a_fault(policy, built, updates):
 def test_only_a_new_activation_leaves_a_fault(built, updates):
     samples = [list(x) for x in updates[:6]]
     samples[3][1] = np.array([np.nan, 0.5])
-    steps = [f"update {t} {built.states(q, dq)}" for t, q, dq in samples]
-    good = [f"update {t} {built.states(q, dq)}" for t, q, dq in updates[:10]]
+    steps = built.update_commands(samples)
+    good = built.update_commands(updates[:10])
     commands = built.activated("text on_fault zero")
     lines = built.answers([*commands, *steps, "deactivate", commands[-1], *good])
     assert "efforts 0 0" in lines
@@ -359,7 +325,7 @@ def test_torques_are_clipped_last(built, updates):
     np.testing.assert_array_equal(found, np.clip(free, -limits, limits))
     assert np.any(np.abs(free) > limits)
     # The torques of a fault too.
-    _, samples = list(faulty(updates).items())[2]
+    _, samples = faulty(updates)[2]
     found = built.efforts(samples, "numbers torque_limits 0.1 0.01")
     np.testing.assert_array_equal(np.abs(found[16:]), [[0.1, 0.01]] * 4)
 
@@ -367,9 +333,7 @@ def test_torques_are_clipped_last(built, updates):
 def test_gains_are_read_when_the_controller_is_configured(built, updates):
     changed = built.efforts(updates[:50], "numbers controller.K2 6.0 15.0")
     assert not np.allclose(changed, built.efforts(updates[:50]))
-    scenario = ij.with_parameters(built.scenario, {"controller.K2": np.array([6.0, 15.0])})
-    rows = [np.array(x) for x in zip(*updates[:50], strict=True)]
-    expected = reference_torques(scenario, updates[0][1], updates[0][2], rows)
+    expected = built.law_torques(updates[:50], **{"controller.K2": np.array([6.0, 15.0])})
     np.testing.assert_allclose(changed, expected, atol=1e-11 * np.abs(expected).max())
 
 
@@ -383,7 +347,7 @@ def test_a_parameter_of_a_configured_controller_cannot_be_changed(built, updates
     reason = ": it is read when the controller is configured. Deactivate it and clean it up first."
     refused = f"change ERROR controller.K2{reason}"
     assert changes == [refused, f"change ERROR torque_limits{reason}", "change SUCCESS", refused]
-    steps = [f"update {t} {built.states(q, dq)}" for t, q, dq in updates[:10]]
+    steps = built.update_commands(updates[:10])
     again = ["deactivate", "cleanup", change, "configure", commands[-1]]
     lines = built.answers([*commands, *again, *steps])
     assert "change SUCCESS" in lines
@@ -393,30 +357,25 @@ def test_a_parameter_of_a_configured_controller_cannot_be_changed(built, updates
     )
 
 
-REFUSED = {
-    "update_rate: got 1000 Hz, expected 500 Hz": "rate 1000",
-    "update_rate: got 0 Hz, expected 500 Hz, the rate of the exported period. Set": "rate 0",
-    "joints: got [a, a], expected 2 different names": "texts joints a a",
-    "joints: got [a], expected 2 different names": "texts joints a",
-    "torque_limits: got [], expected 2 finite numbers > 0": "numbers torque_limits",
-    "torque_limits: got [1.000000, nan], expected": "numbers torque_limits 1 nan",
-    "torque_limits: got [1.000000, inf], expected": "numbers torque_limits 1 inf",
-    "torque_limits: got [1.000000, 0.000000], expected": "numbers torque_limits 1 0",
-    "torque_limits: got [600.000000, 1.000000], expected at most": "numbers torque_limits 600 1",
-    "on_fault: got stop, expected hold or zero": "text on_fault stop",
-    "hold_stiffness: got [-1.000000, 1.000000]": "numbers hold_stiffness -1 1",
-    "hold_damping: got [1.000000]": "numbers hold_damping 1",
-    "controller.K2: got [4.000000, 10.000000], expected 2 numbers": "numbers controller.K2 4 10",
-    "controller.K2: got [nan, 10.000000]": "numbers controller.K2 nan 10",
-    "controller.K2: got [10.000000], expected 2": "numbers controller.K2 10",
-}
+REFUSED = [
+    ("rate 0", "update_rate: got 0 Hz, expected 500 Hz, the rate of the exported period. Set"),
+    ("texts joints a a", "joints: got [a, a], expected 2 different names"),
+    ("numbers torque_limits 1 nan", "torque_limits: got [1.000000, nan], expected"),
+    ("numbers torque_limits 1 0", "torque_limits: got [1.000000, 0.000000], expected"),
+    ("numbers torque_limits 600 1", "torque_limits: got [600.000000, 1.000000], expected at most"),
+    ("text on_fault stop", "on_fault: got stop, expected hold or zero"),
+    ("numbers hold_stiffness -1 1", "hold_stiffness: got [-1.000000, 1.000000]"),
+    ("numbers hold_damping 1", "hold_damping: got [1.000000]"),
+    ("numbers controller.K2 4 10", "controller.K2: got [4.000000, 10.000000], expected 2 numbers"),
+    ("numbers controller.K2 nan 10", "controller.K2: got [nan, 10.000000]"),
+]
 
 
-@pytest.mark.parametrize("words", REFUSED)
-def test_a_parameter_that_does_not_fit_is_refused(words, built):
-    lines = built.answers(["rate 500", REFUSED[words], "init", "configure"])
-    assert "configure ERROR" in lines
-    assert logged(lines)[0].startswith(words)
+def test_parameters_that_do_not_fit_are_refused(built):
+    for command, words in REFUSED:
+        lines = built.answers(["rate 500", command, "init", "configure"])
+        assert "configure ERROR" in lines
+        assert logged(lines)[0].startswith(words)
 
 
 def test_names_of_the_robots_file_cannot_be_replaced(scenario, built, tmp_path):
@@ -431,47 +390,12 @@ def test_names_of_the_robots_file_cannot_be_replaced(scenario, built, tmp_path):
 
 def test_the_files_of_the_package_fit_together(built):
     package = "iblf_law_controller"
-    assert set(built.files) == {
-        "package.xml",
-        "CMakeLists.txt",
-        "law_controller.xml",
-        "README.md",
-        "config/controllers.yaml",
-        f"include/{package}/law_controller.hpp",
-        f"include/{package}/iblf_law.h",
-        "src/law_controller.cpp",
-        "src/iblf_law.c",
-    }
     assert ElementTree.fromstring(built.files["package.xml"]).findtext("name") == package
     plugin = ElementTree.fromstring(built.files["law_controller.xml"])
     assert plugin.attrib["path"] == package
     assert plugin[0].attrib["type"] == f"{package}::LawController"
     cmake = built.files["CMakeLists.txt"]
     assert "${PROJECT_NAME}" in cmake and "src/law_controller.cpp src/iblf_law.c" in cmake
-    assert "compiled and tested against stubs" in built.files["README.md"]
-    yaml = pytest.importorskip("yaml")
-    parameters = yaml.safe_load(built.files["config/controllers.yaml"])
-    assert parameters["controller_manager"]["ros__parameters"]["update_rate"] == 500
-    own = parameters[package]["ros__parameters"]
-    assert own["update_rate"] == 500 and own["controller.K2"] == [10.0, 10.0]
-    assert own["torque_limits"] == [500.0, 400.0] and own["joints"] == list(JOINTS)
-
-
-def test_an_export_contains_the_controller(scenario, tmp_path):
-    """With the limits, gains and joints of the package around it."""
-    K2 = ij.tunable("controller.K2", 5.0, 20.0)
-    made = ij.export(scenario, tmp_path, target="ros2", gains=[K2], torque_limits=[50.0, 20.0])
-    inside = [name for name in made.files if name.startswith("iblf_law_controller/")]
-    assert len(inside) == 9 and all((tmp_path / name).is_file() for name in inside)
-    package = tmp_path / "iblf_law_controller"
-    source = (package / "src" / "law_controller.cpp").read_text()
-    assert "kTorqueLimits = {50.0, 20.0};" in source and 'kNames = {"joint_1", "joint_2"}' in source
-    include = package / "include"
-    own = ("-I", include, "-I", include / "iblf_law_controller", "-isystem", HERE / "stubs")
-    run(["c++", "-std=c++17", *FLAGS, *own, "-fsyntax-only", package / "src/law_controller.cpp"])
-    assert (package / "src" / "iblf_law.c").read_text() == (tmp_path / "c/iblf_law.c").read_text()
-    parameters = (package / "config" / "controllers.yaml").read_text()
-    assert "torque_limits: [50.0, 20.0]" in parameters and "controller.K2" in parameters
 
 
 def test_a_period_without_a_whole_rate_has_no_controller(scenario, built):

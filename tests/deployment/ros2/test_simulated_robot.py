@@ -30,11 +30,11 @@ START = ij.Initial(q=[0.4, 0.7])
 
 
 @contextmanager
-def pd_law(*arguments: str):
+def pd_law(*arguments: str, program: tuple[str, ...] = (str(LAW),)):
     """The proportional-derivative law in a process of its own."""
-    process = subprocess.Popen([sys.executable, str(LAW), *arguments], stderr=subprocess.DEVNULL)
+    process = subprocess.Popen([sys.executable, *program, *arguments], stderr=subprocess.DEVNULL)
     try:
-        yield process
+        yield
     finally:
         process.kill()
         process.wait()
@@ -62,8 +62,12 @@ def expected(periods: int, *, answered=None, origin=0.0) -> np.ndarray:
 
 
 def test_in_lock_step_the_motion_is_that_of_mujoco_with_the_law():
-    with pd_law(), robot() as node:
+    """With topics of other names."""
+    names = ["--ros-args", "-r", "joint_states:=/arm/joint_states", "-r", "efforts:=/arm/efforts"]
+    with pd_law(*names), robot(ros_args=names) as node:
         motion = node.run(0.5)
+        with pytest.raises(ValueError, match=r"robot: got .*Make a new one"):
+            node.run(0.01)
     np.testing.assert_allclose(motion.q[motion.instant], expected(250), atol=1e-9)
     assert motion.origin == 0.0
     assert motion.missed_share == 0.0
@@ -101,23 +105,11 @@ def test_efforts_of_a_wrong_length_or_not_finite_are_refused_with_a_message(capf
 
 
 def test_a_law_that_ends_is_replaced_by_another_which_continues():
-    with robot() as node, pd_law("--samples", "40") as first, pd_law_after(first):
+    first_and_second = "import os, subprocess, sys; law = [sys.executable, sys.argv[1]]; "
+    first_and_second += "subprocess.run([*law, '--samples', '40']); os.execv(law[0], law)"
+    with robot() as node, pd_law(str(LAW), program=("-c", first_and_second)):
         motion = node.run(0.2)
     np.testing.assert_allclose(motion.q[motion.instant], expected(100), atol=1e-9)
-
-
-@contextmanager
-def pd_law_after(first):
-    """A second law that starts when the first one has ended."""
-    waits = f"import subprocess, os, time\nwhile os.path.exists('/proc/{first.pid}') and open("
-    waits += f"'/proc/{first.pid}/stat').read().rsplit(')', 1)[1].split()[0] != 'Z':"
-    waits += f" time.sleep(0.05)\nos.execv({sys.executable!r}, [{sys.executable!r}, {str(LAW)!r}])"
-    process = subprocess.Popen([sys.executable, "-c", waits], stderr=subprocess.DEVNULL)
-    try:
-        yield process
-    finally:
-        process.kill()
-        process.wait()
 
 
 def test_in_real_time_the_stamps_are_the_wall_clock_and_the_run_takes_its_time():
@@ -145,25 +137,13 @@ def test_without_a_law_the_run_ends_with_an_error_that_names_the_remedy():
             pytest.raises(TimeoutError, match=r"joint_states.* and `efforts`"),
         ):
             node.run(0.1, patience=0.3)
+    # Torques of zero do not release the brake.
+    with pd_law("--zero"), robot() as node, pytest.raises(TimeoutError, match="~/start"):
+        node.run(0.1, patience=8.0)
 
 
-def test_topics_can_be_remapped():
-    names = ["--ros-args", "-r", "joint_states:=/arm/joint_states", "-r", "efforts:=/arm/efforts"]
-    with pd_law(*names), robot(ros_args=names) as node:
-        motion = node.run(0.02)
-    np.testing.assert_allclose(motion.q[motion.instant], expected(10), atol=1e-9)
-
-
-def test_a_robot_runs_once():
-    with pd_law(), robot() as node:
-        node.run(0.01)
-        with pytest.raises(ValueError, match=r"robot: got .*Make a new one"):
-            node.run(0.01)
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
+def test_bad_arguments_name_the_field():
+    for options, words in (
         ({"dt": 3e-4}, r"dt: got 0.0003, expected a step that divides the period.*Take dt=0.00028"),
         ({"period": -1.0}, "period: got -1.0"),
         ({"state_dropout": 1.5}, "state_dropout: got 1.5, expected a number from 0 to 1"),
@@ -174,14 +154,9 @@ def test_a_robot_runs_once():
         ({"effort_timeout": 0.0}, "effort_timeout: got 0.0"),
         ({"payload": 1.0}, "payload: got 1.0"),
         ({"brake": True}, "brake: got True, expected"),
-    ],
-)
-def test_bad_arguments_name_the_field(options, words):
-    with pytest.raises(ValueError, match=words):
-        robot(**options)
-
-
-def test_joints_that_the_model_does_not_have_are_named():
+    ):
+        with pytest.raises(ValueError, match=words):
+            robot(**options)
     with pytest.raises(ValueError, match="wrist"):
         ij.deployment.robot_node(ARM, ["shoulder", "wrist"], period=PERIOD)
 
@@ -201,8 +176,3 @@ def test_the_command_ends_cleanly_on_a_signal(number, tmp_path):
     assert process.returncode == 0, output
     assert "latency" in output
     assert (tmp_path / "motion.npz").exists()
-
-
-def test_zero_torques_do_not_release_the_brake():
-    with pd_law("--zero"), robot() as node, pytest.raises(TimeoutError, match="~/start"):
-        node.run(0.1, patience=8.0)

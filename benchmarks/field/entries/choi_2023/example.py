@@ -61,6 +61,8 @@ def barrier(x, t, braking=BRAKING):
 class CruiseProgramme:
     """u of the quadratic programme, with or without the distance of braking in B."""
 
+    clf_rate: ij.Leaf = ij.leaf("1/s", sign="positive", shape="scalar", default=5.0)
+    rate: ij.Leaf = ij.leaf("1/s", sign="positive", shape="scalar", default=5.0)
     braking: ij.Leaf = ij.leaf("m/s^2", sign="positive", shape="scalar", default=BRAKING)
     limited: bool = ij.static(default=True)
     receives_x = True
@@ -75,11 +77,11 @@ class CruiseProgramme:
         """The wheel force."""
         v, mass, natural = x[1], context.model.mass, context.model.drift(t, x)[1]
         slope = 2.0 * (v - WANTED)
-        excess = slope * natural + 5.0 * (v - WANTED) ** 2
+        excess = slope * natural + self.clf_rate * (v - WANTED) ** 2
         u = -mass * jnp.where(excess > 0.0, slope * excess / (100.0 + slope**2), 0.0)
         per_speed = HEADWAY + (v - LEAD) / self.braking
-        fastest = (LEAD - v + 5.0 * barrier(x, t, self.braking)) / per_speed - natural
-        u = jnp.minimum(u, mass * fastest)
+        needed = LEAD - v + self.rate * barrier(x, t, self.braking)
+        u = jnp.minimum(u, mass * (needed / per_speed - natural))
         if self.limited:
             u = jnp.clip(u, -LIMIT, LIMIT)
         zero, inside = jnp.zeros_like(u), jnp.zeros(u.shape, bool)

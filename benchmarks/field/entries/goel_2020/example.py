@@ -57,8 +57,8 @@ constant = ij.with_parts(
 
 
 # %% The model's filter begins at 0, and its second error is that of alpha_1 itself. The filter of
-# the package begins at alpha_1, and the second error is that of its output, for which its bound of
-# V is derived. The model's variant is a law of this page.
+# the package begins at alpha_1; the second error is that of its output, for which its bound of V is
+# derived, or with filter_form="derivative" that of alpha_1. The model's variant is a law here.
 @ij.component
 class ModelFilter:
     """mu beta' + beta = alpha_1; beta' in the place of alpha_1', and z_2 = x_2 - alpha_1."""

@@ -1,0 +1,202 @@
+"""Filters, matrices and nonlinear damping of backstepping laws: beside the published equations in
+NumPy, and the claims about V'.
+"""
+
+import dataclasses
+
+import chain_cases
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import iblf_jax as ij
+from iblf_jax import barriers, bounds, controllers, plants, references
+from iblf_jax.control.controllers import LawContext
+from iblf_jax.world.robots import momentum
+
+K = np.array([2.0, 5.0, 9.0])
+MU = np.array([0.05, 0.03])
+
+
+WIDE = bounds.Bounds(bounds.Constant(-2.0), bounds.Constant(3.0))
+
+
+@pytest.mark.slow
+def test_the_energy_of_the_compensated_law_of_robots_decays_as_with_exact_derivatives(rng):
+    scenario = ij.presets.zhang_yan_2024(variant="corrected")
+    barrier = barriers.TransformedError()
+    found = controllers.DynamicSurface(
+        k1=2.0, K2=20.0, filter=0.05, barrier=barrier, filter_form="compensated"
+    )
+    given, arm, zero = scenario.context, plants.as_plant(scenario.model), jnp.zeros(2)
+
+    def energy(t, x, state):
+        command = found.command(t, x[0], x[1], zero, given, state)[0]
+        e2 = x[1] - command.alpha
+        return jnp.sum(command.V1) + 0.5 * jnp.sum(e2 * momentum(scenario.model, x[0], e2))
+
+    for _ in range(3):
+        t = jnp.asarray(rng.uniform(0.0, 3.0))
+        x = jnp.asarray(rng.normal(scale=0.1, size=(2, 2))) + 0.4
+        state = jnp.asarray(rng.normal(scale=0.1, size=(2, 2)))
+        command, rates = found.command(t, x[0], x[1], zero, given, state)
+        dx = plants.flow(arm, t, x, command.tau)
+        dV = jax.jvp(energy, (t, x, state), (jnp.ones_like(t), dx, rates))[1]
+        decay = 4.0 * jnp.sum(command.V1) + 20.0 * jnp.sum((x[1] - command.alpha) ** 2)
+        np.testing.assert_allclose(dV, -decay, rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_the_certificate_claims_nothing_about_other_forms():
+    scenario = ij.presets.motor_driven_pendulum()
+    changed = dataclasses.replace(scenario.controller, filter=0.02, filter_form="compensated")
+    text = str(ij.certify(ij.with_parts(scenario, controller=changed), duration=0.01, dt=1e-3))
+    assert 'the law has filters of the form "compensated"' in text
+
+
+# --- matrices -------------------------------------------------------------------------------------
+
+K1 = np.array([[0.5, 0.1, 0.0], [-0.1, 0.4, 0.05], [0.0, 0.05, 0.6]])
+K2 = np.array([[9.0, 1.0, 0.0], [0.5, 12.0, 2.0], [0.0, -1.0, 5.0]])
+
+
+@pytest.mark.slow
+def test_the_force_of_a_vessel_is_the_published_one(rng):
+    """tau = M alpha' + C nu + D nu + g - K2 z2 - R^T z1,   alpha = R^T (eta_d' - K1 z1)."""
+    stiffness, rest = np.array([3.0, 5.0, 0.8]), np.array([0.2, -0.1, 0.3])
+    mooring = plants.Mooring(stiffness, rest)
+    vessel = dataclasses.replace(ij.presets.cybership_ii(), restoring=mooring)
+    M = np.asarray(vessel.inertia_matrix())
+    found = controllers.BarrierBackstepping(
+        k=(1.0, 1.0),
+        barriers=barriers.Quadratic(),
+        gain_matrices=np.stack([K1, K2]),
+        weight_matrices=np.stack([np.eye(3), M]),
+    )
+    reference = references.Sinusoid([0.1, 0.2, 0.3], [1.0, 0.5, 0.4], [0.3, 0.2, 0.5])
+    given = LawContext(vessel, reference, (WIDE, None))
+    for _ in range(3):
+        t, eta, nu = rng.uniform(0.0, 5.0), rng.normal(size=3), rng.normal(size=3)
+        x = jnp.stack([eta, nu])
+        ready = found.with_defaults(given, x)
+        np.testing.assert_array_equal(ready.weights, 1.0)
+        command, _ = ready.command(jnp.asarray(t), x, jnp.zeros((2, 3)), given, ())
+
+        wave, amplitude = np.array([0.3, 0.2, 0.5]), np.array([1.0, 0.5, 0.4])
+        z1 = eta - np.array([0.1, 0.2, 0.3]) - amplitude * np.sin(wave * t)
+        velocity = amplitude * wave * np.cos(wave * t)
+        acceleration = -amplitude * wave**2 * np.sin(wave * t)
+        s, c = np.sin(eta[2]), np.cos(eta[2])
+        R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        S = np.array([[0.0, -nu[2], 0.0], [nu[2], 0.0, 0.0], [0.0, 0.0, 0.0]])
+        alpha = R.T @ (velocity - K1 @ z1)
+        dalpha = -S @ alpha + R.T @ (acceleration - K1 @ (R @ nu - velocity))
+        C, D = np.asarray(vessel.coriolis_matrix(nu)), np.asarray(vessel.damping_matrix(nu))
+        forces = C @ nu + D @ nu + R.T @ (stiffness * (eta - rest))
+        tau = M @ dalpha + forces - K2 @ (nu - alpha) - R.T @ z1
+        np.testing.assert_allclose(command.tau, tau, rtol=1e-11, atol=1e-11)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("form", ["surface", "derivative", "compensated"])
+def test_filters_matrices_weights_and_damping_are_those_of_the_equations(form, rng):
+    """(S.2) with (S.4) to (S.6) in NumPy, for two components and matrices on every level."""
+    gain = np.array([[1.5, 0.7], [2.0, 1.1], [0.8, 0.9]])
+    W = np.array([[[2.0, 0.3], [0.3, 0.7]], [[1.2, -0.2], [-0.2, 0.5]], [[0.9, 0.1], [0.1, 1.4]]])
+    A = np.array([[[4.0, 1.0], [0.5, 2.0]], [[7.0, 0.0], [-1.0, 5.0]], [[9.0, 2.0], [1.0, 6.0]]])
+    w, c, gamma = rng.uniform(0.5, 2.0, (3, 3, 2))
+    plant = plants.StrictFeedback(lambda t, x: -(x**3), lambda t, x: gain, n=2, order=3)
+    found = controllers.BarrierBackstepping(
+        k=K,
+        barriers=barriers.Quadratic(),
+        c=c,
+        weights=w,
+        filter=MU,
+        filter_form=form,
+        damping=gamma,
+        regressor=lambda t, x: jnp.stack([jnp.sin(x), x * x], axis=-1),
+        gain_matrices=A,
+        weight_matrices=W,
+    )
+    given = LawContext(plant, references.Sinusoid([0.2, 0.1], 0.4, 1.3), (WIDE, None, None))
+    t, x, beta = rng.uniform(0.0, 3.0), rng.normal(size=(3, 2)), rng.normal(size=(2, 2))
+    xi = np.zeros((3, 2))
+    state = beta
+    if form == "compensated":
+        xi[:2] = rng.normal(size=(2, 2))
+        state = np.concatenate([beta, xi[:2]])
+    zero = jnp.zeros((3, 2))
+    command, rates = found.command(jnp.asarray(t), jnp.asarray(x), zero, given, state)
+
+    centre = np.array([0.2, 0.1]) + 0.4 * np.sin(1.3 * t)
+    rate = np.full(2, 0.4 * 1.3 * np.cos(1.3 * t))
+    expected, of_xi, below = [], [], np.zeros(2)
+    for i in range(3):
+        e = x[i] - xi[i] - centre
+        s = W[i] @ e
+        a = rate - np.linalg.solve(W[i], A[i] @ (K[i] * e))
+        third = np.linalg.solve(W[i], below) / w[i]
+        damping = c[i] + gamma[i] * (np.sin(x[i]) ** 2 + x[i] ** 4)
+        alpha = (a - damping * s - third - K[i] * xi[i] + x[i] ** 3) / gain[i]
+        if i == 2:
+            break
+        rate = (alpha - beta[i]) / MU[i]
+        centre = alpha if form == "derivative" else beta[i]
+        expected.append(rate)
+        of_xi.append(gain[i] * (beta[i] - alpha + xi[i + 1]) - K[i] * xi[i])
+        below = gain[i] * w[i] * s
+    np.testing.assert_allclose(command.tau, alpha, rtol=1e-11)
+    if form == "compensated":
+        expected += of_xi
+    np.testing.assert_allclose(rates, expected, rtol=1e-11, atol=1e-12)
+
+
+def of_levels(**fields):
+    both = (barriers.TransformedError(), barriers.Quadratic())
+    return controllers.BarrierBackstepping(**{"k": (1.0, 1.0), "barriers": both} | fields)
+
+
+def with_a_wrong_regressor():
+    wrong = {"damping": 1.0, "regressor": lambda t, x: x}
+    reference = references.Sinusoid(offset=0.2, amplitude=0.4)
+    given = LawContext(chain_cases.pendulum(), reference, (WIDE, None, None))
+    controllers.BarrierBackstepping(k=K, **wrong).check_start(given)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (
+            lambda: of_levels(gain_matrices=[K1, K2]),
+            r"matrices\[0\].*unit matrix.*TransformedError",
+        ),
+        (lambda: of_levels(weight_matrices=[np.eye(3), K2]), r"weight_matrices\[1\].*symmetric"),
+        (lambda: of_levels(gain_matrices=[np.eye(3), -K2]), r"matrices\[1\].*eigenvalue -12.2"),
+        (lambda: of_levels(weight_matrices=np.eye(3)), r"weight_matrices.*shape \(2, n, n\)"),
+        (lambda: of_levels(filter_form="derivative"), r"BarrierBackstepping\.filter.*filter=0\.01"),
+        (
+            lambda: controllers.DynamicSurface(k1=1.0, K2=1.0, filter=0.1, filter_form="lag"),
+            r"DynamicSurface\.filter_form.*surface",
+        ),
+        (lambda: of_levels(damping=1.0), r"regressor.*phi"),
+        (lambda: of_levels(regressor=phi), "damping"),
+        (with_a_wrong_regressor, r"controller\.regressor.*\(3, 1, m\)"),
+    ],
+)
+def test_what_does_not_fit_is_refused(make, words):
+    with pytest.raises(ValueError, match=words):
+        make()
+
+
+def phi(t, x):
+    return x[..., None]
+
+
+def test_the_unit_of_damping_is_that_for_phi_in_the_unit_of_a_rate():
+    mixed = (barriers.PrescribedPerformance(), barriers.Quadratic())
+    damped = controllers.BarrierBackstepping(
+        k=(1.0, 1.0), barriers=mixed, damping=1.0, regressor=phi
+    )
+    formulas = [unit.formula for unit in damped.leaf_units()["damping"]]
+    assert formulas == ["s", "s/x2^2"]

@@ -1,0 +1,139 @@
+"""Texts of values and of the environment: two that can make two programs differ."""
+
+from __future__ import annotations
+
+import os
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import iblf_jax as ij
+from iblf_jax import _start
+from iblf_jax.core.durable_keys import NoKeyError, _files, environment, text_of
+from iblf_jax.engine.request import RunRequest
+from iblf_jax.engine.structural_constants import StructuralConstants
+from iblf_jax.kernels import Known
+from iblf_jax.simulation import stability
+from iblf_jax.simulation.scenario import canonical
+
+DIFFERENT = (
+    *(None, (), [], ((),), "None", "()"),
+    *(0, False, 0.0, -0.0, np.float32(0), np.float64(0), np.zeros(1), np.zeros((1, 1))),
+    *(1, True, 1.0, "1", b"1", (1,), [1], frozenset((1,)), np.int32(1), np.int64(1)),
+    *(("a", "b"), ("a','b",), ("a,b",), (("a",), "b"), ("a", ("b",))),
+    *(float("nan"), float("inf"), float("-inf")),
+    *(np.dtype("float32"), np.dtype("float64"), np.float32, np.float64),
+    *(RunRequest(1), RunRequest(True), RunRequest(1, "euler"), (1, "rk4", None, None, "auto")),
+    *(canonical, stability.growth_rate, ij.Sampling, tuple, type(None)),
+)
+"""Values of which no two are the same to a program."""
+
+
+def test_values_that_differ_have_different_texts():
+    texts = [text_of(value) for value in DIFFERENT]
+    assert len(set(texts)) == len(texts)
+
+
+@pytest.mark.parametrize("value", DIFFERENT[:20])
+def test_a_value_has_one_text(value):
+    assert text_of((value, "and")) == text_of((value, "and"))
+
+
+def structure_of(scenario):
+    return text_of(jax.tree.structure(canonical(scenario)))
+
+
+def test_scenarios_that_differ_in_a_static_field():
+    paper = ij.presets.zhang_yan_2024()
+    sampled = [
+        ij.with_parts(paper, sampling=ij.Sampling(period=1e-3, **fields))
+        for fields in ({}, {"observer": "euler"})
+    ]
+    texts = {structure_of(x) for x in (paper, *sampled)}
+    assert len(texts) == 3
+    assert structure_of(ij.presets.zhang_yan_2024()) in texts
+
+
+def test_requests_that_differ_in_a_constant_that_is_compiled_in():
+    known = (None, Known(), Known(0.0), Known(-0.0), Known(1.0), Known(same=1), Known(1.0, None, 2))
+    requests = [RunRequest(10, constants=StructuralConstants((x, Known(1.0)))) for x in known]
+    texts = {text_of(x) for x in (*requests, RunRequest(10))}
+    assert len(texts) == len(known) + 1
+
+
+@ij.component
+class Users(ij.disturbances.Disturbance):
+    """A disturbance of a user."""
+
+    def torque(self, t, q, dq, plant, model):
+        return 0.1 * q
+
+    def jump_times(self):
+        return jnp.zeros(0)
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        *(Users, Users.torque, lambda x: x, len, object(), jnp.zeros(1), {"a": 1}),
+        *(jnp.sin, (1, lambda x: x), jax.tree.structure(Users()), np.asarray([object()])),
+    ],
+)
+def test_what_cannot_be_described_has_no_text(value):
+    if value is len:
+        assert text_of(value) == "builtins.len"
+        return
+    with pytest.raises(NoKeyError):
+        text_of(value)
+
+
+def test_a_scenario_with_code_of_a_user_has_no_text():
+    with pytest.raises(NoKeyError):
+        structure_of(ij.with_parts(ij.presets.zhang_yan_2024(), disturbance=Users()))
+
+
+def test_the_environment_stays():
+    assert environment() == environment()
+
+
+def test_a_number_of_the_package_that_was_replaced(monkeypatch):
+    before = environment()
+    monkeypatch.setattr(stability, "THIRD_SIZE", 2.0 * stability.THIRD_SIZE)
+    assert environment() != before
+    monkeypatch.undo()
+    assert environment() == before
+
+
+@pytest.mark.parametrize("place", [(stability, "growth_rate"), (ij.Sampling, "check")])
+def test_code_of_the_package_that_was_replaced(monkeypatch, place):
+    monkeypatch.setattr(*place, lambda *args: None)
+    with pytest.raises(NoKeyError):
+        environment()
+
+
+def test_options_of_jax_and_of_xla(monkeypatch):
+    texts = [environment()]
+    with jax.default_matmul_precision("float32"):
+        texts.append(environment())
+    with jax.enable_x64(False):
+        texts.append(environment())
+    monkeypatch.setenv("XLA_FLAGS", f"{os.environ.get('XLA_FLAGS', '')} ")
+    texts.append(environment())
+    monkeypatch.setenv("IBLF_JAX_THREADS", "7")
+    texts.append(environment())
+    assert len(set(texts)) == 5
+    with jax.debug_nans(True), pytest.raises(NoKeyError):
+        environment()
+
+
+def test_a_file_of_the_package_that_is_newer_than_the_process(monkeypatch):
+    newest = max(file.stat().st_mtime for file in _files())
+    monkeypatch.setattr(_start, "STARTED", newest + 2.0)
+    environment()
+    monkeypatch.setattr(_start, "STARTED", newest - 2.0)
+    with pytest.raises(NoKeyError, match="changed"):
+        environment()
+    assert newest < time.time()

@@ -1,0 +1,284 @@
+"""Laws with the same budget of tuning: what is equal, which laws have a rank, and the page."""
+
+from __future__ import annotations
+
+import json
+import sys
+from types import SimpleNamespace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import ROOT
+
+import iblf_jax as ij
+
+FIELD = ROOT / "benchmarks" / "field"
+sys.path[:0] = [str(FIELD), str(ROOT / "docs")]
+sys.path.append(str(ROOT / "benchmarks"))
+import entry
+import equal_budget
+import field_budget
+import run_numbers
+import task_laws
+
+FILES = sorted(entry.RESULTS.glob("*.json"))
+
+
+def a_task(name):
+    """The task of an entry at scales of one, without its published run."""
+    scenario = entry.definition(entry.ENTRIES / name).scenario
+    n, order = scenario.plant.n, task_laws.plants.order_of(scenario.plant)
+    ones = np.ones(n)
+    return task_laws.Task(scenario, 1.0, 1e-3, 2.0, ones, np.ones((order, n)), 0.0 * ones, ones)
+
+
+# ---------------------------------------------------------------------------- what is equal
+
+
+@pytest.mark.parametrize("name", equal_budget.TASKS)
+def test_every_law_of_a_task_has_two_or_three_gains_in_the_same_range(name):
+    task = a_task(name)
+    published = task.scenario.controller
+    choices = equal_budget.laws_on(task, published, None, {})
+    laws = {equal_budget.PUBLISHED: published}
+    laws |= {law: one.law for law, one in choices.items() if not isinstance(one, str)}
+    assert len(laws) >= 5
+    for law, controller in laws.items():
+        scenario = ij.with_parts(task.scenario, controller=controller)
+        paths = equal_budget.gains_of(name, controller, law == equal_budget.PUBLISHED)
+        assert len(paths) in (2, 3), law
+        assert len(set(paths)) == len(paths), law
+        for one in equal_budget.tunables(scenario, paths):
+            assert np.all(np.asarray(one.low) > 0.0), law
+            ratio = np.asarray(one.high) / np.asarray(one.low)
+            np.testing.assert_allclose(ratio, equal_budget.RANGE**2, err_msg=law)
+
+
+def test_a_law_that_is_the_published_one_has_no_second_row():
+    task = a_task("zhang_yan_2024")
+    law = task_laws.laws_of(task, ())["ComputedTorque"].law
+    names = ["ComputedTorque", "PDGravity"]
+    found = equal_budget.laws_on(task, law, names, {"PDGravity": "no gravity"})
+    assert found["ComputedTorque"] == "it is the published law with other gains"
+    assert found["PDGravity"] == "no gravity"
+    with pytest.raises(entry.EntryError, match=r"--laws: \['no law'\] are unknown"):
+        equal_budget.laws_on(task, law, ["no law"], {})
+
+
+def test_the_rank_leaves_out_laws_outside_the_effort():
+    def law(*rows):
+        return {
+            "front": [{"level": level, **row} for level, row in zip((0.7, 1.0), rows, strict=True)]
+        }
+
+    above = {"left": "its effort is above the limit"}
+    inside = [{"left": "", "error": error} for error in (0.3, 0.2, 0.1)]
+    laws = {"A": law(above, inside[0]), "B": law(inside[2], inside[1]), "C": law(inside[2], above)}
+    assert equal_budget.ranks({"laws": laws}) == {"B": 1, "A": 2}
+    # Errors that differ by less than `TIE` have one rank.
+    assert equal_budget.ranks({"laws": laws}, 0.7) == {"B": 1, "C": 1}
+    nearly = law(above, {"left": "", "error": 0.201})
+    order = equal_budget.ranks({"laws": {**laws, "D": nearly}})
+    assert order == {"B": 1, "D": 1, "A": 3}
+
+
+def test_laws_with_the_same_errors_are_refused():
+    def law(error):
+        return {"front": [{"level": 1.0, "error": error}, {"level": 2.0, "left": "diverges"}]}
+
+    laws = {"A": law(0.1), "B": law(0.1 * (1.0 + 1e-10)), "C": law(0.1 * (1.0 + 1e-8))}
+    assert equal_budget.equal_laws(laws) == ["'A' and 'B' agree to 9 digits"]
+    one, other = sorted(equal_budget.ONE_LAW)
+    assert equal_budget.equal_laws({one: law(0.1), other: law(0.1)}) == []
+
+
+def test_two_barriers_give_one_law_up_to_a_weight():
+    tube = a_task("goel_2020").scenario.context.tube(jnp.zeros(()))
+    q = jnp.array([0.3])
+    integral, log = (task_laws.BARRIERS[name].slope(tube, q) for name in ("Integral", "Log"))
+    np.testing.assert_allclose(integral, 2.0 * log, rtol=1e-12)
+
+
+def test_a_refused_result_leaves_the_former_one(tmp_path, monkeypatch, capsys):
+    law = {"front": [{"level": 1.0, "error": 0.1, "left": ""}]}
+    result = {"laws": {"A": law, "B": law}, "processor_seconds": 1.0}
+    monkeypatch.setattr(equal_budget, "compare", lambda *arguments: result)
+    monkeypatch.setattr(sys, "argv", ["equal_budget.py", "--task", "T", "--out", str(tmp_path)])
+    (tmp_path / "T.json").write_text("{}")
+    assert equal_budget.main() == 1
+    assert "T: refused" in capsys.readouterr().out
+    assert (tmp_path / "T.json").read_text() == "{}"
+    assert json.loads((tmp_path / "T.json.part").read_text())["laws"] == result["laws"]
+
+
+# ---------------------------------------------------------------------------- the task
+
+
+@pytest.mark.parametrize(
+    ("name", "command", "expected"),
+    [
+        ("shaw_cortez_2022", [20.0, -20.0], [18.0, -10.0]),
+        # The vessel has no force in sway.
+        ("wang_2023", [300.0, 5.0, -50.0], [227.355, 0.0, -43.85615]),
+    ],
+)
+def test_limits_of_the_input_clip_every_command(name, command, expected):
+    folder = entry.ENTRIES / name
+    scenario = equal_budget.limited(entry.definition(folder).scenario, entry.load(folder))
+    delivered = scenario.actuator.deliver(jnp.array(command), jnp.zeros(len(command)), ())
+    np.testing.assert_allclose(delivered.tau, expected)
+    assert delivered.limited.all()
+
+
+def test_a_run_says_what_it_does_not_keep():
+    def words(status, violation=-1.0, regions=False):
+        return run_numbers.failure_of(SimpleNamespace(status=int(status)), violation, regions)
+
+    assert words(0) == ""
+    assert words(ij.Status.BOUND_VIOLATED) == "leaves the bounds"
+    assert words(ij.Status.BOUND_VIOLATED | ij.Status.NOT_FINITE) == "diverges"
+    assert words(0, 0.1) == "violates a constraint or the bounds of a further level"
+    assert words(ij.Status.REGION_VIOLATED) == ""
+    assert words(ij.Status.REGION_VIOLATED, regions=True) == "enters a region"
+    assert words(ij.Status.STEP_TOO_LARGE) == "the time step is too large"
+
+
+@pytest.mark.slow
+def test_the_numbers_of_a_run_are_those_of_its_samples():
+    scenario = ij.presets.zhang_yan_2024()
+    fold = run_numbers.Numbers(0.05, 0.5, (lambda t, x: 3.0 - x[0],))
+    run = ij.simulate(scenario, duration=1.0, dt=1e-3, metrics=(fold,))
+    gravity = np.stack([scenario.plant.gravity(jnp.asarray(q)) for q in run.q])
+    square = np.sum((np.asarray(run.tau) - gravity) ** 2, axis=1)
+    error = np.mean(np.asarray(run.e1) ** 2, axis=1)
+
+    def rms(values, part):
+        time = run.t[part]
+        return np.sqrt(np.trapezoid(values[part], time) / (time[-1] - time[0]))
+
+    found = run.metrics
+    np.testing.assert_allclose(found.error, rms(error, run.t >= 0.0), rtol=1e-6)
+    np.testing.assert_allclose(found.late_error, rms(error, run.t >= 0.5), rtol=1e-2)
+    np.testing.assert_allclose(found.effort, rms(square, run.t >= 0.0), rtol=1e-6)
+    np.testing.assert_allclose(found.start_effort, rms(square, run.t <= 0.05), rtol=0.03)
+    np.testing.assert_allclose(found.rest_effort, rms(square, run.t >= 0.05), rtol=0.03)
+    np.testing.assert_allclose(found.peak_input, np.abs(run.tau).max(), rtol=1e-6)
+    np.testing.assert_allclose(found.violation, run.q.max() - 3.0, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_the_quick_comparison(tmp_path, monkeypatch, capsys):
+    law = "BarrierBackstepping(Integral)"
+    words = ["equal_budget.py", "--task", "no_entry_2000", "liu_2018", "--laws", law, "--quick"]
+    monkeypatch.setattr(sys, "argv", [*words, "--out", str(tmp_path)])
+    assert equal_budget.main() == 1
+    assert "no_entry_2000: failed: there is no entry.toml" in capsys.readouterr().out
+    result = json.loads((tmp_path / "liu_2018.json").read_text())
+    assert set(result["laws"]) == {equal_budget.PUBLISHED, law}
+    published = result["laws"][equal_budget.PUBLISHED]
+    kept = [row for row in published["front"] if row["level"] >= 1.0]
+    for row in kept:
+        limit = row["level"] * result["published"]["effort"]
+        assert row["left"] == "" and row["effort"] <= 1.001 * limit
+        assert row["error"] <= result["published"]["error"] * (1.0 + 1e-9)
+    assert set(published["robustness"]) == {"masses", "periods", "noise"}
+    assert len(published["robustness"]["noise"]) == equal_budget.SEEDS
+    check_page({"liu_2018": result})
+
+
+@pytest.mark.slow
+def test_results_of_one_law_differ_by_less_than_a_tie_with_another_search():
+    """The page says that the published law of liu_2018 ends 4 % lower with two of its gains."""
+    folder = entry.ENTRIES / "liu_2018"
+    result = json.loads((entry.RESULTS / "liu_2018.json").read_text(encoding="utf-8"))
+    task, made = task_laws.task_of(folder, entry.load(folder).run.duration)
+    fold = equal_budget.numbers_of(task, made)
+    limit = result["published"]["effort"]
+    gains = ("controller.k[0]", "controller.k[1]")
+    tuned = ij.tune(
+        task.scenario,
+        equal_budget.tunables(task.scenario, gains),
+        equal_budget.objective_of(fold, limit, 1.0),
+        duration=task.duration,
+        dt=task.dt,
+        effort=equal_budget.BUDGET,
+    )
+    found = equal_budget.measured(tuned.scenario, task, fold)
+    assert found["effort"] <= limit * (1.0 + equal_budget.TOLERANCE)
+    front = result["laws"][equal_budget.PUBLISHED]["front"]
+    (own,) = (row["error"] for row in front if row["level"] == 1.0)
+    assert found["error"] / own > 1.0 - equal_budget.TIE
+    np.testing.assert_allclose(found["error"] / own, 0.96, atol=0.005)
+
+
+# ---------------------------------------------------------------------------- results and page
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_a_result_of_the_repository_keeps_what_the_page_says(path):
+    result = json.loads(path.read_text(encoding="utf-8"))
+    budget = equal_budget.BUDGET
+    assert result["budget"] == {
+        "points": budget.values,
+        "starts": budget.starts,
+        "steps": budget.iterations,
+    }
+    assert "uncommitted" not in result["machine"]["commit"]
+    assert equal_budget.equal_laws(result["laws"]) == []
+    for name, law in result["laws"].items():
+        assert len(law["gains"]) in (2, 3), name
+        assert [row["level"] for row in law["front"]] == list(equal_budget.LEVELS), name
+        errors = []
+        for row in law["front"]:
+            # A search without gains that keep the requirements looks at further points.
+            assert budget.values < row["points"] <= 3 * (budget.values + 1), name
+            if row["left"]:
+                assert "error" not in row, name
+                continue
+            limit = row["level"] * result["published"]["effort"]
+            assert row["effort"] <= limit * (1.0 + equal_budget.TOLERANCE), name
+            errors.append(row["error"])
+        assert errors == sorted(errors, reverse=True), name
+
+
+def test_readme_and_article_have_the_numbers_of_the_results():
+    words = field_budget.in_words(field_budget.results())
+    for path in (FIELD / "README.md", ROOT / "paper" / "paper.md"):
+        assert words in " ".join(path.read_text(encoding="utf-8").split()), path
+
+
+def test_the_page_has_all_tasks_and_what_a_law_does_not_keep():
+    found = field_budget.results()
+    check_page(found)
+    above = {"points": 258, "derivatives": 60, "left": "its effort is above the limit"}
+    front = [{"level": level, **above} for level in equal_budget.LEVELS]
+    published = found["liu_2018"]["laws"][equal_budget.PUBLISHED]
+    published["robustness"]["noise"][2] = "leaves the bounds"
+    other = {"gains": ["controller.k1"], "front": front, "robustness": None}
+    result = found["liu_2018"] | {
+        "laws": {equal_budget.PUBLISHED: published, "B": other},
+        "units": ["rad", "N m"],
+        "input_limits": [[-1.0, 1.0]],
+        "constraints": ["h [m]"],
+        "not_applicable": {"C": "it has no gains"},
+    }
+    page = field_budget.page({"liu_2018": result})
+    assert "| B | 0 of 1 | – |" in page
+    assert "| published law | 1 of 1 | 1 |" in page
+    assert "| – | B | its effort is above the limit |" in page
+    assert "1 of 5: leaves the" in page
+    assert "Limits of the input: -1 to 1 N m. Constraints: h \\[m\\]." in page
+    assert "Not in the table: C, it has no gains." in page
+    assert "Chosen, but without a result: " in page
+
+
+def check_page(found):
+    """The page of results, and their figures."""
+    page = field_budget.page(found)
+    for name, result in found.items():
+        assert f"]({field_budget.NAME}_{name}.png)" in page
+        axes, *_ = field_budget.figure(result).axes
+        assert axes.get_xlabel() and axes.get_ylabel()
+        labels = axes.get_legend_handles_labels()[1]
+        assert len(labels) == len(result["laws"]) + 1
