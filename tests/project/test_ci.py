@@ -28,6 +28,7 @@ TESTS_OF_NEWEST = f"{NEWEST} python -m pytest -m not release and not site and (n
 LOSSES = ".venv-test/bin/python benchmarks/losses.py --quick --fail 15"
 SITE = ".venv-test/bin/python docs/build.py"
 LINT = ".venv-test/bin/ruff check ."
+SLOW_TESTS = ".venv-test/bin/python -m pytest -m slow and not site and not members and not release"
 TESTS_OF_ROS = ".venv-ros/bin/python -m pytest -n 2 --dist loadfile " + " ".join(
     f"tests/deployment/ros2/test_{name}.py"
     for name in ("law_node", "simulated_robot", "demo", "recorded_demo")
@@ -75,24 +76,38 @@ def test_every_step_is_called(folder):
     done = ci(folder)
     assert done.returncode == 0, done.stdout
     calls = (folder / "calls").read_text().splitlines()
-    for call in (NEWEST, LOSSES, TESTS_OF_NEWEST, SITE, LINT, INSTALLATION_OF_ROS, TESTS_OF_ROS):
+    expected = (NEWEST, LOSSES, TESTS_OF_NEWEST, SITE, LINT, SLOW_TESTS)
+    for call in (*expected, INSTALLATION_OF_ROS, TESTS_OF_ROS):
         assert call in [line.strip() for line in calls]
 
 
 def test_the_slow_tests_are_those_that_the_change_reaches(folder):
     (folder / "path" / "python3").write_text('#!/bin/sh\necho "reached by $*"\n')
-    (folder / "readme_command").write_text('#!/bin/sh\necho "$SLOW_FILES, $SLOW_MINUTES" > slow\n')
-    for variables, base in (
-        ({}, " a_commit"),
-        ({"BASE": "another"}, " another"),
-        ({"BASE": ""}, ""),
+    (folder / "path" / "python3").chmod(0o755)
+    python = folder / ".venv-test" / "bin" / "python"
+    python.write_text('#!/bin/sh\necho "$SLOW_FILES, $SLOW_MINUTES" > slow\n')
+    for variables, expected in (
+        ({}, "reached by tools/select_tests.py a_commit, 38"),
+        ({"BASE": "another", "MINUTES": "50"}, "reached by tools/select_tests.py another, 50"),
+        ({"BASE": "", "MINUTES": "inf"}, "reached by tools/select_tests.py, inf"),
+        ({"MINUTES": "0"}, "reached by tools/select_tests.py a_commit, 5"),
     ):
         assert ci(folder, **variables).returncode == 0
-        assert f"reached by tools/select_tests.py{base}, " in (folder / "slow").read_text()
+        assert (folder / "slow").read_text().strip() == expected
+
+
+def test_a_change_may_reach_no_slow_test(folder):
+    python = folder / ".venv-test" / "bin" / "python"
+    python.write_text('#!/bin/sh\ncase "$*" in *"slow and"*) exit 5 ;; esac\n')
+    assert ci(folder).returncode == 0
 
 
 @pytest.mark.parametrize(
-    "step", [f"{NEWEST} ", LOSSES, TESTS_OF_NEWEST, SITE, LINT, INSTALLATION_OF_ROS, TESTS_OF_ROS]
+    "step",
+    [
+        *(f"{NEWEST} ", LOSSES, TESTS_OF_NEWEST, SITE, LINT, SLOW_TESTS),
+        *(INSTALLATION_OF_ROS, TESTS_OF_ROS),
+    ],
 )
 def test_a_step_that_fails_is_shown(folder, step):
     (folder / "ready").unlink()
