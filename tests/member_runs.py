@@ -1,17 +1,21 @@
-"""Runs of the scenarios of members, in processes that are told apart.
+"""Runs of scenarios from a folder of pickles, in processes that are told apart.
 
-Each line of the input names a backend, a method and a member.  The answer is a line of JSON with
-position, velocity and torque at the end of a short run; a backend that cannot run it is an error.
-With `--apart`, each line gets a process of its own; it starts with the package imported, and with
-nothing computed or compiled.
+    python tests/member_runs.py FOLDER [--apart]
+
+Each line of the input names a backend, a method and a file without its suffix.  The answer is a
+line of JSON with position, velocity and torque at the end of a short run; a backend that cannot run
+it is an error.  With `--apart`, each line gets a process of its own; it starts with the package
+imported, and with nothing computed or compiled.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import pickle
 import sys
 import warnings
+from pathlib import Path
 
 import jax
 
@@ -30,28 +34,26 @@ def fitting(scenario: ij.Scenario, method: str) -> str:
     return method
 
 
-def answer(line: str) -> None:
+def answer(folder: Path, line: str) -> None:
     """Runs the scenario that a line names and prints where it ends."""
-    from scenarios_of_members import scenarios  # it computes, which a process that forks must not
-
     backend, method, name = line.strip().split(" ", 2)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         warnings.simplefilter("error", BackendWarning)
-        scenario = scenarios()[name]()
+        scenario = pickle.loads((folder / f"{name}.pickle").read_bytes())
         method = fitting(scenario, method)
         run = ij.simulate(scenario, backend=backend, method=method, **RUN)
     end = [getattr(run, x)[-1].tolist() for x in ("q", "dq", "tau")]
     print(json.dumps({"name": name, "backend": backend, "end": end}), flush=True)
 
 
-def serve(apart: bool) -> None:
+def serve(folder: Path, apart: bool) -> None:
     """Answers the lines of the input."""
     for line in sys.stdin:
         if not apart:
-            answer(line)
+            answer(folder, line)
         elif os.fork() == 0:
-            answer(line)
+            answer(folder, line)
             os._exit(0)
         else:
             os.wait()
@@ -59,4 +61,4 @@ def serve(apart: bool) -> None:
 
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)
-    serve("--apart" in sys.argv)
+    serve(Path(sys.argv[1]), "--apart" in sys.argv)

@@ -9,6 +9,7 @@ import dataclasses
 from typing import Any
 
 import jax.numpy as jnp
+import users_functions
 from arm_cases import random_arm
 
 import iblf_jax as ij
@@ -78,18 +79,16 @@ PLANTS = {
         switches=3,
     ),
     "strict_feedback": plants.StrictFeedback(
-        drift=lambda t, x: jnp.stack([x[0] * x[0, ::-1], jnp.sin(x[0] * x[1]) - 0.2 * t]),
-        gain=lambda t, x: jnp.stack(
-            [jnp.diag(2.0 + x[0] ** 2), jnp.eye(2, dtype=x.dtype) + 0.1 * x[1, 0]]
-        ),
+        drift=users_functions.coupled_drift,
+        gain=users_functions.coupled_gain,
         n=2,
         order=2,
         units=(("m", "rad"), "1/s", "N"),
         component_names=("cart", "pole"),
     ),
     "strict_feedback_diagonal": plants.StrictFeedback(
-        drift=lambda t, x: jnp.stack([jnp.cos(x[0]), x[0] * x[1], -x[2]]),
-        gain=lambda t, x: jnp.stack([jnp.ones_like(x[0]), 2.0 + x[1] ** 2, jnp.exp(x[0])]),
+        drift=users_functions.diagonal_drift,
+        gain=users_functions.diagonal_gain,
         n=1,
         order=3,
     ),
@@ -148,10 +147,8 @@ DISTURBANCES = {
 PROCESS_NOISES = {
     "additive": process_noise.Additive([[0.3, 0.2], [0.1, 0.4]], levels=(1, 3)),
     "proportional": process_noise.Proportional([[0.3, 0.2]], substeps=2),
-    "diffusion": process_noise.Diffusion(lambda t, x: jnp.exp(-t) * jnp.cos(x[:1])),
-    "diffusion_additive": process_noise.Diffusion(
-        lambda t, x: (2.0 + jnp.sin(t)) * jnp.ones_like(x[:1]), additive=True
-    ),
+    "diffusion": process_noise.Diffusion(users_functions.fading_noise),
+    "diffusion_additive": process_noise.Diffusion(users_functions.periodic_noise, additive=True),
 }
 
 BARRIERS = {

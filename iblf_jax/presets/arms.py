@@ -136,7 +136,7 @@ def inertial_gain(
     return jnp.maximum(numbers["rate"] * inertia, numbers["least"])
 
 
-def _coupled_gain(robot: Robot, reference: Reference) -> jax.Array:
+def _coupled_gain(robot: Robot, reference: Reference) -> np.ndarray:
     """The gain of `arm_scenario`, (n,) [N m s/rad].
 
     With D the diagonal of M at the start and R = D^(1/2) M^-1 D^(1/2), M^-1 K2 has the eigenvalues
@@ -145,15 +145,20 @@ def _coupled_gain(robot: Robot, reference: Reference) -> jax.Array:
     positions = _positions_of(reference, jnp.asarray(TIMES, jnp.result_type(float)))
     if positions.ndim == 1:
         positions = jnp.repeat(positions[:, None], robot.n, axis=1)
-    # The matrices are computed one by one, and collected by NumPy: XLA would compile programs that
-    # divide and join them.
+    # By NumPy after the matrices: XLA would compile a program for each operation.
     separate = np.asarray(positions.astype(jnp.result_type(float)))
-    matrices = jnp.asarray(np.stack([np.asarray(mass_matrix_at(robot, q)) for q in separate]))
-    inertia = jnp.diagonal(matrices[0])
-    size = jnp.sqrt(inertia)
-    coupling = jnp.sum(jnp.abs(matrices[0]), axis=1) / inertia
-    sums = jnp.sum(jnp.abs(jnp.linalg.inv(matrices) * size[:, None] * size), axis=1)
-    share = jnp.minimum(jnp.minimum(coupling, COUPLED), FASTEST / jnp.max(sums, axis=0))
+    matrices = np.stack([np.asarray(mass_matrix_at(robot, q)) for q in separate])
+    least = np.linalg.eigvalsh(matrices)[:, 0]
+    if not np.all(least > 0.0):
+        first = np.argmin(least)
+        expected = f"a positive definite matrix on the reference, as at t = {TIMES[first]:g} s"
+        remedy = "Check the masses, lengths and inertias."
+        raise checks.fail("robot.mass_matrix(q)", matrices[first], expected, remedy)
+    inertia = np.diagonal(matrices[0])
+    size = np.sqrt(inertia)
+    coupling = np.sum(np.abs(matrices[0]), axis=1) / inertia
+    sums = np.sum(np.abs(np.linalg.inv(matrices) * size[:, None] * size), axis=1)
+    share = np.minimum(np.minimum(coupling, COUPLED), FASTEST / np.max(sums, axis=0))
     return RATE * inertia * share
 
 
@@ -262,7 +267,8 @@ def arm_scenario(
       A Scenario; all its numbers are leaves.
 
     Raises:
-      ValueError: an unknown law or variant; a joint without limits and no bounds given.
+      ValueError: an unknown law or variant; a joint without limits and no bounds given; a mass
+        matrix that is not positive definite on the reference.
 
     Source: this package.
     """

@@ -14,8 +14,9 @@ import jax.numpy as jnp
 
 from iblf_jax.control.observers import Observer
 from iblf_jax.control.sensors._base import Measurement, measurement_of
-from iblf_jax.core import checks, taylor
+from iblf_jax.core import checks, programs, taylor
 from iblf_jax.core.pytree import Absent, Pytree
+from iblf_jax.simulation.initial import Initial
 from iblf_jax.world import plants
 from iblf_jax.world.plants import Plant
 from iblf_jax.world.robots import at_time, friction_torque, inverse_dynamics
@@ -36,8 +37,19 @@ def start_levels(scenario: Scenario) -> jax.Array:
     initial, plant = scenario.initial, scenario.loop.plant
     if plant.order == 2 or initial.higher is not None:
         return initial.x
+    is_known = checks.is_concrete((plant, initial))
+    start = _compiled_steady_start if is_known else _steady_start
+    return start(plant, initial)  # type: ignore[no-any-return]
+
+
+def _steady_start(plant: Plant, initial: Initial) -> jax.Array:
+    """The steady state of a plant at q and q' of a start, (r, n)."""
     steady = plant.steady_levels(initial.q, initial.dq)
     return plants.state_of_levels(initial.q, initial.dq, steady)
+
+
+_compiled_steady_start = programs.jit(_steady_start, options=programs.SHORTEST_TO_COMPILE)
+"""One program: each of some thirty operations would be one."""
 
 
 def levels_on_reference(scenario: Scenario, t: jax.Array) -> jax.Array:

@@ -6,14 +6,17 @@ from __future__ import annotations
 
 import json
 import os
+import pickle
 import random
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import iblf_jax as ij
 from iblf_jax.engine import native
 
 TESTS = Path(__file__).parents[1]
@@ -24,7 +27,8 @@ pytestmark = pytest.mark.skipif(native.unavailable() is not None, reason="no C++
 
 
 def answers(lines: list[str], folder: Path, *options: str) -> dict[tuple[str, str], list]:
-    """(member, backend) -> what `member_runs.py` answers, with `folder` as the cache."""
+    """(member, backend) -> what `member_runs.py` answers, with the pickles and the cache in
+    `folder`."""
     environment = os.environ | {
         "PYTHONPATH": os.pathsep.join([str(TESTS), str(TESTS.parent)]),
         "XDG_CACHE_HOME": str(folder),
@@ -32,7 +36,7 @@ def answers(lines: list[str], folder: Path, *options: str) -> dict[tuple[str, st
         "PYTHONWARNINGS": "ignore",
     }
     done = subprocess.run(
-        [sys.executable, str(TESTS / "member_runs.py"), *options],
+        [sys.executable, str(TESTS / "member_runs.py"), str(folder), *options],
         input="\n".join(lines),
         env=environment,
         capture_output=True,
@@ -43,8 +47,19 @@ def answers(lines: list[str], folder: Path, *options: str) -> dict[tuple[str, st
     return {(x["name"], x["backend"]): x["end"] for x in found}
 
 
+def scenarios() -> dict[str, Callable[[], ij.Scenario]]:
+    """Name of a member -> function that makes its scenario."""
+    import scenarios_of_members  # it computes, and not all tests here need it
+
+    return scenarios_of_members.scenarios()
+
+
 def check(names: list[str], method: str, folder: Path) -> None:
     """Compares the compiled run with plain JAX, in one process and in one process a member."""
+    # A process that made its scenario itself would compile the operations of all others first.
+    folder.mkdir(exist_ok=True)
+    for name in names:
+        (folder / f"{name}.pickle").write_bytes(pickle.dumps(scenarios()[name]()))
     order = [f"{backend} {method} {name}" for name in names for backend in ("native", "vmap")]
     random.Random(0 if os.environ.get("CI") else None).shuffle(order)
     together = answers(order, folder)
@@ -68,8 +83,6 @@ def test_laws_that_are_alike_have_their_own_programs(tmp_path):
 def test_every_member_has_its_own_program(tmp_path_factory, part):
     """In four parts, with one folder in common if one process runs them; by Euler's method, whose
     programs are compiled in a third of the time, where the loop admits it."""
-    from scenarios_of_members import scenarios  # it computes
-
     folder = tmp_path_factory.getbasetemp() / "cache of members"
     names = sorted(scenarios())
     random.Random(1).shuffle(names)

@@ -65,6 +65,8 @@ def test_joint_limits_become_bounds():
 
 IIWA = arms.arm("iiwa14")
 UNLIMITED = dataclasses.replace(IIWA, upper=IIWA.upper.at[3].set(jnp.inf))
+UR5 = arms.arm("ur5")
+MASSLESS = dataclasses.replace(UR5, mass=np.zeros(6), inertia=np.zeros((6, 6)))
 
 
 def test_a_joint_without_a_limit_gets_the_one_that_is_given():
@@ -81,6 +83,7 @@ def test_a_joint_without_a_limit_gets_the_one_that_is_given():
         (lambda: ij.presets.ur5(payload=-1.0), "payload"),
         (lambda: arms.arm_scenario(arms.arm("ur5"), HOLD, variant="wrong"), "variant"),
         (lambda: arms.arm_scenario(arms.arm("ur5"), HOLD, bounds=3), "bounds: got 3"),
+        (lambda: arms.arm_scenario(MASSLESS, HOLD), r"positive definite.*at t = 0 s.*masses"),
     ],
 )
 def test_refusals_name_what_is_expected(make, words):

@@ -121,7 +121,7 @@ from iblf_jax.control.controllers.backstepping import (
     stated_decay,
 )
 from iblf_jax.control.decays import Decay
-from iblf_jax.core import checks
+from iblf_jax.core import checks, programs
 from iblf_jax.core.linalg import inner, matvec
 from iblf_jax.core.pytree import Leaf, component, leaf, static
 from iblf_jax.core.units import ByLevel, PlantUnit, resolved
@@ -331,17 +331,7 @@ class BarrierBackstepping(Law):
         """The law with weights, (r, n), that belong to its model and to a state x."""
         if self.weights is not None or plants.order_of(context.model) != self.order:
             return self
-        scale = plants.as_plant(context.model).weights(x)
-        weights = jnp.ones_like(x)
-        if scale is not None:
-            # e_i/s_i at e_i = 0 and t = 0, with which the weights have the scale of e_i^2.
-            t = jnp.zeros((), x.dtype)
-            tube = context.tube(t)
-            ratios = [_ratio(self.barriers[0], tube, tube.q_d)]
-            for i in range(1, self.order):
-                tube = _tube_at_rest(context.bounds[i], t, jnp.zeros_like(x[i]))
-                ratios.append(_ratio(self.barriers[i], tube, tube.q_d))
-            weights = scale * jnp.stack(ratios)
+        weights = _default_weights(self.barriers, context, x)
         if self.weight_matrices is not None:
             free = [isinstance(barrier, Quadratic) for barrier in self.barriers]
             weights = jnp.where(jnp.array(free)[:, None], 1.0, weights)
@@ -638,6 +628,25 @@ def _check_matrix(field: str, matrix: np.ndarray, barrier: Barrier, name: str) -
     if smallest <= 0.0:
         got = f"a matrix whose symmetric part has the eigenvalue {smallest:.4g}"
         raise checks.fail(field, checks.Words(got), "a positive definite symmetric part")
+
+
+# One program: each of some fifty operations would be one.
+@programs.jit(options=programs.SHORTEST_TO_COMPILE)
+def _default_weights(barriers: tuple[Barrier, ...], context: LawContext, x: jax.Array) -> jax.Array:
+    """The weights, (r, n), with which the levels have the scale of the energy of the model at a
+    state x, (r, n).
+    """
+    scale = plants.as_plant(context.model).weights(x)
+    if scale is None:
+        return jnp.ones_like(x)
+    # e_i/s_i at e_i = 0 and t = 0, with which the weights have the scale of e_i^2.
+    t = jnp.zeros((), x.dtype)
+    tube = context.tube(t)
+    ratios = [_ratio(barriers[0], tube, tube.q_d)]
+    for i in range(1, len(barriers)):
+        tube = _tube_at_rest(context.bounds[i], t, jnp.zeros_like(x[i]))
+        ratios.append(_ratio(barriers[i], tube, tube.q_d))
+    return scale * jnp.stack(ratios)
 
 
 def _ratio(barrier: Barrier, tube: Tube, x: jax.Array) -> jax.Array:

@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.core import checks
+from iblf_jax.core import checks, programs
 from iblf_jax.core.attributes import attributes, has_members
 from iblf_jax.core.disk_cache import keep_programs
 from iblf_jax.core.families import adopt, attribute
@@ -183,7 +183,7 @@ def at_time(robot: R, t: jax.Array) -> R:
     return robot.at(t)
 
 
-@jax.jit
+@programs.jit(options=programs.SHORTEST_TO_COMPILE)
 def _mass_matrix(robot: Robot, q: jax.Array) -> jax.Array:
     return robot.mass_matrix(q)
 
