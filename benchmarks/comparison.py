@@ -27,9 +27,9 @@ FILES = (ROOT / "README.md", ROOT / "paper" / "paper.md")
 LANDING = ROOT / "docs" / "index.md"
 """The first page of the site, which has three of the numbers."""
 ON_LANDING = {
-    "throughput": "4096 closed loops on a CPU; plain JAX: {other}",
+    "throughput": "4096 closed loops on a CPU{ours}; plain JAX: {other}",
     "latency": "a run of 20 s by RK4{ours}; SciPy LSODA: {other}",
-    "arm": "iiwa 14 with law and observer; MuJoCo, the plant alone: {other}",
+    "arm": "iiwa 14 with law and observer{ours}; MuJoCo, the plant alone: {other}",
 }
 """The benchmarks of these numbers, and the words for a narrow column."""
 BEGIN, END = "<!-- comparison -->\n", "<!-- end of comparison -->"
@@ -57,6 +57,8 @@ class Comparison(NamedTuple):
     mislead."""
 
 
+ERROR = "largest error [rad]"
+OF_ERRORS = "largest error {:.1e} rad"
 LOOP = {"loop": "paper", "type": "float64", "runs": 4096}
 ON_GPU = {"loop": "paper", "type": "float32", "runs": 65536}
 ARM_ON_GPU = {"loop": "iiwa14", "type": "float32", "runs": 65536}
@@ -81,7 +83,7 @@ COMPARISONS = (
         "less",
         {"row": "native, user's call, 0.5 ms"},
         {"SciPy LSODA, relative tolerance 1e-6": {"row": "LSODA, compiled field"}},
-        {"largest error [rad]": "largest error {:.1e} rad"},
+        {ERROR: OF_ERRORS},
     ),
     Comparison(
         "65,536 closed loops of the paper's arm, H200",
@@ -171,7 +173,18 @@ def beside(comparison: Comparison, conditions: Conditions) -> str:
         text.format(value_of(comparison, conditions, column))
         for column, text in comparison.beside.items()
     ]
+    if not values:
+        values = [OF_ERRORS.format(error) for error in errors_of(comparison.benchmark, conditions)]
     return "".join(f", {value}" for value in values)
+
+
+def errors_of(benchmark: str, conditions: Conditions) -> list[float]:
+    """The largest error of a row whose benchmark measures times only [rad], of `errors.py`; empty
+    for a row that has none.
+    """
+    rows = result_of("errors")["rows"]
+    named = {"benchmark": benchmark, "row": conditions.get("row")}
+    return [float(row[ERROR]) for row in rows if named.items() <= row.items()]
 
 
 def measured_by(benchmark: str) -> str:
@@ -230,7 +243,11 @@ def table() -> str:
         "|---|---|---|---|",
     ]
     lines = [*head, *map(row, shown)]
-    lines += ["", "The versions of the other software were not noted with these numbers."]
+    lines += [
+        "",
+        "The versions of the other software were not noted with these numbers. The errors of the"
+        f" first and the third row are those of {measured_by('errors')}.",
+    ]
     if removed:
         names = " and ".join(f'"{task}"' for task in removed)
         reason = f"because they were {withdrawn.REASON}; they will be measured again."
@@ -250,6 +267,7 @@ def three_numbers() -> str:
         number = f"{words(value_of(chosen, chosen.ours))} {chosen.unit}"
         other = words(value_of(chosen, conditions)) + beside(chosen, conditions)
         described = text.format(ours=beside(chosen, chosen.ours), other=other)
+        described = described.replace("largest error", "error")  # a narrow column
         lines.append(f"- [**{number}**](benchmarks.md): {described}")
     for worse in COMPARISONS:
         if worse.benchmark in withdrawn.BENCHMARKS:

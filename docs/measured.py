@@ -41,6 +41,12 @@ PLOTS = {
         " with the method Tsit5, whose steps have six evaluations; those of the others have four.",
         {"loop": "paper", "runs": 4096},
     ),
+    "errors": Plot(
+        ("benchmark", "row"),
+        "largest error [rad]",
+        "The largest errors of the rows that are compared above and in the section on seven joints;"
+        " MuJoCo has the plant alone, without torques. Less is better.",
+    ),
     "gpu": Plot(
         ("loop", "type", "runs", "row"),
         "steps/s",

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import os
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -29,6 +31,9 @@ LARGEST_TRAVEL = 0.8
 LARGEST_DISTANCE = 0.15
 """Largest distance of the bounds from the motion [rad or m]; a tenth of the range where this is
 less."""
+RESOLVED = 2.0
+"""Largest product of the decay of a joint's friction and the time step with `rotor_inertia`; RK4 is
+stable up to 2.785, and links that a study makes lighter decay faster."""
 HOLDING = 0.8
 """Largest share of a torque limit that gravity takes, with the payload of the study."""
 DURATIONS = {"zhang_yan_2024": 4.0, "ur5": 4.0, "iiwa14": 4.0}
@@ -49,6 +54,8 @@ class Project(NamedTuple):
     """Path -> the entry of the study, in TOML."""
     margin: float
     """Least distance to the bounds that the tuning requires [rad]."""
+    rotor_inertia: Mapping[str, float] = MappingProxyType({})
+    """Joint -> the inertia that `--rotor-inertia` added to the plant [kg m^2]."""
 
     @property
     def period(self) -> float:
@@ -81,7 +88,9 @@ def of_preset(name: str) -> Project:
     return Project(scenario, scenario_to_toml(scenario), about, duration, perturbations, 0.02)
 
 
-def of_robot(file: Path, folder: Path, base: str | None, tip: str | None) -> Project:
+def of_robot(
+    file: Path, folder: Path, base: str | None, tip: str | None, rotor_inertia: bool = False
+) -> Project:
     """The project of a robot in a URDF or MJCF file: a motion from rest to rest within the ranges
     of its joints, and bounds around it.
 
@@ -92,6 +101,8 @@ def of_robot(file: Path, folder: Path, base: str | None, tip: str | None) -> Pro
       file: the robot's file.
       folder: the folder of the project, to which the path of the file is relative.
       base, tip: links, as for `iblf_jax.robots.load`.
+      rotor_inertia: whether to add an inertia to the joints of the plant whose friction the time
+        step does not resolve (`_rotor_inertia`).
 
     Raises:
       ValueError: a file that cannot be read, torque limits that do not hold the robot, friction
@@ -108,8 +119,15 @@ def of_robot(file: Path, folder: Path, base: str | None, tip: str | None) -> Pro
     start = np.round(middle - np.minimum(0.25 * half, 0.5 * LARGEST_TRAVEL), 4)
     end = np.round(middle + np.minimum(0.25 * half, 0.5 * LARGEST_TRAVEL), 4)
     distance = np.round(np.minimum(0.2 * half, LARGEST_DISTANCE), 4)
-    payload = _payload(arm, np.linspace(start, end, 9), file)
-    _refuse_stiff_friction(arm, start, file)
+    positions = np.linspace(start, end, 9)
+    payload = _payload(arm, positions, file)
+    added = np.zeros(arm.n)
+    if rotor_inertia:
+        added = _rotor_inertia(arm, positions, PERIODS[0] / 2)
+    plant, model = arm, None
+    if added.any():
+        plant, model = dataclasses.replace(arm, armature=np.asarray(arm.armature) + added), arm
+    _refuse_stiff_friction(plant, start, file)
     bounds = Bounds(lower=Constant(start - distance), upper=Constant(end + distance))
     speeds = np.where(np.isfinite(arm.speed), np.asarray(arm.speed), np.pi)
     # The peak speed of a quintic motion is 15/8 of its mean.
@@ -117,7 +135,7 @@ def of_robot(file: Path, folder: Path, base: str | None, tip: str | None) -> Pro
     for _ in range(SLOWINGS):
         time = float(np.ceil(10 * time) / 10)
         motion = references.Quintic(start=start, end=end, duration=time)
-        loop = arm_scenario(arm, motion, bounds=bounds)
+        loop = arm_scenario(plant, motion, bounds=bounds, model=model)
         scenario = next(filter(None, (_at(loop, x, time + 0.5) for x in PERIODS)), None)
         if scenario is not None:
             break
@@ -139,10 +157,13 @@ def of_robot(file: Path, folder: Path, base: str | None, tip: str | None) -> Pro
     }
     if not payload:
         del perturbations["plant.payload"]
-    text = _scenario_text(file, folder, {"base": base, "tip": tip}, scenario, distance)
+    text = _scenario_text(
+        file, folder, {"base": base, "tip": tip}, scenario, distance, is_changed=bool(added.any())
+    )
     about = f"Its robot is `{file.name}`, with the joints {', '.join(arm.joints)}."
     margin = float(np.round(0.2 * np.min(distance), 4))
-    return Project(scenario, text, about, time + 0.5, perturbations, margin)
+    larger = {name: float(x) for name, x in zip(arm.joints, added, strict=True) if x}
+    return Project(scenario, text, about, time + 0.5, perturbations, margin, larger)
 
 
 def _ranges(arm: Arm) -> tuple[np.ndarray, np.ndarray]:
@@ -186,6 +207,42 @@ def _payload(arm: Arm, positions: np.ndarray, file: Path) -> float:
     )
 
 
+def _friction_slope(arm: Arm) -> np.ndarray:
+    """The largest slope of the friction of each joint, which is that at rest, (n,) [N m s/rad]."""
+    slope = np.asarray(arm.damping + arm.friction / arm.friction_width, float)
+    return np.broadcast_to(slope, (arm.n,))
+
+
+def _rotor_inertia(arm: Arm, positions: np.ndarray, step: float) -> np.ndarray:
+    """An inertia J_i of some joints with which a time step resolves the friction at rest, (n,)
+    [kg m^2]; zero if it does without.
+
+        M^-1 D v = lambda v,   lambda step <= RESOLVED,   J_i = D_i step / RESOLVED
+
+    With this J_i of every joint v^T D v <= lambda v^T (M + J) v for all v, since M is positive
+    definite.  The joints receive it one after the other, those with the fastest decay
+    D_i (M^-1)_ii first, until the eigenvalues at all positions are small enough.
+
+    Args:
+      arm: the robot.
+      positions: positions of the motion, (K, n) [rad].
+      step: the time step [s].
+    """
+    slope = _friction_slope(arm)
+    masses = np.stack([np.asarray(arm.mass_matrix(q), float) for q in positions])
+    added = np.zeros(arm.n)
+    while True:
+        mobility = np.linalg.inv(masses + np.diag(added))
+        # The eigenvalues of D^(1/2) M^-1 D^(1/2), which is symmetric, are those of M^-1 D.
+        scaled = np.sqrt(slope)[:, None] * mobility * np.sqrt(slope)
+        if np.max(np.linalg.eigvalsh(scaled)) * step <= RESOLVED:
+            return added
+        decays = np.max(np.diagonal(scaled, axis1=1, axis2=2), axis=0)
+        fastest = int(np.argmax(np.where(added > 0.0, 0.0, decays)))
+        # Rounded up, so that the file has few digits.
+        added[fastest] = math.ceil(1e4 * slope[fastest] * step / RESOLVED) / 1e4
+
+
 def _refuse_stiff_friction(arm: Arm, q: np.ndarray, file: Path) -> None:
     """Raises ValueError for friction that the smallest time step does not resolve.
 
@@ -194,21 +251,21 @@ def _refuse_stiff_friction(arm: Arm, q: np.ndarray, file: Path) -> None:
     """
     from iblf_jax.simulation.integrators import TABLEAUS
 
-    slope = np.asarray(arm.damping + arm.friction / arm.friction_width)
+    slope = _friction_slope(arm)
     mobility = np.diag(np.linalg.inv(np.asarray(arm.mass_matrix(q))))
     decay = slope * mobility
     worst = int(np.argmax(decay))
     step = PERIODS[-1] / 2
     if decay[worst] * step <= TABLEAUS["rk4"].stability:
         return
-    slope_there = np.broadcast_to(slope, decay.shape)[worst]
     raise checks.fail(
         "--robot",
         str(file),
         f"a robot whose friction a time step of {step:g} s resolves",
-        f"At rest the joint {arm.joints[worst]} has {slope_there:.3g} N m s/rad on"
-        f" {1 / mobility[worst]:.2g} kg m^2, a decay of {decay[worst]:.2g} 1/s: correct <dynamics"
-        " damping, friction>, add the rotor's inertia to the link, or name a --tip before it.",
+        f"At rest the joint {arm.joints[worst]} has {slope[worst]:.3g} N m s/rad on"
+        f" {1 / mobility[worst]:.2g} kg m^2, a decay of {decay[worst]:.2g} 1/s. Either give the"
+        " option --rotor-inertia, with which the simulated robot has the inertia of a rotor there,"
+        " or correct <dynamics damping, friction>, or name a --tip before it.",
     )
 
 
@@ -253,17 +310,31 @@ def _scenario_text(
     links: Mapping[str, str | None],
     scenario: Scenario,
     distance: np.ndarray,
+    is_changed: bool,
 ) -> str:
-    """The file scenario.toml of a robot, without its table [run]."""
+    """The file scenario.toml of a robot, without its table [run]; with another armature of the
+    plant if this `is_changed`.
+    """
+    path = json.dumps(os.path.relpath(file, folder))
     named = [f"{name} = {json.dumps(link)}" for name, link in links.items() if link is not None]
+    robot = ["[robot]", f"file = {path}  # relative to this file", *named]
+    if is_changed:
+        plant: Any = scenario.plant
+        armature = json.dumps(np.asarray(plant.armature, float).tolist())
+        robot = [
+            "[plant]  # the simulated robot",
+            *robot[1:],
+            f"armature = {armature}  # kg m^2, of the rotors, in place of the file's",
+            "",
+            "[model]  # the robot that the law knows",
+            *robot[1:],
+        ]
     motion: Any = scenario.reference
     bounds: Any = scenario.bounds[0]
     lines = [
         "# The gains, the weight of the barrier and the torque limits follow from the robot's",
         "# numbers (iblf_jax.presets.arm_scenario); a table [controller] replaces them.",
-        "[robot]",
-        f"file = {json.dumps(os.path.relpath(file, folder))}  # relative to this file",
-        *named,
+        *robot,
         "",
         "[reference]  # from rest to rest",
         'kind = "quintic"',
@@ -415,6 +486,22 @@ TIMES = (
 """Processor time of the three commands, measured with iblf_jax 1.0.0rc1."""
 
 
+def _about_rotors(added: Mapping[str, float]) -> list[str]:
+    """What `--rotor-inertia` changed, a paragraph of the README; empty if it changed nothing."""
+    if not added:
+        return []
+    joints = ", ".join(f"{joint} {inertia:g}" for joint, inertia in added.items())
+    return [
+        "",
+        "The friction of some joints is too fast for the time step; as a rule, the file has the"
+        " friction of their drives and not the inertia of their rotors. The simulated robot has an"
+        f" inertia there that is not in the file, chosen for the time step [kg m^2]: {joints}. The"
+        " friction is that of the file, and the law knows the robot of the file. Write the"
+        " inertias of the rotors, which are the square of the gear ratio times those of the data"
+        " sheets, into `armature` of [plant] and [model] if they are known.",
+    ]
+
+
 def _readme_text(project: Project, name: str) -> str:
     *three, last = COMMANDS
     return "\n".join(
@@ -423,6 +510,7 @@ def _readme_text(project: Project, name: str) -> str:
             "",
             f"{project.about} The law runs every {1e3 * project.period:g} ms. It was run once"
             f" before these files were written: the run of {project.duration:g} s kept its bounds.",
+            *_about_rotors(project.rotor_inertia),
             "",
             "The next three commands, in this folder:",
             "",

@@ -50,7 +50,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--dt",
         type=float,
         metavar="S",
-        help="time step of a closed loop [s] (default: the file's, else 0.001)",
+        help="time step of a closed loop, and the longest one of the self-test's run of a law [s]"
+        " (default: the file's, else 0.001)",
     )
     parser.add_argument(
         "--method",
@@ -118,12 +119,12 @@ def run(args: argparse.Namespace) -> int:
         chosen["torque_limits"] = chosen["torque_limits"][0]
     if args.gains is not None:
         chosen["gains"] = [_tunable(text) for text in args.gains]
+    options = run_options(args, file)
+    chosen |= {key: options[key] for key in ("dt", "method")}
     if args.target == "ros2":
-        # A law has no time step: only what the user gave is checked, not what the file has.
-        chosen |= given_options(args, "dt", "method")
-    else:
-        options = run_options(args, file)
-        chosen |= {key: options[key] for key in ("dt", "method")}
+        # A law has no integrator: only what the user gave is checked, not what the file has.
+        del chosen["method"]
+        chosen |= given_options(args, "method")
     try:
         print(export(file.scenario, output_folder(args.out), **chosen))
     except ToolchainError as error:

@@ -25,6 +25,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--tip", metavar="LINK", help="the last link (default: the end of the only chain)"
     )
     parser.add_argument(
+        "--rotor-inertia",
+        action="store_true",
+        help="add an inertia to the joints whose friction a time step of 1 ms does not resolve; of"
+        " the simulated robot only, the law knows that of the file",
+    )
+    parser.add_argument(
         "--preset",
         metavar="NAME",
         help="without --robot: zhang_yan_2024, ur5 or iiwa14 (default: zhang_yan_2024)",
@@ -44,16 +50,24 @@ def run(args: argparse.Namespace) -> int:
         for option in ("base", "tip"):
             if getattr(args, option) is not None:
                 raise checks.fail(f"--{option}", getattr(args, option), "--robot beside it")
+        if args.rotor_inertia:
+            raise checks.fail("--rotor-inertia", True, "--robot beside it")
         project = _project.of_preset(args.preset or "zhang_yan_2024")
     elif args.preset is not None:
         raise checks.fail("--preset", args.preset, "either --robot or --preset")
     else:
         try:
-            project = _project.of_robot(Path(args.robot), folder, args.base, args.tip)
+            project = _project.of_robot(
+                Path(args.robot), folder, args.base, args.tip, args.rotor_inertia
+            )
         except ImportError as error:
             raise ValueError(str(error)) from error
     names = _project.write(project, output_folder(args.folder, "FOLDER"))
-    print(f"written to {folder}: {', '.join(names)}\n\nNext:\n  cd {folder}")
+    print(f"written to {folder}: {', '.join(names)}")
+    if project.rotor_inertia:
+        joints = ", ".join(f"{name} {x:g}" for name, x in project.rotor_inertia.items())
+        print(f"inertia added to the simulated robot [kg m^2]: {joints}; README.md says why")
+    print(f"\nNext:\n  cd {folder}")
     for command, purpose in _project.COMMANDS[:3]:
         print(f"  {command:<46} # {purpose}")
     return 0

@@ -82,7 +82,7 @@ NEXT_STEPS = {
     "wasm": "load {name}.wasm in a page; {folder}/README.md has its functions",
 }
 """Target -> what to do with the files, with the folder and the name."""
-LOOP_DEFAULTS = {"dt": 1e-3, "method": "rk4", "seed": 0}
+LOOP_DEFAULTS = {"method": "rk4", "seed": 0}
 """The defaults of the arguments that only a closed loop has."""
 TYPES = {"double": "float64", "float": "float32"}
 VECTORS_DURATION = 20.0
@@ -179,7 +179,9 @@ def export(
         a law whose inputs are q_d, q_d' and q_d".
       name: prefix of all names in the code, a C identifier, and the name of a ROS 2 package;
         "iblf_law" or "iblf_loop" if not given.
-      dt, method, seed: of a closed loop, as in `simulate`.
+      dt: the time step [s]: of a closed loop, as in `simulate`; of a law, the longest one of the
+        self-test's run, which is at most 1 ms.
+      method, seed: of a closed loop, as in `simulate`.
       gains: of a ROS 2 package, the gains that can be changed while the node runs: paths, or
         `ij.tunable(path, low, high)` with a range that was simulated; without one, the range is the
         default of `tune`, which may contain unstable loops, and a warning says so.
@@ -200,7 +202,7 @@ def export(
     """
     checks.one_of("target", target, (*LAW_TARGETS, *LOOP_TARGETS))
     is_loop = target in LOOP_TARGETS
-    loop_options = {"dt": dt, "method": method, "seed": seed}
+    loop_options = {"method": method, "seed": seed}
     ros_only = {"gains": gains, "torque_limits": torque_limits, "on_fault": on_fault}
     _check_options(target, dtype, reference, loop_options, ros_only)
     tableau(method)
@@ -237,7 +239,7 @@ def export(
     try:
         if is_loop:
             return _export_loop(scenario, folder, target, name, dt, method, seed)
-        return _export_law(scenario, folder, target, name, external_reference, ros)
+        return _export_law(scenario, folder, target, name, external_reference, ros, dt)
     except UnsupportedError as error:
         came = f"what has no C ({error})"
         raise checks.fail("scenario", came, "a scenario whose operations are lowered") from None
@@ -288,6 +290,7 @@ def _export_law(
     name: str,
     external_reference: bool,
     ros: RosOptions | None,
+    dt: float,
 ) -> Exported:
     scenario_toml: str | None = None
     notes: tuple[str, ...] = ()
@@ -300,7 +303,7 @@ def _export_law(
         programs=control_law(scenario, external_reference),
         name=name,
         external_reference=external_reference,
-        vectors=vectors(scenario, external_reference),
+        vectors=vectors(scenario, external_reference, dt),
         joints=plants.declared_joints(scenario.model),
         scenario_toml=scenario_toml,
     )
@@ -364,10 +367,15 @@ def checked_name(name: str | None, default: str) -> str:
     raise checks.fail("name", name, expected, 'Such as name="arm_law".')
 
 
-def vectors(scenario: Scenario, external_reference: bool) -> Vectors:
-    """Inputs of the law in a simulated run and its outputs; warns where that run fails."""
+def vectors(
+    scenario: Scenario, external_reference: bool, longest_step: float = LONGEST_STEP
+) -> Vectors:
+    """Inputs of the law in a simulated run and its outputs; warns where that run fails.
+
+    A plant may need steps that are shorter than a period, such as one with stiff friction.
+    """
     period = float(scenario.sampling.period)  # type: ignore[union-attr]
-    steps = max(1, math.ceil(period / LONGEST_STEP - 1e-9))
+    steps = max(1, math.ceil(period / min(longest_step, LONGEST_STEP) - 1e-9))
     samples = max(2, round(VECTORS_DURATION / period))
     with notices.muted():
         run = simulate(scenario, duration=samples * period, dt=period / steps, record_every=steps)

@@ -7,6 +7,7 @@
     locked = { gripper_joint = 0.02 }
     gravity = [0.0, 0.0, -9.81]
     repair = true                   # correct errors of the file; see `iblf_jax.robots.load`
+    armature = [0.01, 0.005]        # kg m^2, the inertia of the rotors, in place of the file's
 
     [reference]                     # and other tables that differ from
     ...                             # `iblf_jax.presets.arm_scenario`: bounds, controller, ...
@@ -19,6 +20,7 @@ reads it.
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from typing import Any
 
@@ -33,7 +35,7 @@ from iblf_jax.world.disturbances import Disturbance
 from iblf_jax.world.references import Reference
 from iblf_jax.world.robots import Robot, load
 
-KEYS = ("file", "base", "tip", "locked", "gravity", "repair")
+KEYS = ("file", "base", "tip", "locked", "gravity", "repair", "armature")
 ROBOTS = ("robot", "plant", "model")
 
 
@@ -98,6 +100,13 @@ def _robot(table: object, name: str, folder: str | os.PathLike) -> Robot:
     if "gravity" in table:
         options["gravity"] = numbers(table["gravity"], f"{name}.gravity", "m/s^2")
     try:
-        return load(os.path.join(folder, table["file"]), **options)
+        arm = load(os.path.join(folder, table["file"]), **options)
     except (ValueError, ImportError) as error:
         raise checks.with_location(f"{name}.file", error) from error
+    if "armature" not in table:
+        return arm
+    armature = numbers(table["armature"], f"{name}.armature", "kg m^2")
+    try:
+        return dataclasses.replace(arm, armature=armature)
+    except ValueError as error:
+        raise checks.with_location(name, error) from error

@@ -218,7 +218,33 @@ def test_new_names_friction_that_no_time_step_resolves(command, tmp_path):
     code, _, err = command("new", "a", "--robot", f"{ROOT}/tests/data/arms/xarm7.urdf")
     assert code == 2
     assert "At rest the joint joint7 has 22 N m s/rad on 0.00014 kg m^2" in err
+    assert "--rotor-inertia" in err
     assert not (tmp_path / "a").exists()
+
+
+@pytest.mark.slow
+def test_rotor_inertia_makes_a_project_of_a_robot_with_stiff_friction(command, tmp_path):
+    file = ROOT / "tests" / "data" / "arms" / "xarm7.urdf"
+    code, out, _ = command("new", "a", "--robot", str(file), "--rotor-inertia")
+    assert code == 0
+    assert "inertia added to the simulated robot [kg m^2]: joint1 0.015, " in out
+    scenario = ij.load_scenario(tmp_path / "a" / "scenario.toml")
+    arm = ij.robots.load(file)
+    plant, model = scenario.plant, scenario.model
+    added = np.asarray(plant.armature - arm.armature)
+    assert "joint7 0.011 " in out.replace(";", " ")
+    np.testing.assert_allclose(added, [0.015, 0.0, 0.0125, 0.0, 0.0125, 0.011, 0.011])
+    # The law and the friction are those of the file.
+    np.testing.assert_array_equal(model.armature, arm.armature)
+    np.testing.assert_array_equal(plant.damping, arm.damping)
+    np.testing.assert_array_equal(plant.friction, arm.friction)
+    # The eigenvalues of M^-1 D, computed without the square root of D, at a step of 1 ms.
+    slope = np.diag(np.asarray(arm.damping + arm.friction / arm.friction_width))
+    for q in np.linspace(scenario.reference.start, scenario.reference.end, 9):
+        decays = np.linalg.eigvals(np.linalg.solve(np.asarray(plant.mass_matrix(q)), slope))
+        assert np.max(decays.real) * 1e-3 <= 2.0
+    readme = (tmp_path / "a" / "README.md").read_text()
+    assert "[kg m^2]: joint1 0.015, joint3 0.0125" in readme
 
 
 def test_new_refuses_before_it_writes(command, tmp_path):
@@ -233,6 +259,7 @@ def test_new_refuses_before_it_writes(command, tmp_path):
         (["a", "--robot", "weak.urdf", "--preset", "ur5"], "either --robot or --preset"),
         (["a", "--preset", "vessel"], "--preset: got 'vessel'"),
         (["a", "--tip", "tool0"], "--tip: got 'tool0', expected --robot beside it"),
+        (["a", "--rotor-inertia"], "--rotor-inertia: got True, expected --robot beside it"),
     ):
         code, _, err = command("new", *words)
         assert code == 2

@@ -4,6 +4,7 @@ process noise and switched plants as FMUs: the numbers of `simulate`."""
 from __future__ import annotations
 
 import re
+import warnings
 
 import members
 import numpy as np
@@ -90,6 +91,17 @@ def test_a_law_that_estimates_levels_reads_the_measured_ones(tmp_path, case):
     run = ij.simulate(scenario, duration=DURATION, dt=1e-3)
     torques = export.vectors(scenario, external_reference=False).tau
     np.testing.assert_allclose(torques, run.tau[:-1:10], rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.slow
+def test_the_run_of_the_self_test_has_the_time_step_of_the_scenario(tmp_path):
+    """Friction that decays by about 4500 1/s: RK4 diverges with steps of 1 ms."""
+    stiff = robot(disturbance=ij.disturbances.Friction(viscous=100.0))
+    with pytest.warns(UserWarning, match="the simulated run"):
+        ij.export(stiff, tmp_path / "coarse")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        ij.export(stiff, tmp_path / "fine", dt=2.5e-4)
 
 
 @pytest.mark.slow

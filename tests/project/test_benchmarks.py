@@ -14,7 +14,7 @@ import jax
 import pytest
 
 FOLDER = Path(__file__).parents[2] / "benchmarks"
-OF_THEIR_OWN = ("gpu.py", "monte_carlo.py", "throughput.py")
+OF_THEIR_OWN = ("errors.py", "gpu.py", "monte_carlo.py", "throughput.py")
 """They choose JAX's type and devices, of which a process has one; the others spare themselves
 another start."""
 BEFORE_A_RELEASE = {

@@ -11,6 +11,7 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 STORED = json.loads((ROOT / "benchmarks" / "results" / "laws.json").read_text())
+TUNED = json.loads((ROOT / "benchmarks" / "field" / "results" / "zhang_yan_2024.json").read_text())
 
 
 @pytest.fixture
@@ -39,14 +40,41 @@ def test_the_sentences_follow_the_numbers(scripts):
     sentences = choosing.best_of_each_column(rows)
     assert "least with b (1), largest with a (3). Outside the bounds: c." in sentences[0]
     assert "up to 3 ms: b; c; d. With none of the tested delays: a." in sentences[-1]
-    assert choosing.page(STORED).startswith("# Choosing a law")
+    assert choosing.page(STORED, TUNED).startswith("# Choosing a law")
+
+
+def test_laws_with_the_same_budget_of_tuning_have_the_numbers_of_the_result(scripts):
+    _, choosing = scripts
+    assert choosing.with_tuning() == TUNED
+    text = "\n".join(choosing.same_budget(TUNED))
+    budget = TUNED["budget"]
+    assert f"{budget['points']} points without derivatives and {budget['starts']} searches" in text
+    assert TUNED["machine"]["commit"][:8] in text
+    assert "With the same budget of tuning all 7 laws stay inside the bounds at 10 ms" in text
+    law = TUNED["laws"]["PDGravity"]
+    row = next(x for x in law["front"] if x["level"] == 1.0)
+    found = choosing.tuned_laws(TUNED)["PDGravity"]
+    assert found[:2] == (("Kp", "Kd"), f"{row['points']} + {row['derivatives']}")
+    masses = law["robustness"]["masses"]
+    numbers = [row["error"], row["late_error"], law["robustness"]["periods"]["0.01"]]
+    numbers.append(max(masses["0.7"], masses["1.3"]))
+    assert [f"{x:.6g}" for x in found[2:]] == [f"{1e3 * x:.6g}" for x in numbers]
+    # A run that leaves its bounds is words, and a law that keeps no limit has no row.
+    changed = json.loads(json.dumps(TUNED))
+    changed["laws"]["PDGravity"]["robustness"]["periods"]["0.01"] = "leaves the bounds"
+    changed["laws"]["SafetyFilter"]["robustness"]["masses"]["0.7"] = "diverges"
+    for row in changed["laws"]["ComputedTorque"]["front"]:
+        row["left"] = "its effort is above the limit"
+    assert "tuning 5 of 6 laws stay inside" in choosing.inside_at_longest(changed)
+    assert choosing.tuned_laws(changed)["SafetyFilter"].wrong == "diverges"
 
 
 def test_the_four_questions_name_the_laws_of_the_table(scripts):
     _, choosing = scripts
     rows = [dict(row) for row in STORED["rows"]]
-    questions = choosing.four_questions({**STORED, "rows": rows})
+    questions = choosing.four_questions({**STORED, "rows": rows}, TUNED)
     slow, delay = (next(x for x in questions if word in x) for word in ("*10 ms*", "*A delay*"))
+    assert "all 7 laws stay inside the bounds at 10 ms, and their errors differ by" in slow
     assert "Backstepping(Integral); " in slow and "DynamicSurface" in slow
     assert "Backstepping(Log)" not in slow  # it left the bounds
     assert "ComputedTorque" not in slow  # it claims nothing about bounds
@@ -56,7 +84,7 @@ def test_the_four_questions_name_the_laws_of_the_table(scripts):
     by_name["BarrierBackstepping(Integral, Integral)"][choosing.SLOW] = 0.001  # its gains are own
     by_name["DynamicSurface"][choosing.SLOW] = "left"
     by_name["DynamicSurface"][choosing.LONGEST] = 64.0
-    questions = choosing.four_questions({**STORED, "rows": rows})
+    questions = choosing.four_questions({**STORED, "rows": rows}, TUNED)
     slow, delay = (next(x for x in questions if word in x) for word in ("*10 ms*", "*A delay*"))
     assert "Of those with a factor Backstepping(Log) has the least error (0.01 mrad)." in slow
     assert "DynamicSurface" not in slow

@@ -248,6 +248,14 @@ REFUSED = {
         lever(controller=controllers.BarrierBackstepping(k=(2.0, 8.0), filter=0.01)),
         "exact derivatives",
     ),
+    "matrices": (
+        lever(
+            controller=controllers.BarrierBackstepping(
+                k=(2.0, 8.0), gain_matrices=np.array([[[1.0]], [[2.0]]])
+            )
+        ),
+        "matrices as gains or weights",
+    ),
     "an observer of another kind": (
         lever(observer=observers.StateObserver(bandwidth=30.0)),
         "LevelObserver or NoObserver",

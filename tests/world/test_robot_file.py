@@ -133,6 +133,9 @@ def test_studies_and_tuning_read_it_too(folder):
         ("[robot]\nfile = 3\n", r"robot\.file: got 3, expected a string"),
         (ROBOT + "locked = { elbow = 0.1 }\n", r"robot\.file: .*elbow"),
         (ROBOT + "repair = 1\n", r"robot\.repair: got 1, expected true or false"),
+        (ROBOT + 'armature = "a"\n', r"robot\.armature: got 'a', expected .*kg m\^2"),
+        (ROBOT + "armature = [0.1, 0.2]\n", r"robot: .*armature"),
+        (ROBOT + "armature = -0.1\n", r"robot: .*armature"),
         (ROBOT + '[plant]\nfile = "ur5.urdf"\n', "beside"),
         ('[model]\nfile = "ur5.urdf"\n', "plant: got nothing"),
     ],
@@ -147,6 +150,16 @@ def test_without_the_extra_it_says_so(folder, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "mujoco", None)
     with pytest.raises(ValueError, match=r"robot\.file: .*\.\[robots\]"):
         scenario_file.load_scenario(written(folder, ROBOT + REFERENCE))
+
+
+def test_the_plant_may_have_other_rotors_than_the_model(folder):
+    tables = '[plant]\nfile = "ur5.urdf"\narmature = 0.01\n[model]\nfile = "ur5.urdf"\n'
+    scenario = ij.load_scenario(written(folder, tables + REFERENCE))
+    plain = ij.load_scenario(written(folder, ROBOT + REFERENCE))
+    np.testing.assert_array_equal(np.asarray(scenario.plant.armature), 0.01)
+    np.testing.assert_array_equal(scenario.model.armature, plain.plant.armature)
+    K2 = [one.controller.law.K2 for one in (scenario, plain)]
+    np.testing.assert_array_equal(*K2)
 
 
 @pytest.mark.slow

@@ -248,7 +248,7 @@ REFUSED = [
     ({"dtype": "float"}, "dtype: got 'float'"),
     ({"reference": "given"}, "reference: got 'given'"),
     # Options of a loop.
-    *(({name: x}, f"{name}: got {x!r}") for name, x in (("dt", 2e-3), ("seed", 1))),
+    *(({name: x}, f"{name}: got {x!r}") for name, x in (("method", "heun"), ("seed", 1))),
     ({"method": "euler"}, "method: got 'euler'"),
     # No names of a package of ROS; `json` is a module of Python.
     *(({"name": name}, f"name: got '{name}'") for name in ("ArmLaw", "arm__law", "json")),
