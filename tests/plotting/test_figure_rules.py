@@ -441,13 +441,18 @@ def test_every_figure_function_takes_a_style_and_a_figure():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("style", "width"),
-    [("paper", 3.5), (plotting.Paper("elsevier", 2), 190 / 25.4)],
+    ("style", "width", "figures"),
+    [
+        ("paper", 3.5, (plotting.torques, plotting.overview)),
+        (plotting.Paper("elsevier", 2), 190 / 25.4, (plotting.phase_portrait,)),
+    ],
     ids=["IEEE, one column", "Elsevier, two columns"],
 )
-def test_a_figure_for_print_has_the_size_and_the_font_of_the_journal(style, width, tmp_path):
+def test_a_figure_for_print_has_the_size_and_the_font_of_the_journal(
+    style, width, figures, tmp_path
+):
     run = made_up(chain(2))
-    for number, make in enumerate((plotting.torques, plotting.overview, plotting.phase_portrait)):
+    for number, make in enumerate(figures):
         figure = drawn(make(run, style=style))
         assert figure.get_figwidth() == pytest.approx(width)
         assert figure.get_figheight() <= 9.0
