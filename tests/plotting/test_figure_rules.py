@@ -19,6 +19,7 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.font_manager import findfont
 from matplotlib.text import Text
+from stored_results import stored
 
 import iblf_jax as ij
 from iblf_jax import Status, plotting
@@ -131,11 +132,10 @@ def test_a_comparison_states_the_reason_for_each_window(paper):
     assert torque.get_title().startswith(f"first {torque.get_xlim()[1]:.3g} s: the laws differ")
 
 
-@pytest.mark.slow
-def test_a_certificate_until_a_time_says_so(paper, short_run):
-    certificate = ij.certify(paper, short_run)
-    title = certificate.plot(until=0.2).get_suptitle()
-    assert "until 0.2 s, as requested; the verdict is that of all 0.5 s" in title
+def test_a_certificate_until_a_time_says_so():
+    certificate = stored("Certificate_0")
+    title = certificate.plot(until=0.04).get_suptitle()
+    assert "until 0.04 s, as requested; the verdict is that of all 0.1 s" in title
     assert "as requested" not in certificate.plot().get_suptitle()
 
 
@@ -441,13 +441,18 @@ def test_every_figure_function_takes_a_style_and_a_figure():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("style", "width"),
-    [("paper", 3.5), (plotting.Paper("elsevier", 2), 190 / 25.4)],
+    ("style", "width", "figures"),
+    [
+        ("paper", 3.5, (plotting.torques, plotting.overview)),
+        (plotting.Paper("elsevier", 2), 190 / 25.4, (plotting.phase_portrait,)),
+    ],
     ids=["IEEE, one column", "Elsevier, two columns"],
 )
-def test_a_figure_for_print_has_the_size_and_the_font_of_the_journal(style, width, tmp_path):
+def test_a_figure_for_print_has_the_size_and_the_font_of_the_journal(
+    style, width, figures, tmp_path
+):
     run = made_up(chain(2))
-    for number, make in enumerate((plotting.torques, plotting.overview, plotting.phase_portrait)):
+    for number, make in enumerate(figures):
         figure = drawn(make(run, style=style))
         assert figure.get_figwidth() == pytest.approx(width)
         assert figure.get_figheight() <= 9.0

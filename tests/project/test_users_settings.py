@@ -74,10 +74,14 @@ def test_the_same_as_users_compile(what):
     assert f"{len(names)} passed" in run_tests(*names, TEST_AS_USERS="1")
 
 
+TWO_FILES = ("tests/project/test_select_tests.py", "tests/project/test_examples.py")
+"""Files with default tests and slow ones, which are soon collected."""
+
+
 def collected(files: str | None, *options: str) -> list[str]:
     """The tests that a run of two files has, in their order, with SLOW_FILES; None is without."""
-    paths = [str(ROOT / "tests" / "control" / name) for name in ("test_laws.py", "test_decays.py")]
     variables = {} if files is None else {"SLOW_FILES": files}
+    paths = [str(ROOT / path) for path in TWO_FILES]
     printed = run_tests("--collect-only", *options, *paths, **variables)
     return [line for line in printed.splitlines() if "::" in line]
 
@@ -85,14 +89,12 @@ def collected(files: str | None, *options: str) -> list[str]:
 @pytest.mark.slow
 def test_a_change_runs_the_slow_tests_of_the_files_that_it_reaches():
     """Those of the nearest file first; the default tests of all files run in any case."""
-    laws, decays = "tests/control/test_laws.py", "tests/control/test_decays.py"
-    every, chosen = collected(None), collected(decays)
-    left_out = set(every) - set(chosen)
-    assert left_out and all(test.startswith(laws) for test in left_out)
-    assert left_out == set(collected(None, "-m", "slow and not release")) & left_out
-    assert any(test.startswith(laws) for test in chosen)
-    assert collected(f"{decays} {laws}")[0].startswith(decays)
-    assert collected(f"{laws} {decays}")[0].startswith(laws)
+    one, other = TWO_FILES
+    chosen, slow = collected(other), set(collected(None, "-m", "slow and not release"))
+    assert slow - set(chosen) == {test for test in slow if test.startswith(one)} != set()
+    assert any(test.startswith(one) for test in chosen) and slow & set(chosen)
+    assert collected(f"{other} {one}")[0].startswith(other)
+    assert collected(f"{one} {other}")[0].startswith(one)
 
 
 @pytest.mark.slow

@@ -15,7 +15,7 @@ from test_chains import pendulum as pendulum_with_motor
 import iblf_jax as ij
 from iblf_jax.core.pytree import Leaf, component, leaf, static
 from iblf_jax.kernels.enclosure import enclose
-from iblf_jax.proofs.arms import arm_problem
+from iblf_jax.proofs.arms import MOST_NUMBERS, arm_problem
 from iblf_jax.proofs.chains import chain_problem
 from iblf_jax.proofs.forms import enclosed
 from iblf_jax.proofs.search import search
@@ -39,11 +39,19 @@ def test_entries_with_one_value_differ_from_the_model_at_the_reference_value():
 
 @pytest.mark.slow
 def test_levels_of_a_disturbance_with_one_value_differ_from_what_is_known():
-    waves = ij.disturbances.Sinusoids(0.3, 2.0, 0.5, 0.1)
-    scenario = lever(disturbance=ij.disturbances.Levels((None, waves)))
-    path = "disturbance.parts[1]"
-    together = {f"{path}.amplitude, {path}.offset": ij.value(ij.interval(0.2, 0.4))}
-    check_bounds(scenario, together, 0.3)
+    """Beside as many other uncertain numbers as only a chain may have."""
+    waves = (
+        ij.disturbances.Sinusoids(0.3, 2.0, 0.5, 0.1),
+        ij.disturbances.Sinusoids(0.1, 1.0, 0.2),
+    )
+    scenario = lever(disturbance=ij.disturbances.Levels((None, ij.disturbances.Sum(waves))))
+    one, other = (f"disturbance.parts[1].parts[{i}]" for i in range(2))
+    others = (f"{one}.phase", f"{other}.amplitude", f"{other}.phase")
+    uncertain = {path: ij.factor(ij.interval(0.9, 1.1)) for path in others}
+    uncertain[f"{one}.amplitude, {one}.offset"] = ij.value(ij.interval(0.2, 0.4))
+    uncertain |= within(0.1, *LEVER)
+    assert len(uncertain) > MOST_NUMBERS
+    check_bounds(scenario, uncertain, 0.3)
 
 
 def narrow_between_samples():

@@ -182,7 +182,7 @@ def test_no_choice_of_the_coordinate_proves_too_much(monkeypatch):
     generator = np.random.default_rng(4)
     for guard in (0.0, 1.0, 3.0, np.inf, np.nan):
         monkeypatch.setattr(module, "GUARDS", (guard,))
-        for scales in 10.0 ** generator.uniform(-12.0, 12.0, (4, 3)):
+        for scales in 10.0 ** generator.uniform(-12.0, 12.0, (2, 3)):
             options = {"scales": scales, "max_boxes": 20_000, "progress": False}
             assert not search(waves, LOW, HIGH, [-0.999], **options).proved
             assert not search(bowl, LOW, HIGH, [0.0], **options).proved
@@ -206,7 +206,7 @@ def test_the_halves_of_a_box_cover_it():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("constant", [-1.01, -1.001, -1.0003])
+@pytest.mark.parametrize("constant", [-1.01, -1.001])
 def test_descents_estimate_the_number_of_boxes(constant):
     found = search(waves, LOW, HIGH, [constant], progress=False)
     assert found.proved

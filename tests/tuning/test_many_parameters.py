@@ -184,15 +184,7 @@ def test_a_mini_batch_without_the_worst_runs_warns(risk):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "optimiser",
-    [
-        optax.chain(optax.adam(0.1), optax.contrib.reduce_on_plateau()),
-        optax.sgd(optax.cosine_decay_schedule(0.1, 40), momentum=0.9),
-    ],
-    ids=("plateau", "scheduled sgd"),
-)
-def test_other_optimisers_survive_points_without_a_finite_loss(optimiser):
+def test_other_optimisers_survive_points_without_a_finite_loss():
     class Cliff(Bowls):
         def __call__(self, z):
             found = super().__call__(z)
@@ -202,7 +194,7 @@ def test_other_optimisers_survive_points_without_a_finite_loss(optimiser):
 
     evaluate = Cliff()
     evaluate.centres += 0.6 - evaluate.centres.mean(axis=0)
-    solver = Optax(optimiser)
+    solver = Optax(optax.chain(optax.adam(0.1), optax.contrib.reduce_on_plateau()))
     state = solver.init(evaluate.space, np.full((1, 2), -1.0))
     z, found = steps(solver, evaluate, state, 60)
     assert np.all(np.isfinite(z))

@@ -1037,14 +1037,6 @@ def test_a_killed_tuning_goes_on_bit_identically(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_checkpoint_of_another_problem_is_refused(paper, tmp_path):
-    options = SHORT | {"effort": effort(2), "checkpoint": tmp_path / "c.npz"}
-    ij.tune(paper, GAINS, objective(), **options)
-    with pytest.raises(ValueError, match="this very problem"):
-        ij.tune(paper, GAINS, 2 * objective(), **options)
-
-
-@pytest.mark.slow
 def test_more_peaks_than_the_memory_holds_are_refused(paper, monkeypatch):
     """A requirement on a peak has a matrix for each piece of it in each run."""
     monkeypatch.setattr(checks, "memory", lambda: 1_400_000)

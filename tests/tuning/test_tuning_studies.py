@@ -305,8 +305,9 @@ def test_the_path_of_a_tuning_across_what_is_allowed(paper):
         ij.plotting.paths(best, gains=("controller.k1", "controller.o"))
 
 
-def short_tuning(paper, checkpoint):
-    goal, options = ij.objectives.tracking(scale=1.0), {"duration": 0.01, "progress": False}
+def short_tuning(paper, checkpoint, weight=1.0):
+    goal = weight * ij.objectives.tracking(scale=1.0)
+    options = {"duration": 0.01, "progress": False}
     options |= {"effort": ij.tuning.Effort(iterations=1), "report": ij.tuning.Report(runs=2)}
     return ij.tune(paper, ["controller.k1"], goal, checkpoint=checkpoint, **options)
 
@@ -316,10 +317,12 @@ EARLIER = Path(__file__).parents[1] / "data" / "tuning_before_weights.json"
 
 @pytest.mark.slow
 def test_files_that_are_torn_or_others(paper, tmp_path):
-    """Checkpoints and results of earlier versions: cut anywhere, of another kind, with keys that
-    are missing or of another type."""
+    """Checkpoints and results of earlier versions: of another problem, cut anywhere, of another
+    kind, with keys that are missing or of another type."""
     np.save(tmp_path / "array.npy", np.ones(3))
     short_tuning(paper, tmp_path / "state.npz")
+    with pytest.raises(ValueError, match="this very problem"):
+        short_tuning(paper, tmp_path / "state.npz", weight=2.0)
     state, saved = (tmp_path / "state.npz").read_bytes(), EARLIER.read_text()
     cut = [b"", state[:10], state[: len(state) // 2], state[:-30]]
     bad = tmp_path / "bad.npz"

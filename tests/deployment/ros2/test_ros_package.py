@@ -337,6 +337,8 @@ HOSTILE = {
     "the same as names of C": ("a-b", "a_b"),
     "long": ("x" * 450, "y|" * 225),
 }
+FINE_IN_C = ("YAML", "more YAML", "numbers and words of YAML", "spaces at the ends")
+"""Cases whose names have nothing that is special in C."""
 
 
 def named_scenario(joints, links=("upper", "lower")):
@@ -417,16 +419,18 @@ def test_hostile_names_of_joints_and_links_stay_text(case, named, tmp_path):
     assert row[1] == f"effort of {', '.join(joints)}"
     (command,) = [x for x in readme.splitlines() if x.startswith("    ros2 param set")]
     assert shlex.split(command)[3:] == ["/hostile_law", path, "2.0"]
+    source = controller / "src"
+    law_c = (tmp_path / "c" / "hostile_law.c").read_text(encoding="utf-8")
+    assert (source / "hostile_law.c").read_text(encoding="utf-8") == law_c
+    if case in FINE_IN_C:
+        return
     flags = ["-Wall", "-Wextra", "-Wpedantic", "-Werror", "-fsyntax-only", "-trigraphs"]
     sources = sorted((tmp_path / "c").glob("*.c"))
     subprocess.run(["cc", "-std=c99", *flags, "-Wno-trigraphs", *sources], check=True)
     include = controller / "include"
     flags += ["-I", include, "-I", include / "hostile_law_controller"]
     flags += ["-isystem", ROOT / "tests" / "deployment" / "ros2" / "stubs"]
-    source = controller / "src"
     subprocess.run(["c++", "-std=c++17", *flags, source / "law_controller.cpp"], check=True)
-    law_c = (tmp_path / "c" / "hostile_law.c").read_text(encoding="utf-8")
-    assert (source / "hostile_law.c").read_text(encoding="utf-8") == law_c
 
 
 @pytest.mark.slow
