@@ -28,7 +28,7 @@ import os
 import struct
 import sys
 import types
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -48,7 +48,9 @@ PACKAGE = Path(__file__).resolve().parents[1]
 CLOCK = 1.0
 """Largest difference between the clocks of files and of this process [s]."""
 TRACED = ("core", "kernels", "world", "control", "simulation", "engine")
-"""Folders with what the kept programs are traced from."""
+"""Folders with what every kept program is traced from."""
+STUDIES = ("studies",)
+"""Folders with what only functions in them are traced from."""
 LIBRARIES = frozenset(("iblf_jax", "jax", "jaxlib", "numpy", *sys.stdlib_module_names))
 """Packages whose source the environment determines."""
 CACHED: Any = (MEMOISED_TYPE, type(jax.jit(abs)))
@@ -143,9 +145,12 @@ def _name_of(value: Any) -> str:
     return f"{module}.{name}"
 
 
-def environment() -> str:
+def environment(*functions: Callable) -> str:
     """The text of what decides, besides the arguments, what a program computes (head of this
     module).
+
+    Args:
+      functions: what the program is traced from besides the functions of TRACED.
 
     Raises:
       NoKeyError: something cannot be described, or a program must not be kept: the package was
@@ -164,7 +169,7 @@ def environment() -> str:
     parts = (
         (sys.version, jax.__version__, jaxlib.__version__, np.__version__),
         _source(),
-        _state(),
+        *map(_state, _folders(functions)),
         tuple(sorted((k, x) for k, x in os.environ.items() if k.startswith(VARIABLES))),
         tuple((k, options[k]) for k in sorted(options) if not k.startswith(NOT_OF_PROGRAMS)),
         threads(),
@@ -203,12 +208,22 @@ def _digest_of_files() -> str:
     return found.hexdigest()
 
 
-def _state() -> str:
-    """The digest of the functions, classes and plain values that the modules of the package name
-    now: other code may have replaced some.
+def _folders(functions: Iterable[Callable]) -> list[tuple[str, ...]]:
+    """The groups of folders with the code that these functions run."""
+    places = {str(function.__module__).split(".")[1] for function in functions} - {*TRACED}
+    if not places:
+        return [TRACED]
+    if places <= {*STUDIES}:
+        return [TRACED, STUDIES]
+    raise NoKeyError(f"functions in {places}")
+
+
+def _state(folders: tuple[str, ...]) -> str:
+    """The digest of the functions, classes and plain values that the modules in some folders of the
+    package name now: other code may have replaced some.
     """
-    first = _first_state()
-    now = _namespaces()
+    first = _first_state(folders)
+    now = _namespaces(folders)
     if len(now) == len(first.values) and all(map(_are_same, now.values(), first.values)):
         return first.digest
     return _State.of(now).digest
@@ -235,10 +250,10 @@ class _State(NamedTuple):
         return _State(found.hexdigest(), values)
 
 
-@memoised(1)
-def _first_state() -> _State:
+@memoised(2)
+def _first_state(folders: tuple[str, ...]) -> _State:
     """The state when this process first asks for it, with which later ones are compared."""
-    return _State.of(_namespaces())
+    return _State.of(_namespaces(folders))
 
 
 def _are_same(namespace: Mapping[str, Any], values: dict[str, Any]) -> bool:
@@ -248,10 +263,10 @@ def _are_same(namespace: Mapping[str, Any], values: dict[str, Any]) -> bool:
     return size == len(values) and all(map(operator.is_, now, values.values()))
 
 
-def _namespaces() -> dict[str, Mapping[str, Any]]:
-    """Name -> attributes, of all modules of TRACED and of the classes that they define."""
+def _namespaces(folders: tuple[str, ...]) -> dict[str, Mapping[str, Any]]:
+    """Name -> attributes, of all modules in some folders and of the classes that they define."""
     found: dict[str, Mapping[str, Any]] = {}
-    for module in _modules():
+    for module in _modules(folders):
         attributes = found[module] = vars(sys.modules[module])
         for value in list(attributes.values()):
             if isinstance(value, type) and value.__module__ == module:
@@ -259,12 +274,12 @@ def _namespaces() -> dict[str, Mapping[str, Any]]:
     return found
 
 
-@memoised(1)
-def _modules() -> tuple[str, ...]:
-    """The names of the modules of TRACED, all of them loaded: what a process has loaded before
-    must not matter.
+@memoised(2)
+def _modules(folders: tuple[str, ...]) -> tuple[str, ...]:
+    """The names of the modules in some folders, all of them loaded: what a process has loaded
+    before must not matter.
     """
-    files = [x for folder in TRACED for x in sorted((PACKAGE / folder).rglob("*.py"))]
+    files = [x for folder in folders for x in sorted((PACKAGE / folder).rglob("*.py"))]
     dotted = [".".join(x.relative_to(PACKAGE.parent).with_suffix("").parts) for x in files]
     names = tuple(name.removesuffix(".__init__") for name in dotted)
     for name in names:

@@ -19,6 +19,7 @@ import pickle
 import re
 import threading
 import time
+import types
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -56,11 +57,15 @@ UNWRITABLE = (
 def key_of(*parts: Any) -> str | None:
     """The key of what these values and the environment determine; None if there is none, or if
     nothing is kept in this process.
+
+    Args:
+      parts: the values; the functions among them are what a program is traced from.
     """
     if not keeps_programs():
         return None
     try:
-        return f"{text_of(parts)}\n{environment()}"
+        functions = [part for part in parts if isinstance(part, types.FunctionType)]
+        return f"{text_of(parts)}\n{environment(*functions)}"
     except NoKeyError:
         return None
 

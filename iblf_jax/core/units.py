@@ -23,8 +23,13 @@ from collections.abc import Mapping
 from fractions import Fraction
 from typing import Any, TypeAlias
 
+from iblf_jax.core.caches import memoised
+
 Exponents: TypeAlias = dict[str, Fraction]
 """Name of a factor of a unit -> its exponent."""
+TEXTS = 512
+"""Results that are kept of each function of texts: the metrics of a run have some fifty.  Tuples of
+units are no keys: a `ByLevel` equals a tuple of the same entries."""
 
 
 class ByLevel(tuple):
@@ -94,9 +99,8 @@ def resolved(unit: Unit, units: Mapping[str, Unit]) -> Unit:
         return type(unit)(resolved(entry, units) for entry in unit)
     if not isinstance(unit, PlantUnit):
         return unit
-    factors = exponents(unit.formula)
     found: Unit = "1"
-    for name, exponent in factors.items():
+    for name, exponent in _symbols(unit.formula):
         found = product(found, power(units.get(name, name), exponent))
     return found
 
@@ -105,6 +109,12 @@ def power(unit: Unit, exponent: int | Fraction) -> Unit:
     """A unit to a power."""
     if isinstance(unit, tuple):
         return type(unit)(power(entry, exponent) for entry in unit)
+    return _power_of_text(str(unit), Fraction(exponent))
+
+
+@memoised(TEXTS)
+def _power_of_text(unit: str, exponent: Fraction) -> str:
+    """A unit of one text to a power."""
     return written({name: exponent * k for name, k in exponents(unit).items()})
 
 
@@ -117,8 +127,14 @@ def product(first: Unit, second: Unit) -> Unit:
             count = len(several[0])
             rows = zip(_entries(first, kind, count), _entries(second, kind, count), strict=True)
             return kind(product(a, b) for a, b in rows)
-    total = exponents(str(first))
-    for name, exponent in exponents(str(second)).items():
+    return _product_of_texts(str(first), str(second))
+
+
+@memoised(TEXTS)
+def _product_of_texts(first: str, second: str) -> str:
+    """The product of two units of one text each."""
+    total = exponents(first)
+    for name, exponent in exponents(second).items():
         total[name] = total.get(name, Fraction(0)) + exponent
     return written(total)
 
@@ -133,6 +149,12 @@ def _entries(unit: Unit, kind: type, count: int) -> tuple:
 def per_second(unit: Unit) -> Unit:
     """The unit of a rate."""
     return product(unit, "1/s")
+
+
+@memoised(TEXTS)
+def _symbols(formula: str) -> tuple[tuple[str, Fraction], ...]:
+    """The symbols of a formula and their exponents."""
+    return tuple(exponents(formula).items())
 
 
 def exponents(unit: str) -> Exponents:

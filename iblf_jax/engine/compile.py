@@ -248,7 +248,8 @@ def shapes_of(leaves: list) -> tuple:
     return tuple((x.shape, x.dtype) for x in leaves)
 
 
-def _tree_of_shapes(structure: PyTreeDef, shapes: tuple) -> Any:
+def tree_of_shapes(structure: PyTreeDef, shapes: tuple) -> Any:
+    """A pytree of shapes and types (`shapes_of`) in place of arrays."""
     return jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(*shape) for shape in shapes])
 
 
@@ -282,7 +283,7 @@ def compiled_plan(
     Raises:
       StoppedError: as `first_that_works`; a plan without an executor would be kept.
     """
-    arguments = _tree_of_shapes(structure, shapes)
+    arguments = tree_of_shapes(structure, shapes)
 
     def programs(arguments: Any) -> tuple[StepProgram, StepProgram]:
         scenario, varied, folds, dt = arguments
@@ -302,8 +303,13 @@ def compiled_plan(
             executor.build(*step)
         return (executor.name,)
 
+    def built(executor: Executor) -> tuple[str, ...]:
+        """As `build`.  In a later process the kernels are those that the kept program names."""
+        parts = ("kernels of a batch", executor.name, request, machine, structure, shapes)
+        return kept_programs.computed_once(partial(build, executor), *parts)
+
     execution = plan_of_batch(request, arguments[1], machine)
-    return execution._replace(backends=first_that_works(execution, build, lambda: ()), warnings=())
+    return execution._replace(backends=first_that_works(execution, built, lambda: ()), warnings=())
 
 
 # --- single runs ---
@@ -346,7 +352,7 @@ def _plan_of_single_run(
     request: RunRequest, machine: Machine, structure: PyTreeDef, shapes: tuple
 ) -> SingleRunPlan:
     """As `plan_of_single_run`."""
-    inputs = _tree_of_shapes(structure, shapes)
+    inputs = tree_of_shapes(structure, shapes)
     execution = choose_plan(request, None, machine)
     if not execution.backends:
         return SingleRunPlan(execution, 0)

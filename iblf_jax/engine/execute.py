@@ -10,13 +10,14 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Collection, Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import programs
+from iblf_jax.core.caches import CACHE
 from iblf_jax.engine import registry
 from iblf_jax.engine.adjoint import Cotangents, ReverseRun
 from iblf_jax.engine.batch import (
@@ -35,12 +36,14 @@ from iblf_jax.engine.compile import (
     compiled_plan,
     first_that_works,
     inputs_of,
+    on_shapes,
     operations,
     plan_of_batch,
     run_by_executor,
     scan_of,
     shapes_of,
     structural_part,
+    tree_of_shapes,
 )
 from iblf_jax.engine.derivatives import (
     DerivativeSizes,
@@ -53,15 +56,20 @@ from iblf_jax.engine.linearization import jacobian_carry
 from iblf_jax.engine.loops import checkpointed, kernel_stepper, program_of, scan
 from iblf_jax.engine.outcome import Outcome
 from iblf_jax.engine.plan import ExecutionPlan, plan_of_jacobians, plan_of_states
-from iblf_jax.engine.registry import Executor
+from iblf_jax.engine.registry import Availability, Executor
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.structural_constants import constants_of
 from iblf_jax.engine.time_step import TimeStep, positions
+from iblf_jax.kernels import StoppedError, ToolchainError, UnsupportedError
 from iblf_jax.simulation.closed_loop import LoopState
 from iblf_jax.simulation.scenario import Scenario
 
 if TYPE_CHECKING:
+    from jax.tree_util import PyTreeDef
+
     from iblf_jax.simulation.metrics import Fold
+
+T = TypeVar("T")
 
 
 def run_batch(
@@ -89,29 +97,36 @@ def run_batch(
     """
     inputs = inputs_of(scenario, folds, dt, request)
     execution = plan_of_batch(request, varied, registry.machine())
-    return _run_planned(execution, inputs, varied, request)
+    return first_that_works(
+        execution,
+        lambda executor: _run_by_executor(executor, inputs, varied, request),
+        lambda: _run_by_scan(inputs, varied, request),
+    )
 
 
-def _run_planned(
-    execution: ExecutionPlan, inputs: Inputs, varied: Mapping[str, jax.Array], request: RunRequest
+def _run_by_executor(
+    executor: Executor, inputs: Inputs, varied: Mapping[str, jax.Array], request: RunRequest
 ) -> Outcome:
-    """Runs a batch as planned."""
+    """Runs a batch by an executor."""
 
     def run(run_steps: Stepper, batch: Batch) -> Outcome:
         return run_all(run_steps, batch, request)
 
-    def attempt(executor: Executor) -> Outcome:
-        batch = Batch.of(inputs, varied, request.constants)
-        return run_by_executor(executor, batch, request, run)
+    batch = Batch.of(inputs, varied, request.constants)
+    return run_by_executor(executor, batch, request, run)
 
-    def by_scan() -> Outcome:
-        return run(scan_of(inputs), Batch.of(inputs, varied))
 
-    return first_that_works(execution, attempt, by_scan)
+def _run_by_scan(inputs: Inputs, varied: Mapping[str, jax.Array], request: RunRequest) -> Outcome:
+    """Runs a batch by the scan."""
+    return run_all(scan_of(inputs), Batch.of(inputs, varied), request)
 
 
 class CompiledBatch(NamedTuple):
-    """The program of a batch, a function of the inputs to call inside `jit`; static."""
+    """The program of a batch, a function of the inputs to call inside `jit`; static.
+
+    The program is that of one executor or of the scan: it is `first_that_works` that falls back, so
+    that a program that is kept on the disk is the one that its key states.
+    """
 
     request: RunRequest
     execution: ExecutionPlan
@@ -121,6 +136,23 @@ class CompiledBatch(NamedTuple):
     def backend(self) -> str:
         """The backend on which the batch runs: "native", "gpu" or "vmap"."""
         return self.execution.backend
+
+    def first_that_works(self, call: Callable[[CompiledBatch], T]) -> T:
+        """The value of `call` for this batch, or for that of the scan if the executor fails; call
+        it outside of `jit`.
+
+        Args:
+          call: function of a batch, which compiles its program.
+        """
+
+        def attempt(executor: Executor) -> T:
+            with building():
+                return call(self)
+
+        def by_scan() -> T:
+            return call(self._replace(execution=self.execution._replace(backends=())))
+
+        return first_that_works(self.execution, attempt, by_scan)
 
     def __call__(
         self,
@@ -133,10 +165,16 @@ class CompiledBatch(NamedTuple):
 
         Args:
           scenario, varied, folds, dt: as `run_batch`.
+
+        Raises:
+          ToolchainError: the executor is not available.
+          UnsupportedError: the executor cannot express the step.
         """
         request = self.request._replace(record_every=None)
         inputs = inputs_of(scenario, folds, dt, request)
-        return _run_planned(self.execution, inputs, varied, request)
+        if not self.execution.backends:
+            return _run_by_scan(inputs, varied, request)
+        return _run_by_executor(registry.EXECUTORS[self.backend], inputs, varied, request)
 
     def positions(
         self,
@@ -151,24 +189,22 @@ class CompiledBatch(NamedTuple):
         Args:
           scenario, varied, dt: as `run_batch`.
           record_every: interval of the recorded instants.
+
+        Raises:
+          ToolchainError, UnsupportedError: as a call.
         """
         request = self.request._replace(record_every=record_every)
         inputs = inputs_of(scenario, (), dt, request)
         step = TimeStep(request.method, positions)
 
-        def run(run_steps: Stepper, batch: Batch) -> dict[str, jax.Array]:
-            carry = carry_without_linearization(batch, request.method)
-            return run_steps(step, batch, carry, request.instants, record_every)[1]
-
-        def attempt(executor: Executor) -> dict[str, jax.Array]:
+        if self.execution.backends:
             batch = Batch.of(inputs, varied, request.constants)
-            with building():
-                return run(kernel_stepper(executor), batch)
-
-        def by_scan() -> dict[str, jax.Array]:
-            return run(scan_of(inputs), Batch.of(inputs, varied))
-
-        return first_that_works(self.execution, attempt, by_scan)
+            run_steps = kernel_stepper(registry.EXECUTORS[self.backend])
+        else:
+            batch = Batch.of(inputs, varied)
+            run_steps = scan_of(inputs)
+        carry = carry_without_linearization(batch, request.method)
+        return run_steps(step, batch, carry, request.instants, record_every)[1]
 
 
 def compile_batch(
@@ -367,6 +403,11 @@ def _step_states(
     return first_that_works(execution, lambda executor: by(kernel_stepper(executor)), by_scan)
 
 
+FAILED_JACOBIANS = "failed Jacobians"
+"""Topic of `CACHE` for kernels of `sampled_jacobians` that could not be lowered or built, by
+executor, request, structure and shapes; this process does not try it again."""
+
+
 def sampled_jacobians(scenario: Scenario, times: jax.Array, states: LoopState) -> jax.Array:
     """The derivatives of `closed_loop.perturbed_rate` of a sampled loop at many states, by the
     kernel that linearizes runs; studies build the same one.
@@ -380,27 +421,70 @@ def sampled_jacobians(scenario: Scenario, times: jax.Array, states: LoopState) -
       (R, m, m), as `stability.jacobian`.
     """
     request = RunRequest(0)
-    if registry.default_backend().reason is None:
+    backend = registry.default_backend()
+    if backend.reason is None:
         request = request._replace(constants=constants_of(scenario))
-    return _sampled_jacobians(scenario, times, states, request=request)
+    leaves, structure = jax.tree.flatten((scenario, times, states))
+    shapes = shapes_of(leaves)
+
+    def by(name: str) -> jax.Array:
+        return _sampled_jacobians(scenario, times, states, backend=name, request=request)
+
+    def attempt(executor: Executor) -> jax.Array:
+        try:
+            with building():
+                return by(executor.name)
+        except (ToolchainError, UnsupportedError) as error:
+            if not isinstance(error, StoppedError):
+                CACHE.mark(FAILED_JACOBIANS, (executor.name, request, structure, shapes))
+            raise
+
+    execution = _plan_of_jacobians(request, backend, structure, shapes)
+    backends = tuple(
+        name
+        for name in execution.backends
+        if not CACHE.is_marked(FAILED_JACOBIANS, (name, request, structure, shapes))
+    )
+    return first_that_works(execution._replace(backends=backends), attempt, partial(by, "vmap"))
 
 
-@programs.jit(static_argnames="request", options=programs.SHORTEST_TO_COMPILE)
-def _sampled_jacobians(
-    scenario: Scenario, times: jax.Array, states: LoopState, *, request: RunRequest
-) -> jax.Array:
-    # Commands in transit have no influence, and their number would make another kernel.
+@CACHE.memoised(64)
+def _plan_of_jacobians(
+    request: RunRequest, backend: Availability, structure: PyTreeDef, shapes: tuple
+) -> ExecutionPlan:
+    """The plan of `sampled_jacobians`, for the structure of its arguments and the shapes of their
+    leaves.
+    """
+
+    def count(arguments: tuple[Scenario, jax.Array, LoopState]) -> int:
+        scenario, times, _ = arguments
+        return operations(inputs_of(_with_short_queue(scenario), (), times[0], request))
+
+    return plan_of_jacobians(lambda: on_shapes(count, tree_of_shapes(structure, shapes)), backend)
+
+
+def _with_short_queue(scenario: Scenario) -> Scenario:
+    """A sampled loop with at most one command in transit.  They have no influence on a derivative,
+    and their number would make another kernel.
+    """
     sampling: Any = scenario.sampling
     sampling = dataclasses.replace(sampling, queue=min(sampling.queue, 1))
-    scenario = dataclasses.replace(scenario, sampling=sampling)
+    return dataclasses.replace(scenario, sampling=sampling)
+
+
+@programs.jit(
+    static_argnames=("backend", "request"), options=programs.SHORTEST_TO_COMPILE, kept=True
+)
+def _sampled_jacobians(
+    scenario: Scenario, times: jax.Array, states: LoopState, *, backend: str, request: RunRequest
+) -> jax.Array:
+    """As `sampled_jacobians`, by the executor of this name or by the scan."""
+    scenario = _with_short_queue(scenario)
     inputs = inputs_of(scenario, (), times[0], request)
     starts = {"initial.q": jnp.repeat(scenario.initial.q[None], len(times), axis=0)}
     batch = Batch.of(inputs, starts, request.constants)
     carry = jax.vmap(partial(jacobian_carry, scenario))(times, states)
-    execution = plan_of_jacobians(operations(inputs), registry.default_backend())
-
-    def by(run_steps: Stepper) -> jax.Array:
-        return jacobians(run_steps, batch, carry)
-
-    by_scan = partial(by, partial(scan, rolled=True))
-    return first_that_works(execution, lambda executor: by(kernel_stepper(executor)), by_scan)
+    run_steps: Stepper = partial(scan, rolled=True)
+    if backend in registry.EXECUTORS:
+        run_steps = kernel_stepper(registry.EXECUTORS[backend])
+    return jacobians(run_steps, batch, carry)

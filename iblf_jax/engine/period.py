@@ -73,7 +73,7 @@ def radius_at(scenario: Scenario, period: float, times: np.ndarray) -> float:
     )
 
 
-@programs.jit(options=programs.SHORTEST_TO_COMPILE)
+@programs.jit(options=programs.SHORTEST_TO_COMPILE, kept=True)
 def _sampled_states(scenario: Scenario, instants: jax.Array) -> LoopState:
     """The states at the start and along the reference after the law has run, (T, ...): the torque
     of an instant is the one that the law commands there.
@@ -86,7 +86,7 @@ def _sampled_states(scenario: Scenario, instants: jax.Array) -> LoopState:
     return jax.vmap(sampled)(instants, start_and_along(scenario, instants[1:]))
 
 
-@programs.jit(options=programs.UNOPTIMISED)
+@programs.jit(options=programs.UNOPTIMISED, kept=True)
 def _maps(
     scenario: Scenario, states: LoopState, derivatives: jax.Array
 ) -> tuple[jax.Array, jax.Array]:

@@ -8,6 +8,7 @@ The limits are in `thresholds`.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 from iblf_jax.engine import registry, thresholds
@@ -78,15 +79,15 @@ def plan_of_states(operations: int, backend: Availability) -> ExecutionPlan:
     return ExecutionPlan(backends, reports_unsupported=False)
 
 
-def plan_of_jacobians(operations: int, backend: Availability) -> ExecutionPlan:
-    """The plan of the Jacobians at many states.
+def plan_of_jacobians(count_operations: Callable[[], int], backend: Availability) -> ExecutionPlan:
+    """The plan of the Jacobians at many states; their operations are counted where they decide.
 
     On a CPU their kernel is built for a long loop, too: it takes 3 s of processor time for an arm
     of six joints, XLA's program of the same loop 7 s.
     """
     if backend.reason is None and backend.name == "native":
         return ExecutionPlan((backend.name,), reports_unsupported=False)
-    return plan_of_states(operations, backend)
+    return plan_of_states(count_operations(), backend)
 
 
 def requested_executors(backend: str, machine: Machine) -> tuple[tuple[str, ...], tuple[str, ...]]:

@@ -183,7 +183,7 @@ def _one_step(scenario: Scenario, times: jax.Array, dt: jax.Array, pair: Pair, m
     return Pair(pair.step + 1, coarse, fine, accuracy, difference, nearest, going)
 
 
-@programs.jit(options=programs.SHORTEST_TO_COMPILE)
+@programs.jit(options=programs.SHORTEST_TO_COMPILE, kept=True)
 def start_and_along(scenario: Scenario, times: jax.Array) -> LoopState:
     """The state at the start, and those of a loop that follows its reference exactly; time axis
     first, (1 + T, ...).

@@ -39,6 +39,8 @@ from iblf_jax.core.units import (
     UNCERTAIN,
     VELOCITY,
     PlantUnit,
+    as_text,
+    resolved,
 )
 from iblf_jax.simulation.error_estimate import ACCURACY_UNITS
 from iblf_jax.simulation.scenario import Scenario, fit_joints
@@ -51,7 +53,7 @@ from iblf_jax.simulation.signals import (
     least_xi_margin,
     margin_of,
 )
-from iblf_jax.simulation.units import unit_text
+from iblf_jax.simulation.units import symbols_of
 from iblf_jax.world import plants
 
 
@@ -858,7 +860,9 @@ def metric_units(folds: Sequence[Fold], scenario: Scenario) -> tuple[tuple[str, 
     pairs = [pair for fold in folds for pair in fold.units.items()]
     if plants.has_modes(scenario.plant):
         pairs += plants.SWITCHING_UNITS.items()
-    return tuple((name, unit_text(scenario, unit)) for name, unit in (*pairs, *ACCURACY_UNITS))
+    symbols = symbols_of(scenario)
+    each = (*pairs, *ACCURACY_UNITS)
+    return tuple((name, as_text(resolved(unit, symbols))) for name, unit in each)
 
 
 def standard() -> tuple[Fold, ...]:

@@ -32,11 +32,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.core import checks, programs
+from iblf_jax.core import checks, kept_programs, programs
 from iblf_jax.core.devices import default_devices
 from iblf_jax.core.status import Status, flag
 from iblf_jax.core.thread_options import with_options_of_caller
-from iblf_jax.engine import block_size, blocks_in_flight, wait_until_ready
+from iblf_jax.engine import CompiledBatch, block_size, blocks_in_flight, wait_until_ready
 from iblf_jax.studies.dataset import DRAWN
 from iblf_jax.studies.draws import CaseInputs
 from iblf_jax.studies.options import LocalExecutor
@@ -61,9 +61,30 @@ def named_arrays(results: BlockResults) -> dict[str, Any]:
 
 def result_shapes(prepared: PreparedStudy) -> BlockResults:
     """Shapes and types of the results of one block."""
-    # The same call as in `run_blocks`, so that it is traced once.
-    block = partial(_execute, program=prepared.program, record_every=None)
-    return jax.eval_shape(block, prepared.shared, prepared.inputs_of(np.arange(block_size())))
+    inputs = prepared.inputs_of(np.arange(block_size()))
+    leaves, structure = jax.tree.flatten((prepared.shared, inputs))
+    types = tuple([(x.shape, x.dtype, x.weak_type) for x in map(jax.typeof, leaves)])
+
+    def shapes() -> BlockResults:
+        found = traced(prepared, inputs).out_info
+        return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), found)
+
+    return kept_programs.computed_once(shapes, result_shapes, prepared.program, structure, types)
+
+
+def traced(prepared: PreparedStudy, inputs: CaseInputs) -> Any:
+    """The trace of the program of a block, which is that of `run_blocks`.
+
+    Args:
+      prepared: what to run.
+      inputs: those of a block.
+    """
+
+    def by(batch: CompiledBatch) -> Any:
+        program = prepared.program._replace(batch=batch)
+        return _execute.trace(prepared.shared, inputs, program=program, record_every=None)
+
+    return prepared.program.batch.first_that_works(by)
 
 
 def case_bytes(prepared: PreparedStudy) -> float:
@@ -81,7 +102,7 @@ def _without_inadmissible(admissible: jax.Array, x: jax.Array) -> jax.Array:
     return jnp.where(mask, x, jnp.asarray(mark, x.dtype))
 
 
-@programs.jit(static_argnames=("program", "record_every"))
+@programs.jit(static_argnames=("program", "record_every"), kept=True)
 def _execute(
     shared: SharedInputs,
     inputs: CaseInputs,
@@ -131,13 +152,9 @@ def run_blocks(
     if not first_blocks:
         return
     devices = devices[: len(first_blocks)]
-    execute = partial(_execute, program=prepared.program, record_every=record_every)
     copies = [jax.device_put(prepared.shared, device) for device in devices]
-    if len(devices) > 1:
-        inputs = prepared.inputs_of(np.arange(size))
-        _compile(execute, copies, [jax.device_put(inputs, device) for device in devices])
 
-    def compute(block: int, device: int) -> tuple[Any, int]:
+    def compute(execute: partial, block: int, device: int) -> tuple[Any, int]:
         """The results of a block on the device of this number, and the bytes that it took."""
         cases = np.arange(block * size, (block + 1) * size)
         inputs = jax.device_put(prepared.inputs_of(cases), devices[device])
@@ -145,13 +162,23 @@ def run_blocks(
         wait_until_ready(out)
         return jax.tree.map(np.asarray, out), sum(x.nbytes for x in jax.tree.leaves((inputs, out)))
 
-    # The first block runs before the others: it compiles the program and gives the bytes of one.
-    first, bytes_taken = compute(first_blocks[0], 0)
+    def first_of(batch: CompiledBatch) -> tuple[partial, Any, int]:
+        """The program of blocks by a batch, and what `compute` returns of the first block."""
+        program = prepared.program._replace(batch=batch)
+        execute = partial(_execute, program=program, record_every=record_every)
+        if len(devices) > 1:
+            inputs = prepared.inputs_of(np.arange(size))
+            _compile(execute, copies, [jax.device_put(inputs, device) for device in devices])
+        return execute, *compute(execute, first_blocks[0], 0)
+
+    # The first block runs before the others: it compiles the program, on the scan if the executor
+    # fails, and gives the bytes of one.
+    execute, first, bytes_taken = prepared.program.batch.first_that_works(first_of)
     yield first_blocks[0], first
     in_flight = blocks_in_flight(here.chunk, here.memory, bytes_taken, len(devices))
     # Each block in flight has a thread, which draws, starts or copies results while the block of
     # another thread is integrated.
-    compute_in_pool = with_options_of_caller(compute)
+    compute_in_pool = with_options_of_caller(partial(compute, execute))
     pool = ThreadPoolExecutor(in_flight, "block")
     waiting = deque[tuple[int, Future]]()
     try:

@@ -18,7 +18,7 @@ from iblf_jax.engine import block_size, uses_host_compiler
 from iblf_jax.kernels import built_for
 from iblf_jax.simulation.paths import get, parameters, unit_at
 from iblf_jax.simulation.scenario import Scenario
-from iblf_jax.studies.blocks import _execute
+from iblf_jax.studies.blocks import traced
 from iblf_jax.studies.study_setup import PreparedStudy
 from iblf_jax.studies.sweep_points import Points
 
@@ -83,9 +83,8 @@ def _digest(prepared: PreparedStudy) -> str:
     metric; of a program that cannot be described, a text that no other store has.
     """
     inputs = prepared.inputs_of(np.arange(block_size()))
-    traced = _execute.trace(prepared.shared, inputs, program=prepared.program)
     try:
-        return program_digest(traced)
+        return program_digest(traced(prepared, inputs))
     except CallsPythonError as error:
         return f"calls Python by {error}, {secrets.token_hex(8)}"
 

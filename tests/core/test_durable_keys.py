@@ -18,6 +18,7 @@ from iblf_jax.engine.structural_constants import StructuralConstants
 from iblf_jax.kernels import Known
 from iblf_jax.simulation import stability
 from iblf_jax.simulation.scenario import canonical
+from iblf_jax.studies import blocks, designs, draws
 
 DIFFERENT = (
     *(None, (), [], ((),), "None", "()"),
@@ -112,6 +113,22 @@ def test_code_of_the_package_that_was_replaced(monkeypatch, place):
     monkeypatch.setattr(*place, lambda *args: None)
     with pytest.raises(NoKeyError):
         environment()
+
+
+def test_code_of_studies_counts_for_functions_in_that_folder(monkeypatch):
+    traced, other = blocks.result_shapes, canonical
+    before = environment(other), environment(traced)
+    assert before[0] == environment() != before[1]
+    monkeypatch.setattr(designs, "MAX_RUNS", 2 * designs.MAX_RUNS)
+    assert environment(other) == before[0]
+    assert environment(traced) != before[1]
+    monkeypatch.setattr(draws, "draw", lambda *args: None)
+    with pytest.raises(NoKeyError):
+        environment(traced)
+    monkeypatch.undo()
+    assert (environment(other), environment(traced)) == before
+    with pytest.raises(NoKeyError, match="tuning"):
+        environment(ij.tune)
 
 
 def test_options_of_jax_and_of_xla(monkeypatch):

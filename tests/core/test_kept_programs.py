@@ -11,8 +11,9 @@ import pytest
 
 from iblf_jax.core import kept_programs
 
-SCRIPT = """
+LISTEN = """
 import hashlib
+import numpy as np
 import jax
 jax.config.update("jax_enable_x64", True)
 traced = set()
@@ -21,46 +22,120 @@ def listen(event, seconds, **of):
         traced.add(of.get("fun_name"))
 jax.monitoring.register_event_duration_secs_listener(listen)
 import iblf_jax as ij
+def digest(tree):
+    content = b"".join(np.asarray(x).tobytes() for x in jax.tree.leaves(tree))
+    return hashlib.sha256(content).hexdigest()
+@ij.component
+class Users(ij.disturbances.Disturbance):
+    def torque(self, t, q, dq, plant, model):
+        return -20.0 * q
+    def jump_times(self):
+        return jax.numpy.zeros(0)
 paper = ij.presets.zhang_yan_2024()
-run = ij.simulate(paper, duration=0.05, dt=1e-3)
-content = b"".join(jax.numpy.asarray(x).tobytes() for x in jax.tree.leaves(run))
-print(hashlib.sha256(content).hexdigest())
-print(*sorted({"_initial_values", "_initialize", "_all_steps", "_finalized"} & traced))
+def printed(cases, value, functions):
+    for case in cases:
+        traced.clear()
+        print(value(case), *sorted(functions & traced), sep=",")
 """
+RUN = """
+run = lambda scenario: digest(ij.simulate(scenario, duration=0.05, dt=1e-3))
+printed([paper], run, {"_initial_values", "_initialize", "_all_steps", "_finalized"})
+"""
+RADII = """
+from iblf_jax.engine.period import radius_at
+from iblf_jax.simulation.scenario import canonical
+sampled = ij.with_parts(paper, sampling=ij.Sampling(period=1e-3))
+cases = [
+    sampled,
+    ij.with_parts(paper, sampling=ij.Sampling(period=1e-3, observer="euler")),
+    ij.with_parameters(sampled, {"controller.weight": 0.5}),
+    ij.with_parts(sampled, disturbance=Users()),
+]
+radius = lambda scenario: radius_at(canonical(scenario), 2e-3, np.zeros(0)).hex()
+printed(cases, radius, {"_maps", "_sampled_jacobians", "_sampled_states"})
+"""
+"""The second loop differs from the first one in a static field, the third one in a constant that is
+compiled in, and the fourth one has code of a user."""
+STUDIES = """
+users = ij.with_parts(paper, disturbance=Users())
+cases = [
+    (paper, {"plant.mass[1]": ij.factor(ij.uniform(0.9, 1.1))}),
+    (paper, {"plant.mass[0]": ij.factor(ij.uniform(0.9, 1.1))}),
+    (users, {"plant.mass[1]": ij.factor(ij.uniform(0.9, 1.1))}),
+]
+def results(case):
+    study = ij.monte_carlo(*case, runs=4, duration=0.02, dt=1e-3, progress=False)
+    bands = study.bands(samples=10)
+    metrics = list(study.metrics.values())
+    return digest((metrics, study.samples, study.status, bands.q.values, bands.time.values))
+printed(cases, results, {"_execute"})
+"""
+"""The second study draws another parameter, and the third one has code of a user."""
 
 
-def printed(folder, **variables):
-    """The digest of a run in a process of its own, and the functions that were traced."""
+def printed(script, folder, **variables):
+    """What a script prints in a process of its own: values, and what was traced for each."""
     environment = os.environ | {"XDG_CACHE_HOME": str(folder), **variables}
-    found = subprocess.run(
-        [sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=True, env=environment
-    )
-    digest, traced = found.stdout.splitlines()
-    return digest, traced.split()
+    command = [sys.executable, "-c", LISTEN + script]
+    found = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+    rows = [line.split(",") for line in found.stdout.splitlines()]
+    return [row[0] for row in rows], [row[1:] for row in rows]
 
 
-@pytest.mark.slow
-def test_a_second_process_traces_nothing_and_a_damaged_entry_is_made_again(tmp_path):
-    kept = {"JAX_ENABLE_COMPILATION_CACHE": "1"}
-    everything = ["_all_steps", "_finalized", "_initial_values", "_initialize"]
-    digest, traced = printed(tmp_path, **kept)
-    assert traced == everything
-    entries = sorted((tmp_path / "iblf_jax").glob("*.program"))
-    assert len(entries) == 5
-    assert printed(tmp_path, **kept) == (digest, [])
-    # Other options are another environment.
-    assert printed(tmp_path, **kept, IBLF_JAX_THREADS="3") == (digest, everything)
+KEPT = {"JAX_ENABLE_COMPILATION_CACHE": "1"}
+NOTHING_KEPT = {"JAX_ENABLE_COMPILATION_CACHE": "0"}
+
+
+def damage(folder):
+    """Changes a bit of every entry, and returns how many there are."""
+    entries = sorted((folder / "iblf_jax").glob("*.program"))
     for entry in entries:
         content = bytearray(entry.read_bytes())
         content[len(content) // 2] ^= 1
         entry.write_bytes(content)
-    assert printed(tmp_path, **kept) == (digest, everything)
+    return len(entries)
+
+
+@pytest.mark.slow
+def test_a_second_process_traces_nothing_and_a_damaged_entry_is_made_again(tmp_path):
+    everything = ["_all_steps", "_finalized", "_initial_values", "_initialize"]
+    digest, traced = printed(RUN, tmp_path, **KEPT)
+    assert traced == [everything]
+    assert printed(RUN, tmp_path, **KEPT) == (digest, [[]])
+    # Other options are another environment.
+    assert printed(RUN, tmp_path, **KEPT, IBLF_JAX_THREADS="3") == (digest, traced)
+    assert damage(tmp_path) == 10
+    assert printed(RUN, tmp_path, **KEPT) == (digest, traced)
     # Without its kernels, a program is compiled again.
     for kernel in (tmp_path / "iblf_jax").glob("*.so"):
         kernel.unlink()
-    found, traced = printed(tmp_path, **kept)
+    found, (traced,) = printed(RUN, tmp_path, **KEPT)
     assert found == digest
     assert "_all_steps" in traced
+
+
+@pytest.mark.slow
+def test_the_search_for_a_period_reads_its_programs(tmp_path):
+    """Only the kernel of the Jacobians depends on the constants that are compiled in."""
+    everything = ["_maps", "_sampled_jacobians", "_sampled_states"]
+    expected, traced = printed(RADII, tmp_path, **NOTHING_KEPT)
+    assert len(set(expected)) == 4
+    assert traced == [everything, everything, ["_sampled_jacobians"], everything]
+    assert printed(RADII, tmp_path, **KEPT) == (expected, traced)
+    assert printed(RADII, tmp_path, **KEPT) == (expected, [[], [], [], everything])
+    assert damage(tmp_path)
+    assert printed(RADII, tmp_path, **KEPT) == (expected, traced)
+
+
+@pytest.mark.slow
+def test_a_study_and_its_bands_read_their_programs(tmp_path):
+    expected, traced = printed(STUDIES, tmp_path, **NOTHING_KEPT)
+    assert len(set(expected)) == 3
+    assert traced == [["_execute"]] * 3
+    assert printed(STUDIES, tmp_path, **KEPT) == (expected, traced)
+    assert printed(STUDIES, tmp_path, **KEPT) == (expected, [[], [], ["_execute"]])
+    assert damage(tmp_path)
+    assert printed(STUDIES, tmp_path, **KEPT) == (expected, traced)
 
 
 @pytest.fixture

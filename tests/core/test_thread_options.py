@@ -12,7 +12,10 @@ import study_cases as cases
 from jax._src import config as jax_config
 
 from iblf_jax.core import thread_options
+from iblf_jax.engine import CompiledBatch, RunRequest
+from iblf_jax.engine.plan import ExecutionPlan
 from iblf_jax.studies import blocks, workers
+from iblf_jax.studies.study_setup import StudyProgram
 
 VALUES = {
     "jax_default_device": (None, "cpu"),
@@ -43,7 +46,7 @@ NOT_TRANSFERRED = {
 class Prepared:
     """The members of a prepared study that `run_blocks` reads, without a computation."""
 
-    program = None
+    program = StudyProgram((), CompiledBatch(RunRequest(1), ExecutionPlan((), False)))
     shared = None
 
     def inputs_of(self, cases):

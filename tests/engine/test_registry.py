@@ -22,6 +22,7 @@ from iblf_jax.engine import (
     registry,
     single_run,
 )
+from iblf_jax.engine.period import radius_at
 from iblf_jax.kernels import StoppedError, ToolchainError, UnsupportedError
 from iblf_jax.simulation.scenario import canonical
 
@@ -208,6 +209,49 @@ def test_what_cannot_be_loaded_runs_by_the_scan(scenario, monkeypatch, run, reas
     expected = ij.simulate(scenario, **SHORT, backend="vmap")
     np.testing.assert_array_equal(found.q, expected.q)
     np.testing.assert_array_equal(again.q, expected.q)
+
+
+@pytest.mark.slow
+@needs_compiler
+def test_a_study_falls_back_outside_of_its_program(scenario, monkeypatch):
+    """The program of an executor is never that of the scan, which would be kept under its name."""
+    broken = registry.Executor(
+        *("broken", (devices.platform(),), calls_what_xla_does_not_know),
+        *(lambda: None, native.build),
+    )
+    perturbed = {"controller.Kp": ij.factor(ij.uniform(0.9, 1.1))}
+    expected = ij.monte_carlo(scenario, perturbed, runs=3, **SHORT, backend="vmap")
+    monkeypatch.setattr(registry, "EXECUTORS", {broken.name: broken})
+    CACHE.clear(compile.WARNINGS)
+    with pytest.warns(compile.BackendWarning, match=r"XLA failed: .*running on vmap"):
+        found = ij.monte_carlo(scenario, perturbed, runs=3, **SHORT)
+    for name, values in expected.metrics.items():
+        np.testing.assert_array_equal(found.metrics[name], values)
+
+
+@pytest.mark.slow
+@needs_compiler
+def test_jacobians_of_a_sampled_loop_fall_back_once(scenario, monkeypatch):
+    """Periods that are tried one after the other try a broken executor once."""
+    calls = []
+
+    def counted(*arguments):
+        calls.append("run")
+        return calls_what_xla_does_not_know(*arguments)
+
+    sampled = canonical(ij.with_parts(scenario, sampling=ij.Sampling(period=1e-3)))
+    monkeypatch.setattr(registry, "EXECUTORS", {})
+    expected = radius_at(sampled, 2e-3, np.zeros(0))
+    broken = registry.Executor("broken", (devices.platform(),), counted, lambda: None, native.build)
+    monkeypatch.setattr(registry, "EXECUTORS", {broken.name: broken})
+    CACHE.clear(compile.WARNINGS)
+    with pytest.warns(compile.BackendWarning, match=r"XLA failed: .*running on vmap"):
+        found = radius_at(sampled, 2e-3, np.zeros(0))
+    assert calls
+    calls.clear()
+    assert radius_at(sampled, 2e-3, np.zeros(0)) == found
+    assert calls == []
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 
 def test_an_error_of_xla_is_one_line():

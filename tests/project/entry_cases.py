@@ -43,7 +43,8 @@ INTERVAL = {"plant.mass": ij.factor(ij.interval(0.9, 1.1))}
 TRACKING = ij.objectives.tracking(scale=1.0)
 TUBE = ij.bounds.tube_at(WEAK.reference, WEAK.bounds[0], 0.1)
 RUNS = (
-    *("engine.simulate.run_one", "studies.blocks._execute", "engine.explain.instructions"),
+    *("engine.simulate.run_one", "engine.explain.instructions"),
+    *("studies.blocks._execute", "studies.blocks.traced"),
     *("tuning.problem.rollouts", "tuning.evaluation.Evaluator.__call__", "tuning.result._slice"),
     *("tuning._falsify._margins", "certificates._certify._certificate_of"),
     *("proofs._prove.problem_of", "plotting._style.new_figure"),

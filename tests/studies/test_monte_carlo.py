@@ -72,6 +72,7 @@ def test_as_many_blocks_are_made_beside_each_other_as_are_in_flight(
         finally:
             now.pop()
 
+    counted.trace = execute_block.trace
     monkeypatch.setattr(blocks, "_execute", counted)
     again = cases.study(
         runs=256 * (1 + sizes.MAX_IN_FLIGHT), executor=ij.studies.LocalExecutor(chunk=chunk)
