@@ -105,11 +105,11 @@ def tune(
 
     With the default solver and effort, the tuning evaluates 1,024 points besides the scenario's
     gains without derivatives.  It begins searches at up to 32 of these points, of which those that
-    differ continue after five steps, and the better third of these after every five further ones.
-    This takes about 350 evaluations with derivatives, and more if the search finds no gains that
-    keep the requirements, if it does not converge, or if only one start came within 0.5 % of the
-    best objective.  Starts whose objective changes by more than 0.5 % at a quarter of the time step
-    do not count.
+    differ continue after five and ten steps, and the better third of these after fifteen and every
+    five further ones.  This takes about 400 evaluations with derivatives, and more if the search
+    finds no gains that keep the requirements, if it does not converge, or if only one start came
+    within 0.5 % of the best objective.  Starts whose objective changes by more than 0.5 % at a
+    quarter of the time step do not count.
 
     The requirements of the result are evaluated again at half the time step.  If one of them is
     then broken by more than `step_check.STEP_TOLERANCE`, a short search at dt / 2 follows, and its

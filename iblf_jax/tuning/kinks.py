@@ -23,14 +23,15 @@ from __future__ import annotations
 import numpy as np
 
 from iblf_jax.tuning.parameters import Box
-from iblf_jax.tuning.solvers import SearchSpace, quadratic
+from iblf_jax.tuning.solvers import SearchSpace
 from iblf_jax.tuning.solvers.sqp import (
     MIN_PENALTY,
     PENALTY_FACTOR,
     Point,
     Step,
+    Subproblem,
     positive_definite,
-    subproblem,
+    subproblems,
     with_nearby_pieces,
 )
 
@@ -74,15 +75,14 @@ def step_between_kinks(
         for other, point in nearby
     ]
     space, here = with_nearby_pieces(space, here, moved)
-    task = subproblem(
+    requested = Subproblem(
         here.gradient,
         positive_definite(here.matrix, float(np.max(np.abs(here.matrix)))),
         np.maximum(space.box.low - z, -reach),
         np.minimum(space.box.high - z, reach),
-        space.constraints,
         here.pieces,
         here.piece_gradients,
         PENALTY_FACTOR**2 * MIN_PENALTY * max(1e-3, abs(here.loss)),
     )
-    (step,) = quadratic.together([task])
+    (step,) = subproblems(space.constraints, [requested])
     return step

@@ -90,9 +90,9 @@ class Effort:
     """How much a tuning evaluates at most.
 
     All starts take `selection` steps, those that have not come near a better one take as many
-    again, the better third of these takes as many again, and so on until the best one is left.
-    Until then a search takes at most 405 evaluations with derivatives with the defaults: five steps
-    each of 32, 32, 11, 4 and 2 starts.
+    again, and so once more, the better third of these takes as many again, and so on until the best
+    one is left.  Until then a search takes at most 565 evaluations with derivatives with the
+    defaults: five steps each of 32, 32, 32, 11, 4 and 2 starts.
 
     Args:
       values: number of points that are evaluated without derivatives to find the starts.  With many
@@ -102,7 +102,7 @@ class Effort:
         six.
       iterations: largest number of steps of the solver in each phase of the search.  A step
         evaluates every start that is still active.
-      selection: number of steps after which starts near better ones end, and from the second time
+      selection: number of steps after which starts near better ones end, and from the third time
         on all but the better third.
       second_starts: number of starts of a second search around the best gains of the first one,
         chosen from a third as many points; if not given, 12 where only one of more than six starts

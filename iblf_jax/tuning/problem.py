@@ -258,6 +258,8 @@ class TuningProblem:
 
     def sampled_too_slowly(self, z: np.ndarray) -> bool:
         """Whether the law's sampling period is too long for the gains at z, (p,)."""
+        if self.scenario.sampling is None:
+            return False
         values = values_at(self.blocks, jnp.asarray(z))
         return sampled_too_slowly(with_parameters(self.scenario, values))
 

@@ -38,7 +38,7 @@ AT_KINK = "converged at a kink: the slope of a requirement jumps from one peak t
 nearby gains are added."""
 FEW_STARTS_NEAR = "an optimum that few starts came near: better ones may exist"
 """`TuneResult.stopped` where the conditions of an optimum hold as for "converged", and fewer than a
-quarter of many starts came within 0.5 % of the objective."""
+third of many starts came within 0.5 % of the objective."""
 STUCK = "the solver ended at gains where the conditions of an optimum do not hold"
 """`TuneResult.stopped` where the solver has converged by its own criterion at gains that keep the
 requirements, but the conditions of an optimum do not hold."""

@@ -124,6 +124,8 @@ COARSE_STEPS = 6
 enough to compare the starts."""
 KEPT = 3
 """One of so many starts continues after a selection."""
+SELECTIONS_BY_DISTANCE = 2
+"""Number of selections in which only starts end that have come near a better one."""
 OPTIMISE, REPAIR, SECOND_SEARCH = range(3)
 """The phases of a search, in order."""
 REPAIR_STEPS = 30
@@ -141,10 +143,10 @@ region around one local minimum."""
 
 SAME_OBJECTIVE = 0.005
 """Largest difference from the best objective, relative to it, of a start that confirms it."""
-CONFIRMING_SHARE = 0.25
+CONFIRMING_SHARE = 1 / 3
 """Smallest share of the starts that come within SAME_OBJECTIVE of the best objective for which the
-search has converged.  Of one tuning of a sampled computed torque, four of 32 starts ended in a
-valley 3.7 % above the best."""
+search has converged.  Of one tuning of two links, eight of 32 starts ended in a valley 4.5 % above
+the best."""
 STARTS_IF_SINGLE = 12
 """Number of starts of the second search where no other start confirms the best objective."""
 STEP_FACTOR = 4.0
@@ -709,9 +711,10 @@ class Search:
         """Retires starts after every `selection` steps of the phase: those that have come near a
         better one, as they will end where that one ends, and all but the better third.
 
-        The better third is only determined from the second time on, as the order of the starts
-        says little after the first steps: on a problem of six gains the only start that ended in
-        the best valley was the 23rd of 32 then, and the first one at the second selection.
+        The better third is only determined after `SELECTIONS_BY_DISTANCE` selections, as the order
+        of the starts says little after the first steps: on a problem of six gains the only start
+        that ended in the best valley was the 23rd of 32 after five steps, the 28th after ten and
+        the first one after fifteen.
         """
         state = self.state
         if self.strategy is None or state.phase == REPAIR:
@@ -724,7 +727,7 @@ class Search:
         for s in order:
             if not np.any(is_near(state.best_z[kept], state.best_z[s], box)):
                 kept.append(s)
-        if state.phase_steps > self.strategy.selection:
+        if state.phase_steps > SELECTIONS_BY_DISTANCE * self.strategy.selection:
             kept = kept[: checks.ceil_div(len(order), KEPT)]
         self.retire(sorted(set(order) - set(kept)))
 

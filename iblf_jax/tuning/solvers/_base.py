@@ -65,11 +65,11 @@ class Constraints(NamedTuple):
         """G_r, (R,), from the pieces' values, (B, M)."""
         found = np.zeros(len(self.worst))
         for r, k in enumerate(self.worst):
-            by_run = pieces[:, self.owner == r].max(axis=1)
+            own = pieces[:, self.owner == r]
             if k == 1:
-                found[r] = by_run.max()
+                found[r] = own.max()
             else:
-                found[r] = np.sort(by_run)[-k:].mean()
+                found[r] = np.sort(own.max(axis=1))[-k:].mean()
         return found
 
 

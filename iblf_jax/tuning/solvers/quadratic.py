@@ -9,8 +9,7 @@ depends on how far the predictor came (corrector).
 
 Several programmes are solved together, as arrays with the programmes first, because the calls of
 NumPy for an iteration of a small programme take much longer than its arithmetic: 32 random
-programmes of 11 unknowns and about 50 rows take four times as long as one of them.  `together` runs
-algorithms that need one programme after another side by side.
+programmes of 11 unknowns and about 50 rows take four times as long as one of them.
 
 Source: S. Mehrotra, SIAM J. Optim. 2 (1992) 575-601; J. Nocedal, S. J. Wright, Numerical
 Optimization, 2nd ed., algorithm 16.4.
@@ -18,12 +17,9 @@ Optimization, 2nd ed., algorithm 16.4.
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
-
-T = TypeVar("T")
 
 MAX_ITERATIONS = 60
 """Iterations; about fifteen are needed."""
@@ -31,65 +27,52 @@ PRECISION = 1e-11
 """Of all conditions, relative to the numbers of the programme."""
 
 
-class Programme(NamedTuple):
-    """The arrays of one programme."""
+class Programmes(NamedTuple):
+    """The arrays of N programmes.
+
+    Programmes with fewer rows or unknowns than others are filled up with rows 0 <= 1 and with
+    unknowns whose entries are 0, and which are 0 in the solution.
+    """
 
     H: np.ndarray
-    """(n, n), positive semidefinite."""
+    """(N, n, n), positive semidefinite."""
     c: np.ndarray
-    """(n,)."""
+    """(N, n)."""
     A: np.ndarray
-    """(m, n); its rows bound x."""
+    """(N, m, n); its rows bound x."""
     b: np.ndarray
-    """(m,)."""
+    """(N, m)."""
 
 
-class Solution(NamedTuple):
-    """The solution of one programme."""
+class Solutions(NamedTuple):
+    """The solutions of N programmes."""
 
     x: np.ndarray
-    """(n,)."""
+    """(N, n)."""
     y: np.ndarray
-    """Multipliers of the rows, (m,)."""
+    """Multipliers of the rows, (N, m)."""
 
 
-Task = Generator[Programme, Solution, T]
-"""An algorithm that yields programmes, receives their solutions, and returns a T."""
-
-
-def together(tasks: Sequence[Task[T]]) -> list[T]:
-    """What some algorithms return, whose programmes are solved side by side."""
-    results: dict[int, T] = {}
-    solutions: dict[int, Solution | None] = dict.fromkeys(range(len(tasks)))
-    while solutions:
-        programmes = {}
-        for i, solution in solutions.items():
-            try:
-                programmes[i] = tasks[i].send(solution)  # type: ignore[arg-type]
-            except StopIteration as end:
-                results[i] = end.value
-        solutions = dict(zip(programmes, solve(list(programmes.values())), strict=True))
-    return [results[i] for i in range(len(tasks))]
-
-
-def solve(programmes: Sequence[Programme]) -> list[Solution]:
+def solve(programmes: Programmes) -> Solutions:
     """The solution of each programme."""
-    if not programmes:
-        return []
-    scale = np.array([max(np.abs(q.c).max(), np.abs(q.H).max(), 1e-300) for q in programmes])
-    H, c, A, b = _stacked(programmes, scale)
+    H, c, A, b = programmes
+    size = np.maximum(np.abs(c).max(axis=1), np.abs(H).max(axis=(1, 2)))
+    scale = np.maximum(size, 1e-300)
+    # The identity makes matrices definite that are semidefinite, or of unknowns without entries.
+    H = H / scale[:, None, None] + 1e-12 * np.eye(c.shape[1])
+    c = c / scale[:, None]
     found_x = np.zeros_like(c)
     found_y = np.zeros_like(b)
     unsolved = np.arange(len(c))
     x = found_x.copy()
     s = np.maximum(b, 1.0)
     y = np.ones_like(b)
+    limit = PRECISION * (1.0 + np.max(np.abs(b), axis=1))
     for _ in range(MAX_ITERATIONS):
         At = np.swapaxes(A, 1, 2)
         dual = _times(H, x) + c + _times(At, y)
         primal = _times(A, x) + s - b
         gap = np.maximum(np.sum(s * y, axis=1) / b.shape[1], 1e-300)
-        limit = PRECISION * (1.0 + np.max(np.abs(b), axis=1))
         ended = (gap < PRECISION) & (np.max(np.abs(dual), axis=1) < 10 * PRECISION)
         ended &= np.max(np.abs(primal), axis=1) < limit
         factor = _cholesky(H + (At * (y / s)[:, None, :]) @ A)
@@ -100,8 +83,8 @@ def solve(programmes: Sequence[Programme]) -> list[Solution]:
             if np.all(ended):
                 unsolved = unsolved[:0]
                 break
-            everything = (unsolved, H, c, A, b, x, s, y, At, dual, primal, gap, factor)
-            unsolved, H, c, A, b, x, s, y, At, dual, primal, gap, factor = (
+            everything = (unsolved, H, c, A, b, limit, x, s, y, At, dual, primal, gap, factor)
+            unsolved, H, c, A, b, limit, x, s, y, At, dual, primal, gap, factor = (
                 array[~ended] for array in everything
             )
         # The inverse of a triangular matrix is as precise as a solution with it.
@@ -114,38 +97,16 @@ def solve(programmes: Sequence[Programme]) -> list[Solution]:
         dx, ds, dy = _newton_step(*arrays, s * y + ds * dy - centre[:, None])
         length = np.minimum(_longest(s, ds, 2.0), _longest(y, dy, 2.0))
         length = np.minimum(1.0, 0.995 * length)[:, None]
-        # A programme whose step is not finite stays where it is.
-        is_finite = np.all(np.isfinite(dx), axis=1)[:, None]
-        dx, ds, dy = (np.where(is_finite, d, 0.0) for d in (dx, ds, dy))
+        if not np.all(np.isfinite(dx)):
+            # A programme whose step is not finite stays where it is.
+            is_finite = np.all(np.isfinite(dx), axis=1)[:, None]
+            dx, ds, dy = (np.where(is_finite, d, 0.0) for d in (dx, ds, dy))
         x = x + length * dx
         s = s + length * ds
         y = y + length * dy
     found_x[unsolved] = x[: len(unsolved)]
     found_y[unsolved] = y[: len(unsolved)]
-    rows = zip(programmes, found_x, scale[:, None] * found_y, strict=True)
-    return [Solution(own_x[: len(q.c)], own_y[: len(q.b)]) for q, own_x, own_y in rows]
-
-
-def _stacked(programmes: Sequence[Programme], scale: np.ndarray) -> Programme:
-    """The programmes as one, with the programmes first, their objectives divided by `scale`.
-
-    Programmes with fewer rows or unknowns are filled up with rows 0 <= 1 and with unknowns whose
-    optimum is 0.
-    """
-    count = len(programmes)
-    unknowns = max(len(q.c) for q in programmes)
-    rows = max(len(q.b) for q in programmes)
-    H = np.tile(np.eye(unknowns), (count, 1, 1))
-    c = np.zeros((count, unknowns))
-    A = np.zeros((count, rows, unknowns))
-    b = np.ones((count, rows))
-    for i, q in enumerate(programmes):
-        m, n = q.A.shape
-        H[i, :n, :n] = q.H / scale[i] + 1e-12 * np.eye(n)
-        c[i, :n] = q.c / scale[i]
-        A[i, :m, :n] = q.A
-        b[i, :m] = q.b
-    return Programme(H, c, A, b)
+    return Solutions(found_x, scale[:, None] * found_y)
 
 
 def _newton_step(
@@ -191,7 +152,8 @@ def _cholesky(matrix: np.ndarray) -> np.ndarray:
 
 
 def _longest(x: np.ndarray, change: np.ndarray, most: float) -> np.ndarray:
-    """The longest steps along changes, (N, m), with which x >= 0 remains, at most `most`, (N,)."""
-    ratio = np.full_like(x, most)
-    np.divide(-x, change, out=ratio, where=change < 0)
-    return np.minimum(most, ratio.min(axis=1))
+    """The longest steps along changes, (N, m), with which x >= 0 remains, at most `most`, (N,).
+    Changes that are not numbers do not count.
+    """
+    fastest = -np.fmin.reduce(change / x, axis=1)
+    return 1.0 / np.fmax(fastest, 1.0 / most)

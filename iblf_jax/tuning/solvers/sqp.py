@@ -14,7 +14,7 @@ Subproblem.  The step s solves, within |s_i| <= delta and the ranges of the gain
 where y are the multipliers of the previous subproblem.  It is solved first with c_j = e_j, and
 then, once curvatures are known, CURVATURE_SOLVES times with c_j = e_j + s.C_j.s/2 at the last
 solution.  The trial is z + s with the solution of which the quadratic models predict the largest
-decrease.  The subproblems of all starts are solved side by side (`quadratic.together`).
+decrease.  The subproblems of all starts are solved side by side (`together`).
 
 Requirements on a share of the runs.  If k > 1 of the B runs may violate a requirement, its G_r is
 the mean of its k worst runs, which equals
@@ -64,8 +64,10 @@ regions).
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from collections.abc import Generator, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
 
 import jax
 import numpy as np
@@ -144,6 +146,24 @@ subproblem only, a tuning of two joints with 64 runs took 26 evaluations instead
 # --------------------------------------------------------------------------------- the subproblem
 
 
+class Subproblem(NamedTuple):
+    """The numbers of one subproblem."""
+
+    gradient: np.ndarray
+    """g, (p,)."""
+    matrix: np.ndarray
+    """B + sum_j y_j C_j, (p, p), positive definite."""
+    low: np.ndarray
+    """Bounds of the step, (p,): trust region and ranges of the gains."""
+    high: np.ndarray
+    pieces: np.ndarray
+    """c, (B, k M): k times the pieces of the requirements, at several points."""
+    piece_gradients: np.ndarray
+    """a, (B, p, k M)."""
+    penalty: float
+    """rho."""
+
+
 class Step(NamedTuple):
     """The solution of a subproblem."""
 
@@ -154,137 +174,163 @@ class Step(NamedTuple):
     violation: np.ndarray
     """Predicted violation of each requirement: v_r, (R,)."""
     piece_multipliers: np.ndarray
-    """Multiplier of each piece in each run, (B, M)."""
+    """Multiplier of each piece in each run, (B, M).  A piece at several points is one constraint,
+    which has one multiplier."""
     multipliers: np.ndarray
     """Multiplier of each requirement, (R,)."""
     lagrangian: np.ndarray
     """Gradient of the Lagrangian, (p,)."""
 
 
-class Selected(NamedTuple):
-    """The m pieces of one requirement that are constraints of a subproblem."""
+class Rows(NamedTuple):
+    """The pieces of one requirement that are constraints of some subproblems, m in all."""
 
+    start: np.ndarray
+    """Index of the subproblem of each piece, (m,), in increasing order."""
     run: np.ndarray
-    """Index of the run of each piece, (m,)."""
+    """Index of its run, (m,)."""
     piece: np.ndarray
     """Index among all pieces of a run, (m,)."""
+    place: np.ndarray
+    """0, 1, ... among the pieces of its subproblem, (m,)."""
+    number: np.ndarray
+    """Number of pieces of each subproblem, (S,)."""
 
 
-def subproblem(
-    gradient: np.ndarray,
-    matrix: np.ndarray,
-    low: np.ndarray,
-    high: np.ndarray,
-    constraints: Constraints,
-    pieces: np.ndarray,
-    piece_gradients: np.ndarray,
-    penalty: float,
-) -> quadratic.Task[Step]:
-    """Solves the subproblem of this module as a quadratic programme; see `quadratic.together`.
+T = TypeVar("T")
+Task = Generator[Subproblem, Step, T]
+"""An algorithm that yields subproblems, receives their solutions, and returns a T."""
 
-    The columns of the programme are the step and the unknowns of each requirement.  Its rows are
-    both bounds of the step, the pieces of each requirement and the conditions of `_own_columns`.
 
-    Args:
-      gradient, matrix: g, (p,), and B, (p, p), positive definite.
-      low, high: bounds of the step, (p,): trust region and ranges of the gains.
-      constraints: the requirements.
-      pieces: c, (B, M).
-      piece_gradients: a, (B, p, M).
-      penalty: rho.
+def together(constraints: Constraints, tasks: Sequence[Task[None]]) -> None:
+    """Runs some algorithms, whose subproblems are formed and solved side by side."""
+    solutions: dict[int, Step | None] = dict.fromkeys(range(len(tasks)))
+    while solutions:
+        requested = {}
+        for i, solution in solutions.items():
+            # An algorithm that has ended yields nothing.
+            with contextlib.suppress(StopIteration):
+                requested[i] = tasks[i].send(solution)  # type: ignore[arg-type]
+        solved = subproblems(constraints, list(requested.values()))
+        solutions = dict(zip(requested, solved, strict=True))
+
+
+def subproblems(constraints: Constraints, requested: Sequence[Subproblem]) -> list[Step]:
+    """Solves subproblems of this module as quadratic programmes, all of them together.
+
+    The columns of a programme are the step and the unknowns of each requirement.  Its rows are both
+    bounds of the step, the pieces of each requirement and the conditions of `_own_columns`.
     """
+    if not requested:
+        return []
+    count = len(requested)
+    gradient, matrix, low, high = (np.stack([q[i] for q in requested]) for i in range(4))
+    penalty = np.array([q.penalty for q in requested])
     # The interior-point method needs an interior, also where z is at the end of a range.
     low = np.minimum(low, -1e-12)
     high = np.maximum(high, 1e-12)
+    pieces, piece_gradients = _stacked_pieces(requested)
     reach = np.maximum(-low, high)
-    size = len(gradient)
-    change = np.abs(piece_gradients).transpose(0, 2, 1) @ reach
+    change = (reach[:, None, None] @ np.abs(piece_gradients))[:, :, 0]
+    size = gradient.shape[1]
+    copies = max(1, pieces.shape[2] // max(1, len(constraints.owner)))
+    own = [_copies_of(constraints, r, copies) for r in range(len(constraints.worst))]
     selected = [
-        _pieces_that_may_bind(constraints, r, pieces, change) for r in range(len(constraints.worst))
+        _pieces_that_may_bind(columns, k, pieces, change)
+        for columns, k in zip(own, constraints.worst, strict=True)
     ]
-    runs_and_counts = zip(selected, constraints.worst, strict=True)
-    own_columns = [_own_columns(chosen.run, k) for chosen, k in runs_and_counts]
-    A, violation_columns = _columns_of_requirements(size, own_columns, constraints)
-    limits = _set_rows_of_pieces(A, selected, own_columns, pieces, piece_gradients)
-    H = np.zeros((A.shape[1], A.shape[1]))
-    H[:size, :size] = matrix
-    c = np.zeros(A.shape[1])
-    c[:size] = gradient
-    c[violation_columns] = penalty
-    x, y = yield quadratic.Programme(H, c, A, np.concatenate([high, -low, limits]))
-    step = np.clip(x[:size], low, high)
-    piece_multipliers = _multipliers_of_pieces(y[2 * size :], selected, own_columns, pieces.shape)
-    multipliers = np.zeros(len(selected))
-    np.add.at(multipliers, constraints.owner, piece_multipliers.sum(axis=0))
-    return Step(
-        step=step,
-        change=float(gradient @ step + 0.5 * step @ matrix @ step),
-        violation=np.maximum(x[violation_columns], 0.0),
-        piece_multipliers=piece_multipliers,
-        multipliers=multipliers,
-        lagrangian=gradient + np.einsum("bm,bpm->p", piece_multipliers, piece_gradients),
+    columns = size + np.arange(len(selected))  # of v_r; one where only the largest excess counts
+    if constraints.largest_only:
+        columns[:] = size
+    A, b, first_rows = _rows_of_programmes(
+        low, high, constraints, columns, selected, pieces, piece_gradients
     )
+    H = np.zeros((count, A.shape[2], A.shape[2]))
+    H[:, :size, :size] = matrix
+    c = np.zeros((count, A.shape[2]))
+    c[:, :size] = gradient
+    c[:, columns] = penalty[:, None]
+    x, y = quadratic.solve(quadratic.Programmes(H, c, A, b))
+    step = np.clip(x[:, :size], low, high)
+    violation = np.maximum(x[:, columns], 0.0)
+    each = np.zeros_like(pieces)
+    multipliers = np.zeros(violation.shape)
+    for r, rows in enumerate(selected):
+        found = y[rows.start, first_rows[r, rows.start] + rows.place]
+        each[rows.start, rows.run, rows.piece] = found
+        multipliers[:, r] = np.bincount(rows.start, found, count)
+    lagrangian = gradient + (piece_gradients @ each[..., None])[..., 0].sum(axis=1)
+    each = each.reshape(*each.shape[:2], copies, -1).sum(axis=2)
+    change_of_loss = _dot(gradient + 0.5 * (matrix @ step[..., None])[..., 0], step).tolist()
+    steps = zip(step, change_of_loss, violation, each, multipliers, lagrangian, strict=True)
+    return [Step(*numbers) for numbers in steps]
 
 
-def _set_rows_of_pieces(
-    A: np.ndarray,
-    selected: list[Selected],
-    own_columns: list[np.ndarray],
+def _stacked_pieces(requested: Sequence[Subproblem]) -> tuple[np.ndarray, np.ndarray]:
+    """The pieces of all subproblems, (S, B, k M), and their gradients, (S, B, p, k M).
+
+    Subproblems with the pieces of fewer points are filled up with pieces far below their limits.
+    """
+    most = max(q.pieces.shape[1] for q in requested)
+    runs, size, _ = requested[0].piece_gradients.shape
+    pieces = np.full((len(requested), runs, most), -np.inf)
+    gradients = np.zeros((len(requested), runs, size, most))
+    for i, q in enumerate(requested):
+        count = q.pieces.shape[1]
+        pieces[i, :, :count] = q.pieces
+        gradients[i, :, :, :count] = q.piece_gradients
+    return pieces, gradients
+
+
+def _copies_of(constraints: Constraints, requirement: int, copies: int) -> np.ndarray:
+    """Indices of the pieces of a requirement, where all pieces are there at several points."""
+    own = constraints.pieces_of(requirement)
+    return (own + len(constraints.owner) * np.arange(copies)[:, None]).ravel()
+
+
+def _rows_of_programmes(
+    low: np.ndarray,
+    high: np.ndarray,
+    constraints: Constraints,
+    columns: np.ndarray,
+    selected: list[Rows],
     pieces: np.ndarray,
     piece_gradients: np.ndarray,
-) -> np.ndarray:
-    """Sets the columns of the step in the rows of the requirements, a_j for each piece and zeros
-    for the conditions on the unknowns of the requirement itself, and returns the right-hand sides
-    of these rows, -c_j - TARGET_EXCESS and zeros.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A and b of the programmes of S subproblems, and the first row of each requirement, (R, S).
+
+    The columns are the step, v_r in the columns that are given, (R,), and the further unknowns of
+    each requirement.
     """
-    size = piece_gradients.shape[1]
-    limits = np.zeros(len(A) - 2 * size)
-    row = 0  # the first row of the pieces of a requirement
-    for chosen, own in zip(selected, own_columns, strict=True):
-        end = row + len(chosen.run)
-        A[2 * size + row : 2 * size + end, :size] = piece_gradients[chosen.run, :, chosen.piece]
-        limits[row:end] = -pieces[chosen.run, chosen.piece] - TARGET_EXCESS
-        row += len(own)
-    return limits
-
-
-def _multipliers_of_pieces(
-    y: np.ndarray,
-    selected: list[Selected],
-    own_columns: list[np.ndarray],
-    shape: tuple[int, ...],
-) -> np.ndarray:
-    """The multiplier of each piece in each run, (B, M), from those of the rows of the
-    requirements.
-    """
-    found = np.zeros(shape)
-    row = 0  # the first row of the pieces of a requirement
-    for chosen, own in zip(selected, own_columns, strict=True):
-        found[chosen.run, chosen.piece] = y[row : row + len(chosen.run)]
-        row += len(own)
-    return found
-
-
-def _columns_of_requirements(
-    size: int, own_columns: list[np.ndarray], constraints: Constraints
-) -> tuple[np.ndarray, np.ndarray]:
-    """The matrix of the programme with the bounds of the step and the columns of the unknowns of
-    all requirements, and the index of the column of v_r, (R,).
-
-    Where only the largest excess counts, all requirements share one unknown v.
-    """
-    rows = np.cumsum([2 * size, *(len(own) for own in own_columns)])
-    columns = np.cumsum([size, *(own.shape[1] for own in own_columns)])
-    A = np.zeros((rows[-1], columns[-1]))
-    A[:size, :size] = np.eye(size)
-    A[size : 2 * size, :size] = -np.eye(size)
-    for own, row, column in zip(own_columns, rows[:-1], columns[:-1], strict=True):
-        A[row : row + own.shape[0], column : column + own.shape[1]] = own
-    if not constraints.largest_only:
-        return A, columns[:-1]
-    shared = A[:, columns[:-1]].sum(axis=1, keepdims=True)
-    others = np.delete(A[:, size:], columns[:-1] - size, axis=1)
-    return np.hstack([A[:, :size], shared, others]), np.full(len(own_columns), size)
+    count, size = low.shape
+    own = [
+        [_own_columns(run, k) for run in np.split(rows.run, np.cumsum(rows.number)[:-1])]
+        for rows, k in zip(selected, constraints.worst, strict=True)
+    ]
+    shapes = np.array([x.shape for of_all in own for x in of_all], int)
+    heights, widths = shapes.reshape(len(own), count, 2).transpose(2, 0, 1)
+    # The first row of each requirement, and the first column of its further unknowns.
+    row = 2 * size + np.cumsum(heights, axis=0) - heights
+    number_of_v = len(np.unique(columns))
+    further = size + number_of_v + np.cumsum(widths - 1, axis=0) - (widths - 1)
+    most_rows = 2 * size + int(np.max(heights.sum(axis=0)))
+    A = np.zeros((count, most_rows, size + number_of_v + int(np.max((widths - 1).sum(axis=0)))))
+    b = np.ones((count, most_rows))
+    A[:, :size, :size] = np.eye(size)
+    A[:, size : 2 * size, :size] = -np.eye(size)
+    b[:, :size] = high
+    b[:, size : 2 * size] = -low
+    for r, rows in enumerate(selected):
+        for s, block in enumerate(own[r]):
+            height, width = block.shape
+            place = slice(row[r, s], row[r, s] + height)
+            A[s, place, columns[r]] = block[:, 0]
+            A[s, place, further[r, s] : further[r, s] + width - 1] = block[:, 1:]
+            b[s, place] = 0.0
+        place = row[r, rows.start] + rows.place
+        A[rows.start, place, :size] = piece_gradients[rows.start, rows.run, :, rows.piece]
+        b[rows.start, place] = -pieces[rows.start, rows.run, rows.piece] - TARGET_EXCESS
+    return A, b, row
 
 
 def _own_columns(run: np.ndarray, k: int) -> np.ndarray:
@@ -311,39 +357,51 @@ def _own_columns(run: np.ndarray, k: int) -> np.ndarray:
 
 
 def _pieces_that_may_bind(
-    constraints: Constraints, r: int, pieces: np.ndarray, change: np.ndarray
-) -> Selected:
-    """The pieces of a requirement that may become active within the bounds of the step.  Of more
-    than MAX_PIECES the worst ones are taken.
+    columns: np.ndarray, k: int, pieces: np.ndarray, change: np.ndarray
+) -> Rows:
+    """The pieces of a requirement that may become active within the bounds of the step, in each of
+    S subproblems.  Of more than MAX_PIECES the worst ones are taken.
 
     Args:
-      constraints: the requirements.
-      r: index of the requirement.
-      pieces: c, (B, M).
-      change: the largest change of each linear piece within the bounds, (B, M).
+      columns: the pieces of the requirement, (m,).
+      k: number of worst runs of the requirement.
+      pieces: c, (S, B, M).
+      change: the largest change of each linear piece within the bounds, (S, B, M).
     """
-    own = constraints.pieces_of(r)
-    k = constraints.worst[r]
-    values = pieces[:, own]
-    change = change[:, own]
+    values = pieces[:, :, columns]
+    change = change[:, :, columns]
     # A piece may become the largest of its run if the largest value that it can reach is at least
     # the smallest value that the largest piece can reach.
-    threshold = np.max(values - change, axis=1, keepdims=True)
+    threshold = np.max(values - change, axis=2, keepdims=True)
     if k == 1:
-        may_bind = values + change >= np.maximum(threshold, -TARGET_EXCESS)
-        run, piece = np.nonzero(may_bind)
-        order = np.argsort(-values[run, piece], kind="stable")[:MAX_PIECES]
-        return Selected(run[order], own[piece[order]])
+        # The mean of several runs needs their pieces also where these are far below the limit.
+        threshold = np.maximum(threshold, -TARGET_EXCESS)
     may_bind = values + change >= threshold
-    runs_from_worst = np.argsort(-np.max(values, axis=1), kind="stable")
-    may_bind[runs_from_worst[RUNS_PER_WORST * k :]] = False
-    run, piece = np.nonzero(may_bind)
-    # The mean of k runs needs pieces of k runs.  So the worst piece of each run is always selected.
-    worst_of_run = np.argmax(np.where(may_bind, values, -np.inf), axis=1)
-    is_further = piece != worst_of_run[run]
-    count = max(MAX_PIECES, int(np.sum(~is_further)))
-    order = np.lexsort((-values[run, piece], is_further))[:count]
-    return Selected(run[order], own[piece[order]])
+    is_further = np.zeros(values.shape, bool)
+    most = np.full(len(values), MAX_PIECES)
+    if k > 1:
+        from_worst = np.argsort(-np.max(values, axis=2), axis=1, kind="stable")
+        np.put_along_axis(may_bind, from_worst[:, RUNS_PER_WORST * k :, None], False, axis=1)
+        # The mean of k runs needs pieces of k runs, so that the worst piece of each run is always
+        # selected.
+        worst = np.argmax(np.where(may_bind, values, -np.inf), axis=2)[..., None]
+        is_further[:] = True
+        np.put_along_axis(is_further, worst, False, axis=2)
+        most = np.maximum(most, np.sum(may_bind & ~is_further, axis=(1, 2)))
+    start, run, piece = np.nonzero(may_bind)
+    found = start, run, piece
+    order = np.lexsort((-values[found], is_further[found], start))
+    count = np.bincount(start, minlength=len(values))
+    place = np.arange(len(start)) - np.repeat(np.cumsum(count) - count, count)
+    is_taken = place < most[start]
+    order = order[is_taken]
+    count = np.minimum(count, most)
+    return Rows(start[order], run[order], columns[piece[order]], place[is_taken], count)
+
+
+def _dot(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """The products x.y of vectors, (..., p)."""
+    return np.sum(x * y, axis=-1)
 
 
 def positive_definite(matrix: np.ndarray, scale: float) -> np.ndarray:
@@ -392,7 +450,7 @@ class Point(NamedTuple):
 
     def linear_change(self, step: np.ndarray) -> np.ndarray:
         """a_j.s of every piece, (B, M)."""
-        return np.einsum("p,bpm->bm", step, self.piece_gradients)
+        return step @ self.piece_gradients
 
 
 @jax.tree_util.register_dataclass
@@ -448,7 +506,9 @@ class SQPState:
     def curvature_along(self, step: np.ndarray) -> np.ndarray:
         """s.C_j.s/2 of every piece, (B, M)."""
         found = np.zeros_like(self.here.pieces)
-        found.flat[self.curved] = 0.5 * np.einsum("p,kpq,q->k", step, self.curvatures, step)
+        size = len(step)
+        products = (self.curvatures.reshape(-1, size) @ step).reshape(-1, size)
+        found.flat[self.curved] = 0.5 * (products @ step)
         return found
 
 
@@ -562,7 +622,7 @@ class SQP(Solver):
         for own in state:
             for c in np.flatnonzero(np.max(np.abs(own.cut_z - z), axis=1) <= reach):
                 gradients = own.cut_gradients[c]
-                values = own.cut_pieces[c] + np.einsum("p,bpm->bm", z - own.cut_z[c], gradients)
+                values = own.cut_pieces[c] + (z - own.cut_z[c]) @ gradients
                 found.append(own.here._replace(pieces=values, piece_gradients=gradients))
         return found
 
@@ -573,18 +633,17 @@ class SQP(Solver):
         space: SearchSpace = evaluate.space
         trials = np.stack([start.trial for start in state])
         found = evaluate(trials)
-        quadratic.together(
+        together(
+            space.constraints,
             [
                 _advance(space, state[s], Point.of(space, found, s), tolerance)
                 for s in np.flatnonzero(evaluate.active).tolist()
-            ]
+            ],
         )
         return trials, found
 
 
-def _advance(
-    space: SearchSpace, state: SQPState, found: Point, tolerance: float
-) -> quadratic.Task[None]:
+def _advance(space: SearchSpace, state: SQPState, found: Point, tolerance: float) -> Task[None]:
     """Accepts or rejects the trial of one start, and determines the next one.
 
     The first evaluation of a start, or the first one after the loss has changed, is accepted
@@ -666,9 +725,13 @@ def _accept(space: SearchSpace, state: SQPState, found: Point) -> None:
     chosen = [np.zeros(0, int)]
     for r, count in enumerate(_curvatures_kept(constraints)):
         own = np.flatnonzero(np.tile(constraints.owner == r, constraints.runs))
-        from_worst = np.argsort(-found.pieces.ravel()[own], kind="stable")
-        chosen.append(np.sort(own[from_worst[:count]]))
+        if count < len(own):
+            from_worst = np.argsort(-found.pieces.ravel()[own], kind="stable")
+            own = np.sort(own[from_worst[:count]])
+        chosen.append(own)
     curved = np.concatenate(chosen)
+    if np.array_equal(curved, state.curved):
+        return
     curvatures = np.zeros_like(state.curvatures)
     _, new, old = np.intersect1d(curved, state.curved, return_indices=True)
     curvatures[new] = state.curvatures[old]
@@ -687,53 +750,56 @@ class Model(NamedTuple):
 
     matrix: np.ndarray
     """B + sum_j y_j C_j, positive definite, (p, p)."""
+    scale: float
+    """Largest eigenvalue of the Gauss-Newton matrix, in magnitude."""
     low: np.ndarray
     """Bounds of the step: trust region and ranges of the gains, (p,)."""
     high: np.ndarray
-    constraints: Constraints
-    """With the pieces of the rejected trials as further pieces of the same requirements."""
     cuts: list[np.ndarray]
-    """The pieces of each of these trials, linearised there and evaluated at the accepted point,
+    """The pieces of each near rejected trial, linearised there and evaluated at the accepted point,
     (B, M)."""
     piece_gradients: np.ndarray
-    """a_j of all pieces, (B, p, (1 + cuts) M)."""
+    """a_j of the pieces of the accepted point and of these trials, (B, p, (1 + cuts) M)."""
 
 
 def _model(space: SearchSpace, state: SQPState) -> Model:
     """The model at the accepted point, with the present multipliers."""
-    multipliers = state.piece_multipliers.ravel()[state.curved]
-    curvature_of_pieces = np.einsum("k,kpq->pq", multipliers, state.curvatures)
     scale = float(np.max(np.abs(np.linalg.eigvalsh(state.here.matrix))))
     cuts = _near_cuts(state)
-    owner = np.tile(space.constraints.owner, 1 + len(cuts))
-    gradients = [state.here.piece_gradients, *state.cut_gradients[cuts]]
+    gradients = state.here.piece_gradients
+    if cuts:
+        gradients = np.concatenate([gradients, *state.cut_gradients[cuts]], axis=2)
     return Model(
-        matrix=positive_definite(state.here.matrix + state.correction + curvature_of_pieces, scale),
+        matrix=_model_matrix(state, scale),
+        scale=scale,
         low=np.maximum(space.box.low - state.z, -state.radius),
         high=np.minimum(space.box.high - state.z, state.radius),
-        constraints=space.constraints._replace(owner=owner),
         cuts=[_cut_values(state, c) for c in cuts],
-        piece_gradients=np.concatenate(gradients, axis=2),
+        piece_gradients=gradients,
     )
 
 
-def _solve(
-    model: Model, state: SQPState, pieces: np.ndarray, penalty: float
-) -> quadratic.Task[Step]:
+def _model_matrix(state: SQPState, scale: float) -> np.ndarray:
+    """`Model.matrix` with the present multipliers."""
+    multipliers = state.piece_multipliers.ravel()[state.curved]
+    matrix = state.here.matrix + state.correction
+    of_pieces = multipliers @ state.curvatures.reshape(len(multipliers), matrix.size)
+    return positive_definite(matrix + of_pieces.reshape(matrix.shape), scale)
+
+
+def _solve(model: Model, state: SQPState, pieces: np.ndarray, penalty: float) -> Task[Step]:
     """The subproblem at the accepted point, with `pieces` as c."""
-    found = yield from subproblem(
-        state.here.gradient,
-        model.matrix,
-        model.low,
-        model.high,
-        model.constraints,
-        np.concatenate([pieces, *model.cuts], axis=1),
-        model.piece_gradients,
-        penalty,
+    return (
+        yield Subproblem(
+            state.here.gradient,
+            model.matrix,
+            model.low,
+            model.high,
+            np.concatenate([pieces, *model.cuts], axis=1),
+            model.piece_gradients,
+            penalty,
+        )
     )
-    # A piece and its copies from rejected trials are one constraint, which has one multiplier.
-    by_point = found.piece_multipliers.reshape(len(pieces), 1 + len(model.cuts), -1)
-    return found._replace(piece_multipliers=by_point.sum(axis=1))
 
 
 def _near_cuts(state: SQPState) -> list[int]:
@@ -748,28 +814,30 @@ def _cut_values(state: SQPState, c: int) -> np.ndarray:
     The linear model of a concave piece is above the piece itself.  It is lowered to the piece, so
     that the accepted point does not seem to violate it.
     """
-    change = np.einsum("p,bpm->bm", state.z - state.cut_z[c], state.cut_gradients[c])
+    change = (state.z - state.cut_z[c]) @ state.cut_gradients[c]
     return np.minimum(state.cut_pieces[c] + change, state.here.pieces)
 
 
-def _predicted_decrease(
-    space: SearchSpace, state: SQPState, model: Model, step: np.ndarray
+def _predicted_merit(
+    space: SearchSpace, state: SQPState, model: Model, step: np.ndarray, curved: np.ndarray
 ) -> float:
-    """Decrease of the penalty function by the quadratic models of objective and pieces."""
-    linear = np.split(np.einsum("p,bpm->bm", step, model.piece_gradients), 1 + len(model.cuts), 1)
-    pieces = state.here.pieces + linear[0] + state.curvature_along(step)
-    for values, linear_change in zip(model.cuts, linear[1:], strict=True):
-        pieces = np.maximum(pieces, values + linear_change)
+    """The penalty function after a step by the quadratic models of objective and pieces, without f
+    at the accepted point; `curved` is e_j + s.C_j.s/2, (B, M).
+    """
+    linear = step @ model.piece_gradients
+    count = curved.shape[1]
+    pieces = curved + linear[:, :count]
+    for i, values in enumerate(model.cuts, start=1):
+        pieces = np.maximum(pieces, values + linear[:, i * count : (i + 1) * count])
     matrix = state.here.matrix + state.correction
     change = float(state.here.gradient @ step + 0.5 * step @ matrix @ step)
-    return _merit(space, state, 0.0, state.here.pieces) - _merit(space, state, change, pieces)
+    return _merit(space, state, change, pieces)
 
 
-def _with_penalty(space: SearchSpace, state: SQPState) -> quadratic.Task[tuple[Step, float]]:
+def _with_penalty(space: SearchSpace, state: SQPState, model: Model) -> Task[tuple[Step, float]]:
     """The step of the subproblem and rho, which is increased as long as that reduces the predicted
     violation.
     """
-    model = _model(space, state)
     size = state.size
     largest = LARGEST_PENALTY * size
     smallest = max(2.0 * float(np.max(state.multipliers, initial=0.0)), MIN_PENALTY * size)
@@ -785,9 +853,10 @@ def _with_penalty(space: SearchSpace, state: SQPState) -> quadratic.Task[tuple[S
     return found, penalty
 
 
-def _plan(space: SearchSpace, state: SQPState, tolerance: float) -> quadratic.Task[None]:
+def _plan(space: SearchSpace, state: SQPState, tolerance: float) -> Task[None]:
     """Determines the next trial of one start, or ends the start."""
-    found, penalty = yield from _with_penalty(space, state)
+    model = _model(space, state)
+    found, penalty = yield from _with_penalty(space, state, model)
     state.penalty = penalty
     predicted_violation = space.constraints.violation(found.violation)
     if predicted_violation <= TARGET_EXCESS:
@@ -795,21 +864,22 @@ def _plan(space: SearchSpace, state: SQPState, tolerance: float) -> quadratic.Ta
     state.piece_multipliers = found.piece_multipliers
     state.multipliers = found.multipliers
 
-    model = _model(space, state)
+    model = model._replace(matrix=_model_matrix(state, model.scale))
     excess = space.constraints.excess(state.here.pieces)
     violation = space.constraints.violation(excess + TARGET_EXCESS)
     reduction = violation - predicted_violation
     linear_decrease = -found.change + state.penalty * reduction
     step = found.step
-    decrease = _predicted_decrease(space, state, model, step)
+    merit = state.penalty * violation
+    curved = state.here.pieces + state.curvature_along(step)
+    decrease = merit - _predicted_merit(space, state, model, step, curved)
     if np.any(state.curvatures):
         # The step with the largest predicted decrease, among the one found and those of
         # subproblems with the curvature of the pieces, becomes the trial.
-        last = found
         for _ in range(CURVATURE_SOLVES):
-            curved = state.here.pieces + state.curvature_along(last.step)
             last = yield from _solve(model, state, curved, penalty)
-            other = _predicted_decrease(space, state, model, last.step)
+            curved = state.here.pieces + state.curvature_along(last.step)
+            other = merit - _predicted_merit(space, state, model, last.step, curved)
             if other > decrease:
                 step = last.step
                 decrease = other
@@ -878,17 +948,16 @@ def conditions_at(space: SearchSpace, z: np.ndarray, found: Point) -> tuple[np.n
     if space.constraints.largest_only:
         size = penalty = 1.0
         found = found._replace(gradient=np.zeros_like(found.gradient))
-    task = subproblem(
+    requested = Subproblem(
         found.gradient,
         BETA * size * np.eye(len(z)),
         np.maximum(space.box.low - z, -1.0),
         np.minimum(space.box.high - z, 1.0),
-        space.constraints,
         np.where(np.abs(found.pieces) < AT_LIMIT, -TARGET_EXCESS, found.pieces),
         found.piece_gradients,
         penalty,
     )
-    (solved,) = quadratic.together([task])
+    (solved,) = subproblems(space.constraints, [requested])
     excess = space.constraints.excess(found.pieces)
     over_limit = found.pieces
     if space.constraints.largest_only:
@@ -904,16 +973,15 @@ def _residuals(
     """
     stationarity = free_slope(space.box, z, found.lagrangian)
     products = np.sum(found.piece_multipliers * pieces, axis=0)
-    complementarity = sum(
-        abs(float(np.sum(products[space.constraints.pieces_of(r)]))) for r in range(len(excess))
-    )
+    by_requirement = np.bincount(space.constraints.owner, products, len(excess))
+    complementarity = float(np.sum(np.abs(by_requirement)))
     worst = float(np.max(excess, initial=-np.inf))
     return np.array([stationarity, max(worst, 0.0), complementarity])
 
 
 def _correct(
     space: SearchSpace, state: SQPState, step: np.ndarray, pieces: np.ndarray
-) -> quadratic.Task[bool]:
+) -> Task[bool]:
     """Makes the second-order correction of a rejected step the next trial; returns whether it
     differs from the rejected one.
     """
