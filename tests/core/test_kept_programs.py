@@ -65,7 +65,6 @@ def test_a_second_process_traces_nothing_and_a_damaged_entry_is_made_again(tmp_p
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """An empty folder of kept values."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     return tmp_path / "iblf_jax"
 
