@@ -172,7 +172,6 @@ ARM = dataclasses.replace(PAPER, observer=ij.observers.NoObserver(), controller=
 
 
 def chain():
-    """The pendulum with the disturbance of its preset."""
     disturbance = ij.presets.motor_driven_pendulum().disturbance
     return dataclasses.replace(pendulum(), disturbance=disturbance)
 
@@ -286,7 +285,7 @@ def test_units_of_the_adaptation_are_those_of_the_parameters():
 
 
 @pytest.mark.slow
-def test_a_figure_shows_the_parameters_with_their_names_and_units():
+def test_a_figure_shows_the_parameters_with_their_names_and_units(short_run):
     loaded = ij.with_parameters(ARM, {"plant.payload": 0.4})
     law = controllers.Saturated(loaded.controller, limit=15.0, auxiliary=5.0)
     limited = dataclasses.replace(loaded, controller=law)
@@ -300,4 +299,4 @@ def test_a_figure_shows_the_parameters_with_their_names_and_units():
     assert lines["value of the plant"][0] == 0.4
     np.testing.assert_allclose(lines["free"][-1], run.controller_state.theta[-1, 2])
     with pytest.raises(ValueError, match="a run of Backstepping"):
-        ij.plotting.adaptation(ij.simulate(UNDISTURBED, duration=0.01, dt=1e-3))
+        ij.plotting.adaptation(short_run)

@@ -30,16 +30,13 @@ LIMITED = ij.with_parts(PAPER, controller=SATURATED)
 LAWS = {
     "two_barriers": two_barriers(),
     "dynamic_surface": controllers.DynamicSurface(k1=2.0, K2=20.0, filter=0.02),
-    "barrier_backstepping": controllers.BarrierBackstepping(k=(2.0, 20.0)),
-    "adaptive_rbf": controllers.AdaptiveRBF(k1=2.0, K2=20.0, nodes=4),
     "adaptive_network": controllers.AdaptiveNetwork(k1=2.0, K2=20.0, nodes=4),
     "computed_torque": controllers.ComputedTorque(Kp=25.0, Kd=10.0),
 }
-"""Laws besides `Backstepping`; the last one does not take the shift."""
+"""Laws besides those of the independent programs; the last one does not take the shift."""
 
 
 def with_numbers(scenario, limit, k, **gains):
-    """The scenario with other numbers of its law."""
     inner = dataclasses.replace(scenario.controller.law, **gains)
     law = controllers.Saturated(inner, limit=limit, auxiliary=k)
     return canonical(ij.with_parts(scenario, controller=law))
@@ -171,9 +168,10 @@ def test_without_a_reached_limit_it_is_the_law_without_it(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["adaptive_rbf", "adaptive_network"])
-def test_the_command_of_a_network_with_an_auxiliary_state_needs_no_model(name):
-    scenario = canonical(ij.with_parts(PAPER, controller=limited_by(1e4, LAWS[name])))
+@pytest.mark.parametrize("kind", [controllers.AdaptiveRBF, controllers.AdaptiveNetwork])
+def test_the_command_of_a_network_with_an_auxiliary_state_needs_no_model(kind):
+    network = kind(k1=2.0, K2=20.0, nodes=4)
+    scenario = canonical(ij.with_parts(PAPER, controller=limited_by(1e4, network)))
     law, x = scenario.controller, jnp.array([[0.5, 0.6], [0.1, 0.2]])
     state = law.init(x, scenario.context)._replace(auxiliary=jnp.array([0.3, -0.2]))
     commands = []

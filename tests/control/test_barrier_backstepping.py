@@ -69,7 +69,6 @@ def law(**fields):
 
 
 def within(size):
-    """Constant bounds."""
     return ij.Bounds(lower=bounds.Constant(-size), upper=bounds.Constant(size))
 
 
@@ -90,7 +89,6 @@ INTEGRAL, LOG = barriers.Integral(), barriers.Log()
 
 
 def under(*given):
-    """The law with these barriers."""
     return {"controller": law(barriers=given)}
 
 

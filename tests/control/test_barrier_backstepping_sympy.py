@@ -112,8 +112,6 @@ def derived_input(t, x):
 
 
 def scenario():
-    """The same in the package's terms."""
-
     def rows(t, x):
         drift, gain = drift_and_gain(x[:, 0], jnp.cos, jnp.sin, jnp.exp)
         return jnp.stack(drift)[:, None], jnp.stack(gain)[:, None]

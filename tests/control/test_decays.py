@@ -65,7 +65,6 @@ def arm_scenario(pair, K2=20.0, **parts):
 
 @jax.jit
 def torque(scenario, t, q, dq):
-    """The command at one state."""
     return scenario.controller.command(t, q, dq, jnp.zeros_like(q), scenario.context, ())[0].tau
 
 
@@ -244,7 +243,6 @@ def test_units():
 
 
 def under(given, **numbers):
-    """A Backstepping with these decays."""
     return controllers.Backstepping(2.0, 20.0, decays=given, **numbers)
 
 

@@ -6,7 +6,6 @@ from __future__ import annotations
 from typing import ClassVar
 
 import jax.numpy as jnp
-import numpy as np
 import pytest
 from iblf_jax.barriers import Quadratic, TransformedError
 
@@ -37,15 +36,6 @@ def with_reference(reference, **options):
     parts = {"reference": reference, "bounds": BASE.bounds[:1]}
     parts |= {"controller": law(**options), "initial": ij.Initial(q=0.0, dq=0.0)}
     return ij.with_parts(BASE, **parts)
-
-
-@pytest.mark.slow
-def test_a_reference_with_enough_derivatives_gives_a_continuous_input():
-    reference = references.WaypointSpline((0.0, 1.0), [[0.0], [0.5]], derivatives=3)
-    run = ij.simulate(with_reference(reference), duration=1.2, dt=1e-3)
-    assert int(run.status) == 0
-    jumps = np.abs(np.diff(np.asarray(run.tau[:, 0])))
-    assert jumps.max() < 0.1  # of 4 V
 
 
 def with_bounds(level, barriers):

@@ -158,13 +158,12 @@ def test_the_reference_of_a_filter_may_leave_the_bounds_and_that_of_no_other_law
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("nearest", ["torque", "acceleration"])
-def test_an_estimate_of_rates_acts_as_its_torque(nearest):
+def test_an_estimate_of_rates_acts_as_its_torque():
     """A `LevelObserver` passes rates d_hat to a law of x; M0 d_hat_2 is the same estimate as a
     torque."""
     full_state = ij.presets.zhang_yan_2024_full_state()
     observer = ij.observers.LevelObserver(gain=(0.0, 20.0), eta0=[[0.0, 0.0], [3.0, -2.0]])
-    scenario = filtered(ij.with_parts(full_state, observer=observer), nearest=nearest)
+    scenario = filtered(ij.with_parts(full_state, observer=observer))
     loop, start = scenario.loop, initial_state(scenario)
     t = jnp.zeros(())
     d_hat = loop.observer.estimate(t, start.x, loop.model, start.observer)

@@ -227,7 +227,6 @@ class Push:
 
 
 def disturbance_of(paper, part):
-    """The disturbance of a short run."""
     scenario = ij.with_parts(paper, disturbance=part)
     return ij.simulate(scenario, duration=2e-3, dt=1e-3, backend="vmap").disturbance[0, 0]
 

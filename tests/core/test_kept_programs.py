@@ -140,7 +140,6 @@ def test_a_study_and_its_bands_read_their_programs(tmp_path):
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """An empty folder of kept values."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     return tmp_path / "iblf_jax"
 

@@ -40,21 +40,24 @@ LEAVES = {
 @pytest.mark.slow
 @pytest.mark.parametrize("case", LEAVES)
 def test_derivatives_by_leaves_are_differences(case):
+    """In one program for the gradient by all of them, and one for the derivative along all."""
     scenario = CASES[case]()
-    for path in LEAVES[case]:
-        start = jnp.asarray(get(scenario, path))
+    start = {path: jnp.asarray(get(scenario, path)) for path in LEAVES[case]}
 
-        def error(value, path=path):
-            run = ij.simulate(ij.with_parameters(scenario, {path: value}), **SHORT)
-            return 1e4 * jnp.sum(run.e1[-1] ** 2)
+    def error(values):
+        run = ij.simulate(ij.with_parameters(scenario, values), **SHORT)
+        return 1e4 * jnp.sum(run.e1[-1] ** 2)
 
-        one = jnp.ones_like(start)
-        size = 1e-6 * max(1.0, float(jnp.max(jnp.abs(start))))
-        difference = (error(start + size * one) - error(start - size * one)) / (2.0 * size)
-        reverse = jnp.sum(jax.grad(error)(start))
-        forward = jax.jvp(error, (start,), (one,))[1]
-        np.testing.assert_allclose(reverse, forward, rtol=1e-9, err_msg=path)
-        np.testing.assert_allclose(forward, difference, rtol=1e-3, atol=1e-6, err_msg=path)
+    reverse = {path: jnp.sum(x) for path, x in jax.grad(error)(start).items()}
+    forward = jax.jvp(error, (start,), (jax.tree.map(jnp.ones_like, start),))[1]
+    np.testing.assert_allclose(sum(reverse.values()), forward, rtol=1e-9)
+    for path, x in start.items():
+        size = 1e-6 * max(1.0, float(jnp.max(jnp.abs(x))))
+        ends = (error(start | {path: x + sign * size}) for sign in (1, -1))
+        difference = next(ends) - next(ends)
+        np.testing.assert_allclose(
+            reverse[path], difference / (2.0 * size), rtol=1e-3, atol=1e-6, err_msg=path
+        )
 
 
 @pytest.mark.slow

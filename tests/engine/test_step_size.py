@@ -36,9 +36,11 @@ def shaken(paper):
     return dataclasses.replace(paper, disturbance=torque)
 
 
-def random_leaves(rng, n=2):
+@pytest.fixture(scope="module")
+def random_leaves(n=2):
     """Leaves of RUNS random scenarios: signals up to 3,000 rad/s, gains of all sizes, starts
     anywhere in the tube."""
+    rng = np.random.default_rng(0)
 
     def between(low, high):
         return np.exp(rng.uniform(np.log(low), np.log(high), (RUNS, n)))
@@ -72,17 +74,22 @@ def batches_of(scenario, steps, method):
     return lambda varied, dt: map(np.asarray, run(jax.tree.map(jnp.asarray, varied), dt))
 
 
+@pytest.fixture(scope="module")
+def accurate(shaken, random_leaves):
+    """Time step -> positions of the random runs, by a sixteenth of it."""
+    finer = batches_of(canonical(shaken), 400 * FINER, "rk4")
+    return {dt: next(finer(random_leaves, dt / FINER)) for dt in (1e-3, 2e-3, 5e-3)}
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("method", TABLEAUS)
-def test_the_estimate_is_about_the_error(shaken, rng, method):
+def test_the_estimate_is_about_the_error(shaken, random_leaves, accurate, method):
     """At 1, 2 and 5 ms, too large for some: no run is off by more than the tolerance without its
     flag, and good ones are not flagged."""
-    scenario, varied = canonical(shaken), random_leaves(rng)
     flagged = good = alarms = 0
-    coarse, finer = batches_of(scenario, 400, method), batches_of(scenario, 400 * FINER, "rk4")
-    for dt in (1e-3, 2e-3, 5e-3):
-        q, width, estimate, status = coarse(varied, dt)
-        fine, *_ = finer(varied, dt / FINER)
+    coarse = batches_of(canonical(shaken), 400, method)
+    for dt, fine in accurate.items():
+        q, width, estimate, status = coarse(random_leaves, dt)
         error = np.max(np.abs(q - fine) / width, axis=(1, 2))
         found = status & int(Status.INACCURATE | Status.STEP_TOO_LARGE) != 0
         assert np.all(found[error > TOLERANCE]), (dt, error[(error > TOLERANCE) & ~found])
@@ -283,7 +290,7 @@ def split(steps, **fields):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", TABLEAUS)
+@pytest.mark.parametrize("method", ["heun", "rk4"])
 def test_jumps_cost_no_order(method):
     """The error is that of a smooth loop, and the estimate is not below it."""
     scenario, truth = with_steps(SLOW, MANY), split(MANY)

@@ -116,7 +116,6 @@ def heavier(scenario):
 
 @pytest.fixture(scope="module")
 def run(heavier):
-    """The paper's motion of it."""
     return ij.simulate(heavier, duration=6.0, dt=1e-3)
 
 
@@ -314,7 +313,6 @@ def lacking(scenario, log, paths):
 
 @pytest.fixture(scope="module")
 def other_logs():
-    """Logs of other motions."""
     return [independent_log(duration=5.0, seed=seed) for seed in (11, 12)]
 
 
@@ -505,7 +503,6 @@ HEAD = "t, q[0], q[1], tau[0], tau[1]"
 
 @pytest.fixture
 def lines(log):
-    """The lines of a table of the log."""
     rows = np.column_stack([log["t"], log["q"], log["tau"]])
     return [HEAD, *(", ".join(f"{x:.17g}" for x in row) for row in rows)]
 

@@ -18,7 +18,6 @@ IMAGE = b"image of a kernel, which a driver would load"
 
 
 def text(name: str) -> str:
-    """The text of a file beside this one."""
     return (FOLDER / name).read_text()
 
 
@@ -47,7 +46,6 @@ def kernel(
 
 
 def run(program, shared, lane, carry, steps, every, *, threads=32, flags=()):
-    """As `gpu.run`."""
     name = kernel(program, shared.size, lane.shape[0], flags)
     return gpu.call(name, program, shared, lane, carry, steps, every, threads)
 

@@ -61,7 +61,6 @@ def filled(tmp_path_factory):
 
 @pytest.fixture
 def cache(tmp_path, monkeypatch):
-    """An empty cache of its own."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(toolchain.CACHES, "libraries", {})  # as in another process
     return tmp_path / "cache" / "iblf_jax"

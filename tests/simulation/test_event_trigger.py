@@ -70,8 +70,6 @@ def test_a_chain_of_order_three_is_that_of_the_independent_program(compensated):
 
 @ij.component
 class Given:
-    """A law with a given input and a given slope."""
-
     v: ij.Leaf
     z: ij.Leaf
 

@@ -168,23 +168,19 @@ def test_a_command_is_active_from_its_arrival_to_that_of_the_next(delay):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("base", "timing"),
-    [
-        (PAPER, {"period": 1e-3, "delay": 1e-3}),
-        (PAPER, {"period": 2e-3, "delay": 1e-3}),
-        (SLOW, {"period": 2e-3, "delay": 2.7e-3}),
-    ],
+    [(PAPER, {"period": 2e-3, "delay": 1e-3}), (SLOW, {"period": 2e-3, "delay": 2.7e-3})],
 )
 def test_a_sampled_loop_is_that_of_an_independent_program(base, timing):
     agree(ij.with_parts(base, sampling=ij.Sampling(**timing)), Independent)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("delay", [0.0, 3.7e-3])
-def test_a_disturbance_that_jumps_between_samples_is_that_of_an_independent_program(delay):
+def test_a_disturbance_that_jumps_between_samples_is_that_of_an_independent_program():
     """In steps as long as the period: the jump is within one, where its error was 5e-3 rad and its
     estimate 3e-5 rad."""
     late = ij.disturbances.Step(size=[20.0, 5.0], time=0.2137)
-    scenario = ij.with_parts(SLOW, sampling=ij.Sampling(period=1e-2, delay=delay), disturbance=late)
+    sampling = ij.Sampling(period=1e-2, delay=3.7e-3)
+    scenario = ij.with_parts(SLOW, sampling=sampling, disturbance=late)
     assert agree(scenario, Independent, dt=1e-2, q=1e-6, tau=1e-3).ok
 
 

@@ -36,7 +36,6 @@ class Spring:
     damping: ij.Leaf = ij.leaf("N m s/rad", sign="positive")
 
     def init(self, q, dq, context):
-        """It has no state."""
         return ()
 
     def command(self, t, q, dq, f_hat, context, state):

@@ -10,18 +10,14 @@ import pytest
 import iblf_jax as ij
 
 SHORT = {"duration": 0.08, "dt": 1e-3}
-UNKNOWN = {
-    "user class": {"plant.D": ij.factor(ij.uniform(0.9, 1.1))},
-    "flexible joint": {"plant.stiffness": ij.factor(ij.uniform(0.8, 1.2))},
-}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", UNKNOWN)
-def test_executors_give_the_same_numbers(case):
-    scenario = loops_of_plants.CASES[case]()
+def test_executors_give_the_same_numbers():
+    scenario = loops_of_plants.flexible_joint()
+    draws = {"plant.stiffness": ij.factor(ij.uniform(0.8, 1.2))}
     runs = [
-        ij.monte_carlo(scenario, UNKNOWN[case], runs=8, backend=name, progress=False, **SHORT)
+        ij.monte_carlo(scenario, draws, runs=8, backend=name, progress=False, **SHORT)
         for name in ("native", "vmap")
     ]
     for name in runs[0].metrics:

@@ -28,7 +28,6 @@ def plant_of(drift=drift, gain=gain, **others):
 
 
 def altered(**members):
-    """The pendulum with other members."""
     fields = [(field.name, field.type, field) for field in dataclasses.fields(PENDULUM)]
     namespace = dict(vars(type(PENDULUM))) | members
     for name in ("__dict__", "__weakref__", "__init__"):
