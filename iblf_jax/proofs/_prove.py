@@ -28,6 +28,7 @@ import jax
 import numpy as np
 from numpy.typing import ArrayLike
 
+from iblf_jax.control.sensors import Ideal
 from iblf_jax.core import checks, notices
 from iblf_jax.core.progress import announced
 from iblf_jax.core.pytree import unwrapped
@@ -104,8 +105,8 @@ def prove(
       scenario: the loop of a robot with the corrected backstepping law and the momentum observer,
         whose torque may have limits (`Saturated`, `Motor`), or of a plant in strict-feedback form
         of order 2 or 3 with one number per level and the law `BarrierBackstepping`.  The loop of a
-        robot may be sampled, with the observer's step "poles" or "euler", exact measurements and no
-        delay; the statement then is about all times, also between samples.
+        robot may be sampled, without delay, with exact measurements or positions rounded to counts
+        of an `Encoder`; the statement then is about all times, also between samples.
       level: level c of V_w, in its unit, N m rad for robots. If not given, for a robot half of the
         greatest level at which no point with V_w' > 0 was found, or the least level whose set
         contains the start if that is more; `Proof.level_choice` has both. `largest_level` searches
@@ -557,10 +558,11 @@ def _refuted(
 def _value_above(
     scenario: Scenario, run: Rollout, level: float, weight: float, dt: float
 ) -> float | None:
-    """The largest V_w at a sample, if the loop is sampled and V_w is above the level there by more
-    than the difference that half of the time step makes; None otherwise.
+    """The largest V_w at a sample, if the loop is sampled with exact measurements and V_w is above
+    the level there by more than the difference that half of the time step makes; None otherwise.
     """
-    if scenario.sampling is None:
+    # The estimate of a run is that of the law, from what is measured.
+    if scenario.sampling is None or type(scenario.sensor) is not Ideal:
         return None
     values = sampled_values(scenario, run, weight)
     # A comparison with NaN is False.

@@ -5,24 +5,31 @@ u(X) that the law would command at the state X = (t, q, v, phi), where phi is th
 observer, interpolated between samples:
 
     u = M0 alpha' + C0 alpha + G0 - phi - K2 e2 - w s,   f_tilde = f(u(X)) - phi,
-    phi' = g (p' - phi_k - tau_k - n_k),   p = M0 v,   n = M0' v - C0 v - G0                  (H.1)
+    phi' = g (p' - phi_k - tau_k - n_k) + r p',   p = M0 v,   n = M0' v - C0 v - G0           (H.1)
 
-phi is the discrete estimate at each sample, with g = (1 - exp(-kf h))/h for "poles" and g = kf for
-"euler", and V_w is continuous there.  With the differences since the sample
+phi is the discrete estimate at each sample, and V_w is continuous there:
+
+    g = (1 - exp(-kf h))/h for "poles" and "exact",   g = kf for "euler",
+    r = kf - g for "exact",   r = 0 for the others.
+
+With the differences since the sample
 
     D = tau_k - u,   L = n - n_k + phi - phi_k,   A = M0 M^-1,   K = dM M0^-1,   A (I + K) = I,
 
-    phi' = g (f_tilde - K A D + L),   u' = u_h' - phi',   L' = n' + phi',                     (H.2)
-    V_w' = (rate of the continuous loop with the gain g) + e2^T A D
-           + w_f f_tilde^T A [(F M0^-1 + g K) A D - g L],                                     (H.3)
+    phi' = g (f_tilde - K A D + L) + r (u_h + n + f_tilde + A D),                             (H.2)
+    u' = u_h' - phi',   L' = n' + phi',
+    V_w' = (rate of the continuous loop with the gain g + r) + e2^T A D
+           + w_f f_tilde^T A [(F M0^-1 + g K - r) A D - g L - r (u_h + n)],                   (H.3)
 
-where u_h = u + phi, and F is the derivative of f(u(X)) along e2 at a given f_tilde.  D and L follow
-from their rates along the path since the sample, which are affine in f_tilde:
+where u_h = u + phi, u_h + n + f_tilde = p' at D = 0, and F is the derivative of f(u(X)) along e2 at
+a given f_tilde.  D and L follow from their rates along the path since the sample, which are affine
+in f_tilde:
 
     D = -s (u0 + U f_tilde),   L = s (n0 + N f_tilde),   0 <= s <= h                          (H.4)
 
 with means over the path.  (H.3) is affine in s for given means, and its maximum over f_tilde convex
-in s: it is bounded at s = 0 and at s = h.
+in s: it is bounded at s = 0 and at s = h.  `ArmParts.kf` is g + r, and `ArmParts.innovation_gain`
+is g where r is not 0.
 
 **The path.**  Bounds |u'| <= R_u, |L'| <= R_L and |f'| <= R_f on the whole set, under |D| <= h R_u
 and |L| <= h R_L, hold along every run: D and L are 0 at a sample, and up to the first time at which
@@ -31,6 +38,18 @@ one of them reaches its bound, which is before the next sample, the rates are be
 that contains the end of each of its steps in its interior contains the path: `_path` inflates the
 box by its rates and tests that.  Paths from boxes near e1 = 0 come from the other side of the tube;
 there, `TwoSided` joins the values of the barrier's functions on both sides.
+
+**Errors of measurements.**  A sample reads q + dq with a bounded dq, and law and observer use f_hat
+= eta + (g + r) M0 v at this position.  With phi = eta + (g + r) M0 v of the true state,
+(H.1) holds with the values phi_k and n_k of the measured one, and so do (H.2) and (H.3).  At a
+sample, D and L are not 0 then, but
+
+    D_0 = d u_h - (g + r) d p,   L_0 = -(g + r) d p - d n,                                    (H.5)
+
+where d is the difference between the measured state and the true one.  D and L in (H.4) begin with
+D_0 and L_0, which are enclosed by the mean value theorem over a box of the path and of what may be
+measured on it; |D_0| <= E_u and |L_0| <= E_L on the whole set, and the bounds of D and L in the
+section above are h R_u + E_u and h R_L + E_L.
 """
 
 from __future__ import annotations
@@ -80,7 +99,7 @@ precision: 256 times its distance from the next number."""
 
 
 class PathRates(NamedTuple):
-    """Bounds of rates on the whole set, (n,) each [N m/s]."""
+    """Bounds on the whole set, (n,) each, of rates [N m/s] and of differences at samples [N m]."""
 
     command: jax.Array
     """R_u."""
@@ -88,6 +107,17 @@ class PathRates(NamedTuple):
     """R_L."""
     mismatch: jax.Array
     """R_f."""
+    first_command: jax.Array | None = None
+    """E_u; None for exact measurements."""
+    first_lag: jax.Array | None = None
+    """E_L."""
+
+    def differences(self, h: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """D and L at all ages up to the period h."""
+        D, L = h * self.command, h * self.lag
+        if self.first_command is not None and self.first_lag is not None:
+            D, L = D + self.first_command, L + self.first_lag
+        return symmetric(D), symmetric(L)
 
 
 class TwoSided:
@@ -130,15 +160,26 @@ def two_sided(parts: ArmParts, sign: jax.Array) -> ArmParts:
 
 def with_exact_gain(constants: Constants) -> Constants:
     """The constants with an interval that contains the exact gain g of the observer."""
-    kf = constants.parts.kf
-    exact = kf * (1.0 + symmetric(jnp.full_like(kf, GAIN_ERROR)))
-    return constants._replace(parts=constants.parts._replace(kf=exact))
+
+    def enclosing(gain: jax.Array) -> jax.Array:
+        return gain * (1.0 + symmetric(jnp.full_like(gain, GAIN_ERROR)))
+
+    parts = constants.parts
+    if parts.innovation_gain is None:
+        return constants._replace(parts=parts._replace(kf=enclosing(parts.kf)))
+    exact = enclosing(parts.innovation_gain)
+    return constants._replace(parts=parts._replace(innovation_gain=exact))
 
 
 def period(parts: ArmParts) -> jax.Array:
     """The period of the samples, () [s]."""
     assert parts.period is not None
     return parts.period
+
+
+def innovation_gain(parts: ArmParts) -> jax.Array:
+    """The gain g, (n,) [1/s]."""
+    return parts.kf if parts.innovation_gain is None else parts.innovation_gain
 
 
 # --- functions of the motion ---------------------------------------------------------------------
@@ -157,6 +198,11 @@ def momentum_term(parts: ArmParts, at: Errors) -> jax.Array:
     """The term n = M0' v - C0 v - G0 of the momentum's rate, (n,) [N m]."""
     q = position(parts, at)
     return energy_gradient(parts.model, q, velocity(parts, at)) - parts.model.gravity(q)
+
+
+def momentum_rate(parts: ArmParts, at: Errors) -> jax.Array:
+    """The rate u_h + n of the momentum M0 v at f_tilde = 0 and D = 0, (n,) [N m]."""
+    return free_torque(parts, at) + momentum_term(parts, at)
 
 
 def kinematics(parts: ArmParts, at: Errors, f_tilde: jax.Array) -> Kinematics:
@@ -209,6 +255,8 @@ class FirstRates(NamedTuple):
     """Of n."""
     mismatch: jax.Array
     """F, (n, n) [N m s/rad]."""
+    p_rate: jax.Array
+    """u_h + n, (n,) [N m]."""
 
 
 def first_rates(constants: Constants, places: Places, at: Errors, z: jax.Array) -> FirstRates:
@@ -249,6 +297,7 @@ def first_rates(constants: Constants, places: Places, at: Errors, z: jax.Array) 
         Affine(torque, matrix(torque_columns)),
         Affine(momentum, matrix(momentum_columns)),
         matrix(mismatch_columns),
+        momentum_rate(parts, at),
     )
 
 
@@ -283,12 +332,15 @@ def _path(
     parts = constants.parts
     h, g, at = period(parts), parts.kf, point.errors
     sign = cast(TwoSided, parts.law.barrier).sign
-    D, L = symmetric(h * limits.command), symmetric(h * limits.lag)
+    D, L = limits.differences(h)
+
+    # u_h + n = u + phi + n changes along the path as u and L do.
+    p_rate = momentum_rate(parts, at) + symmetric(h * (limits.command + limits.lag))
 
     def estimate_term(at: Errors) -> tuple[jax.Array, jax.Array]:
         """Of f_tilde' all but -g f_tilde as a magnitude, and the acceleration by D."""
         error = mass_error(constants, places, at, z)
-        size = jnp.abs(change_of_f_tilde(parts, error, limits, D, L))
+        size = jnp.abs(change_of_f_tilde(parts, error, p_rate, limits, D, L))
         return upper(size), matvec(error.inverse, matvec(error.ratio, D))
 
     def on_side(box: Errors) -> Errors:
@@ -333,28 +385,95 @@ def rates_under(
     parts: ArmParts, error: MassError, rates: FirstRates, D: jax.Array, L: jax.Array
 ) -> tuple[Affine, Affine]:
     """The rates of u and L under differences D and L, as functions of f_tilde."""
-    g = parts.kf
     AD = matvec(error.ratio, D)
-    push, estimate = matvec(error.inverse, AD), g * (L - matvec(error.relative, AD))
+    push, estimate = matvec(error.inverse, AD), estimate_rate(parts, error, rates.p_rate, AD, L)
 
     def under(rate: Affine) -> Affine:
         slope = matmul(rate.slope, error.inverse)
         return Affine(rate.value + matvec(rate.slope, push), slope)
 
     command, momentum = under(rates.torque), under(rates.momentum)
-    decay = jnp.diag(g)
+    decay = jnp.diag(parts.kf)
     return (
         Affine(command.value - estimate, command.slope - decay),
         Affine(momentum.value + estimate, momentum.slope + decay),
     )
 
 
-def change_of_f_tilde(
-    parts: ArmParts, error: MassError, limits: PathRates, D: jax.Array, L: jax.Array
+def estimate_rate(
+    parts: ArmParts, error: MassError, p_rate: jax.Array, AD: jax.Array, L: jax.Array
 ) -> jax.Array:
-    """The rate of f_tilde but for its own decay, f_tilde' + g f_tilde, (n,) [N m/s]."""
-    KAD = matvec(error.relative, matvec(error.ratio, D))
-    return symmetric(limits.mismatch) + parts.kf * (KAD - L)
+    """The rate phi' of the estimate but for (g + r) f_tilde, (n,) [N m/s]; `p_rate` is u_h + n."""
+    g = innovation_gain(parts)
+    rate = g * (L - matvec(error.relative, AD))
+    if parts.innovation_gain is None:
+        return rate
+    return rate + (parts.kf - g) * (p_rate + AD)
+
+
+def change_of_f_tilde(
+    parts: ArmParts,
+    error: MassError,
+    p_rate: jax.Array,
+    limits: PathRates,
+    D: jax.Array,
+    L: jax.Array,
+) -> jax.Array:
+    """The rate of f_tilde but for its own decay, f_tilde' + (g + r) f_tilde, (n,) [N m/s]."""
+    AD = matvec(error.ratio, D)
+    return symmetric(limits.mismatch) - estimate_rate(parts, error, p_rate, AD, L)
+
+
+class FirstDifferences(NamedTuple):
+    """D and L at a sample, (n,) each [N m]."""
+
+    D: jax.Array
+    """D_0 of (H.5)."""
+    L: jax.Array
+    """L_0."""
+    is_inside: jax.Array | bool
+    """Whether no guard of the barrier is active at what is measured, ()."""
+
+
+def first_sizes(parts: ArmParts, at: Errors) -> tuple[jax.Array, jax.Array]:
+    """Bounds of |D_0| and |L_0| by the mean value theorem, (n,) each [N m], at errors that contain
+    the true ones and those that are measured.
+    """
+    assert parts.measurement_error is not None
+    zero, k = jnp.zeros_like(at.xi), arm_motion.side_of(parts, at.t, at.xi).k
+
+    def functions(at: Errors) -> tuple[jax.Array, jax.Array]:
+        q = position(parts, at)
+        momentum = parts.kf * matvec(parts.model.mass_matrix(q), velocity(parts, at))
+        return free_torque(parts, at) - momentum, momentum + momentum_term(parts, at)
+
+    D = L = zero
+    for size, unit in zip(parts.measurement_error, jnp.eye(len(zero)), strict=True):
+        # e2 = v - alpha at a given v
+        dxi = unit / k
+        alpha = along(lambda xi: arm_motion.relative_alpha(parts, at.t, xi), (at.xi,), (dxi,))
+        step = Errors(jnp.zeros_like(at.t), dxi, -alpha)
+        command, lag = along(functions, (at,), (step,))
+        D = D + size * jnp.abs(command)
+        L = L + size * jnp.abs(lag)
+    return D, L
+
+
+def first_differences(parts: ArmParts, at: Errors) -> FirstDifferences:
+    """D_0 and L_0 of samples in a box of errors; the barrier of `parts` is two-sided."""
+    assert parts.measurement_error is not None
+    sign = cast(TwoSided, parts.law.barrier).sign
+    side = arm_motion.side_of(parts, at.t, at.xi)
+    dxi = symmetric(parts.measurement_error / side.k)
+    xi = with_sign(at.xi + dxi, sign)
+    alpha = along(lambda xi: arm_motion.relative_alpha(parts, at.t, xi), (xi,), (dxi,))
+    e2 = at.e2 + symmetric(jnp.abs(alpha))
+    D, L = first_sizes(parts, Errors(at.t, xi, e2))
+    free = 1.0 - parts.guard
+    # Beyond e1 = 0, xi is in parts of the width on this side.
+    other = jnp.where(sign > 0.0, -side.scaled.lower, side.scaled.upper)
+    is_inside = jnp.all((sign * xi < free) & (-sign * xi < free * other))
+    return FirstDifferences(symmetric(D), symmetric(L), is_inside)
 
 
 class PathMeans(NamedTuple):
@@ -371,11 +490,16 @@ class PathMeans(NamedTuple):
 
 
 def path_means(
-    parts: ArmParts, path: Path, error: MassError, rates: FirstRates, limits: PathRates
+    parts: ArmParts,
+    path: Path,
+    error: MassError,
+    rates: FirstRates,
+    limits: PathRates,
+    first: FirstDifferences | None = None,
 ) -> PathMeans:
     """The means over a path of any age up to the period."""
     h, g = period(parts), parts.kf
-    D, L = symmetric(h * limits.command), symmetric(h * limits.lag)
+    D, L = limits.differences(h)
     # The rates on the path, within the bounds on the whole set.
     u_rate, L_rate = (
         meet(rate.value + matvec(rate.slope, path.f_tilde), symmetric(limit))
@@ -383,11 +507,14 @@ def path_means(
             rates_under(parts, error, rates, D, L), (limits.command, limits.lag), strict=True
         )
     )
-    change = change_of_f_tilde(parts, error, limits, D, L)
+    change = change_of_f_tilde(parts, error, rates.p_rate, limits, D, L)
     # The mean of a difference that grows from 0 on at such a rate has half of the age.
     half = up_to(0.5 * h)
     rest = half * (g * (up_to(h) * (g * path.f_tilde - change)) - change)
-    return PathMeans(-half * u_rate, half * L_rate, 1.0 + half * g, rest)
+    mean_D, mean_L = -half * u_rate, half * L_rate
+    if first is not None:
+        mean_D, mean_L = first.D + mean_D, first.L + mean_L
+    return PathMeans(mean_D, mean_L, 1.0 + half * g, rest)
 
 
 def mean_rates(
@@ -409,14 +536,39 @@ def held_terms(
     z: jax.Array,
     path: Path,
     limits: PathRates,
-) -> HeldTorque:
-    """What the held torque adds at the age h."""
-    parts = constants.parts
+    first: FirstDifferences | None,
+) -> tuple[HeldTorque | None, HeldTorque]:
+    """What the held torque adds at the ages 0 and h."""
+    parts, e2 = constants.parts, point.errors.e2
     error = mass_error(constants, places, path.at, z)
     rates = first_rates(constants, places, path.at, z)
-    means = path_means(parts, path, error, rates, limits)
+    means = path_means(parts, path, error, rates, limits, first)
     command, lag = mean_rates(parts, error, rates, means)
-    return added_terms(constants, point.errors.e2, error, rates.mismatch, command, lag)
+    added = added_terms(constants, e2, error, rates.mismatch, command, lag)
+    if first is None:
+        return None, added
+    fresh = first_terms(constants, e2, error, rates.mismatch, first)
+    return fresh, HeldTorque(fresh.power + added.power, fresh.push + added.push, added.slope)
+
+
+def weight_of_command(parts: ArmParts, error: MassError, F: jax.Array) -> jax.Array:
+    """The matrix F M0^-1 + g K - r of (H.3), (n, n) [1/s]."""
+    g = innovation_gain(parts)
+    matrix = matmul(F, error.inverse) + g[:, None] * error.relative
+    if parts.innovation_gain is None:
+        return matrix
+    return matrix - jnp.diag(parts.kf - g)
+
+
+def first_terms(
+    constants: Constants, e2: jax.Array, error: MassError, F: jax.Array, first: FirstDifferences
+) -> HeldTorque:
+    """The terms of (H.3) with D_0 and L_0."""
+    parts, A = constants.parts, error.ratio
+    AD = matvec(A, first.D)
+    inside = matvec(weight_of_command(parts, error, F), AD) - innovation_gain(parts) * first.L
+    push = constants.weight * matvec(A, inside)
+    return HeldTorque(inner(e2, AD), push, jnp.zeros_like(A))
 
 
 def added_terms(
@@ -429,9 +581,9 @@ def added_terms(
 ) -> HeldTorque:
     """The terms of (H.3) with D = -h u' and L = h L', for means u' (`command`) and L' (`lag`)."""
     parts, weight = constants.parts, constants.weight
-    h, g = period(parts), parts.kf
+    h, g = period(parts), innovation_gain(parts)
     K, A = error.relative, error.ratio
-    G = matmul(F, error.inverse) + g[:, None] * K
+    G = weight_of_command(parts, error, F)
     # A D and the bracket of (H.3), in parts of -h.
     value = command.value - matvec(K, matvec(A, command.value))
     slope = matmul(A, command.slope)
@@ -439,6 +591,13 @@ def added_terms(
     of_f_tilde = matmul(G, slope) + g[:, None] * lag.slope
     push = matvec(slope.T, e2) + weight * matvec(A, inside)
     return HeldTorque(-h * inner(e2, value), -h * push, -h * matmul(A, of_f_tilde))
+
+
+def bias(constants: Constants, places: Places, at: Errors, z: jax.Array) -> jax.Array:
+    """The term A r (u_h + n) of (H.3), (n,) [N m/s]."""
+    parts = constants.parts
+    error = mass_error(constants, places, at, z)
+    return matvec(error.ratio, (parts.kf - innovation_gain(parts)) * momentum_rate(parts, at))
 
 
 def held_bound(
@@ -451,14 +610,20 @@ def held_bound(
     at = coordinates(x, n, places.coordinates)
     point = arm_errors(constants, at)
     vertices = corners(mismatch(constants, places, point.errors, at.z), at.z)
+    if constants.parts.innovation_gain is not None:
+        shift = bias(constants, places, point.errors, at.z)
+        vertices = [vertex._replace(value=vertex.value - shift) for vertex in vertices]
     losses = dissipation_bound(constants, point)
     both = constants._replace(parts=two_sided(constants.parts, at.sign))
     path = _path(both, places, point, at.z, limits)
-    held_torque = held_terms(both, places, point, at.z, path, limits)
-    fresh = jnp.min(bounds_from(constants, point, losses, vertices))
+    first = None if both.parts.measurement_error is None else first_differences(both.parts, path.at)
+    at_sample, held_torque = held_terms(both, places, point, at.z, path, limits, first)
+    fresh = jnp.min(bounds_from(constants, point, losses, vertices, at_sample))
     old = jnp.min(bounds_from(constants, point, losses, vertices, held_torque))
     # A box of which the path is not enclosed may have a narrower one inside.
     bound = jnp.where(path.is_enclosed, jnp.maximum(fresh, old), hull(jnp.inf, -LARGE))
+    if first is not None:
+        bound = jnp.where(first.is_inside, bound, hull(jnp.inf, -LARGE))
     return jnp.where(is_inside_guard(constants, point), bound, jnp.inf)[None]
 
 
@@ -478,8 +643,14 @@ def rate_excess(places: Places, x: jax.Array, constants: Constants, limits: Path
         jnp.stack([jnp.abs(rate.value[i]) + point.b * norm(rate.slope[i]) for i in range(n)])
         for rate in found
     ]
-    excess = jnp.max(jnp.stack([s / most for s, most in zip(sizes, limits, strict=True)]))
-    return jnp.where(is_inside_guard(constants, point), excess - 1.0, jnp.inf)[None]
+    is_inside = is_inside_guard(constants, point)
+    if constants.parts.measurement_error is not None:
+        first = first_differences(two_sided(constants.parts, at.sign), point.errors)
+        sizes += [jnp.abs(first.D), jnp.abs(first.L)]
+        is_inside = is_inside & first.is_inside
+    given = [limit for limit in limits if limit is not None]
+    excess = jnp.max(jnp.stack([s / most for s, most in zip(sizes, given, strict=True)]))
+    return jnp.where(is_inside, excess - 1.0, jnp.inf)[None]
 
 
 def _rates(
@@ -487,17 +658,18 @@ def _rates(
 ) -> list[Affine]:
     """The rates of u, L and f as functions of f_tilde."""
     parts, errors = constants.parts, point.errors
-    h, g, n = period(parts), parts.kf, errors.xi.shape[-1]
+    n = errors.xi.shape[-1]
     inside, directions, sizes = differences(constants, places, at.z)
     error = mass_error(constants, places, errors, at.z)
-    AD = matvec(error.ratio, symmetric(h * limits.command))
-    push, KAD = matvec(error.inverse, AD), matvec(error.relative, AD)
-    L = symmetric(h * limits.lag)
+    D, L = limits.differences(period(parts))
+    AD = matvec(error.ratio, D)
+    push = matvec(error.inverse, AD)
+    lagging = estimate_rate(parts, error, momentum_rate(parts, errors), AD, L)
     of_model = (parts.model, parts.disturbance)
 
     def rates(f_tilde: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         step = path_rates(parts, errors, f_tilde, push)
-        estimate = g * (f_tilde - KAD + L)
+        estimate = parts.kf * f_tilde + lagging
         torque = along(lambda at: free_torque(parts, at), (errors,), (step,))
         momentum = along(lambda at: momentum_term(parts, at), (errors,), (step,))
         now, change = jax.jvp(lambda at: kinematics(parts, at, f_tilde), (errors,), (step,))
@@ -530,14 +702,36 @@ class HeldRates(NamedTuple):
     """f', (n,) [N m/s]."""
 
 
+def biased_rate(parts: ArmParts, at: Errors) -> jax.Array:
+    """The part r (u_h + n) of phi', (n,) [N m/s]."""
+    if parts.innovation_gain is None:
+        return jnp.zeros_like(parts.kf)
+    return (parts.kf - parts.innovation_gain) * momentum_rate(parts, at)
+
+
+def mass_ratio(parts: ArmParts, at: Errors, vector: jax.Array) -> jax.Array:
+    """A times a vector for the true plant in `parts`, (n,)."""
+    q = position(parts, at)
+    M0, M = parts.model.mass_matrix(q), parts.plant.mass_matrix(q)
+    return matvec(M0, jnp.linalg.solve(M, vector))
+
+
 def rates_at(parts: ArmParts, at: Errors, f_tilde: jax.Array) -> HeldRates:
     """The rates of u, L and f at the age 0, of the true plant in `parts`."""
-    step = arm_motion.rates_of_errors(parts, at, f_tilde)
-    estimate = parts.kf * f_tilde
+    step, bias = arm_motion.rates_of_errors(parts, at, f_tilde), biased_rate(parts, at)
+    estimate = parts.kf * f_tilde + bias
     torque = along(lambda at: free_torque(parts, at), (at,), (step,))
     momentum = along(lambda at: momentum_term(parts, at), (at,), (step,))
-    change = arm_motion.mismatch_rate(parts, at, f_tilde)
+    # f' contains K A phi', and K A = I - A.
+    change = arm_motion.mismatch_rate(parts, at, f_tilde) + bias - mass_ratio(parts, at, bias)
     return HeldRates(torque - estimate, momentum + estimate, change)
+
+
+def bias_addition(parts: ArmParts, weight: jax.Array, at: Errors, f_tilde: jax.Array) -> jax.Array:
+    """What r (u_h + n) adds to V_w' by (H.3), for numbers and the true plant in `parts`,
+    () [N m rad/s].
+    """
+    return -weight * inner(f_tilde, mass_ratio(parts, at, biased_rate(parts, at)))
 
 
 def held_addition(
@@ -553,13 +747,13 @@ def held_addition(
     """
     now = kinematics(parts, at, f_tilde)
     M0, M = parts.model.mass_matrix(now.q), parts.plant.mass_matrix(now.q)
-    push = jnp.linalg.solve(M, D)
+    push, g = jnp.linalg.solve(M, D), innovation_gain(parts)
+    AD = matvec(M0, push)
     step = Errors(jnp.zeros_like(at.t), jnp.zeros_like(at.xi), push)
 
     def mismatch_at(at: Errors) -> jax.Array:
         return arm_motion.mismatch_torque(parts, kinematics(parts, at, f_tilde))
 
     change = along(mismatch_at, (at,), (step,))
-    inside = change + parts.kf * (matvec(M - M0, push) - L)
-    direction = matvec(M0, jnp.linalg.solve(M, inside))
-    return inner(at.e2, matvec(M0, push)) + weight * inner(f_tilde, direction)
+    inside = change + g * (matvec(M, push) - AD - L) - (parts.kf - g) * AD
+    return inner(at.e2, AD) + weight * inner(f_tilde, mass_ratio(parts, at, inside))

@@ -68,6 +68,11 @@ class ArmParts(NamedTuple):
     """Guard of the law's barrier, () [1]."""
     period: jax.Array | None = None
     """Of the samples, () [s]; None for a continuous loop."""
+    innovation_gain: jax.Array | None = None
+    """Of a sampled observer the gain of what the model does not explain of the momentum's change
+    in a period, (n,) [1/s]; None where it is kf."""
+    measurement_error: jax.Array | None = None
+    """Bound of the errors of the positions that samples read, (n,) [rad]; None for exact ones."""
 
 
 class Errors(NamedTuple):

@@ -69,19 +69,25 @@ from iblf_jax.world.robots import Robot
 
 APPLIED = "The torque of the law is applied as it is: without {parts} or delay."
 HELD_TORQUE = (
-    "Law and observer read exact measurements at the same instant every {period:g} s, and their"
+    "Law and observer read {readings} at the same instant every {period:g} s, and their"
     " torque is held from this instant to the next one; the observer makes a step of the kind"
     ' "{observer}" meanwhile.',
     "A run starts at a sample, so that each torque is one that the law commanded inside the set."
     " V_w of a state between samples is that of the torque that the law would command there, and of"
     " the estimate interpolated by (G.6).",
 )
+ENCODERS = (
+    "V_w is that of the true state, and of the estimate that the observer would give with the true"
+    " momentum; a torque on the set differs from the law's one at the true state by what the errors"
+    " of the measurement change."
+)
+"""What is added for errors of measurements."""
+ROUNDING = 1.0 + 1e-12
+"""Factor of the bound of such an error, which is computed in double precision."""
 EXACT = (
     "The observer's error and the state are exactly those of the level set; measurements have no"
     " noise."
 )
-KNOWN_STEPS = ("poles", "euler")
-"""Steps of the observer whose estimate the bound has between samples."""
 MOST_NUMBERS = 6
 """Largest number m of uncertain numbers: the bound has a copy of its terms for each of 2^m corners.
 Plants in strict-feedback form have a bound without corners."""
@@ -140,20 +146,28 @@ class HeldRates(OfStructure):
     """The rates of a held torque at a point of sampled arms of one structure."""
 
     def __call__(self, point: jax.Array, constants: list[jax.Array]) -> jax.Array:
-        """Those at the age 0, (3, n) [N m/s]."""
+        """Those at the age 0, (3, n) [N m/s], and with errors of measurements E_u and E_L below
+        them [N m].
+        """
         numbers: Constants = jax.tree.unflatten(self.structure, constants)
         at = point_of(self.places, jnp.asarray(point), numbers)
-        return jnp.stack(arm_held.rates_at(at.parts, at.errors, at.f_tilde))
+        rates = [*arm_held.rates_at(at.parts, at.errors, at.f_tilde)]
+        if at.parts.measurement_error is not None:
+            rates += arm_held.first_sizes(at.parts, at.errors)
+        return jnp.stack(rates)
 
 
 class SampledArmRate(ArmRate):
     """V_w' at a point of sampled arms of one structure, to first order in the period."""
 
     def __call__(self, point: jax.Array, constants: list[jax.Array]) -> jax.Array:
-        """The larger one of those at the ages 0 and a period of the torque, () [N m rad/s]."""
-        fresh = super().__call__(point, constants)
+        """The larger one of those at the ages 0 and a period of the torque, without errors of
+        measurements, () [N m rad/s].
+        """
+        rate = super().__call__(point, constants)
         numbers: Constants = jax.tree.unflatten(self.structure, constants)
         at = point_of(self.places, jnp.asarray(point), numbers)
+        fresh = rate + arm_held.bias_addition(at.parts, numbers.weight, at.errors, at.f_tilde)
         h = cast(jax.Array, numbers.parts.period)
         rates = arm_held.rates_at(at.parts, at.errors, at.f_tilde)
         added = arm_held.held_addition(
@@ -309,6 +323,7 @@ def arm_problem(
         scenario = canonical(astype(scenario, jnp.float64))
         free, limits = without_limits(scenario)
         _check_rate(disturbance_rate, limits, scenario.sampling)
+        _check_limits(limits, scenario.sensor)
         parts = _parts_of(free)
         uncertain = uncertain_coordinates(scenario, parameters, disturbance_rate)
         _check_count(len(uncertain.low))
@@ -327,7 +342,12 @@ def arm_problem(
         structure = jax.tree.structure(Constants(parts, uncertain.numbers, zero, zero))
     of_structure = (structure, uncertain.places, tuple(examination.digests))
     claims = claim_sentences([parts.law.barrier])
-    assumptions = (*_timing(scenario, limits), EXACT, *claims, *examination.assumed)
+    assumptions = (
+        *_timing(scenario, limits, parts.measurement_error),
+        EXACT,
+        *claims,
+        *examination.assumed,
+    )
     torque = TorqueFunctions(ArmTorque(*of_structure), ArmTorqueExcess(*of_structure), limits)
     bound: ArmBound | SampledArmBound = ArmBound(*of_structure)
     rate, held_torque = ArmRate(*of_structure), None
@@ -339,7 +359,7 @@ def arm_problem(
         uncertain,
         bound,
         rate,
-        torque if disturbance_rate is None else None,
+        torque if disturbance_rate is None and parts.measurement_error is None else None,
         held_torque,
         length,
         is_period,
@@ -390,9 +410,7 @@ def _check_sampling(scenario: Scenario) -> None:
     sampling = scenario.sampling
     if sampling is None:
         return
-    if type(scenario.sensor) is not sensors.Ideal:
-        reason = "The bound has no errors of measurements, and no velocity from differences."
-        raise unsupported("sensor", type(scenario.sensor).__name__, "sensors.Ideal", reason)
+    _check_sensor(scenario.sensor)
     if sampling.trigger is not None:
         reason = "A command that is not sent leaves an old torque, whose age has no bound."
         raise unsupported("sampling.trigger", type(sampling.trigger).__name__, "None", reason)
@@ -402,23 +420,59 @@ def _check_sampling(scenario: Scenario) -> None:
             " command arrives the torque is not one of the law."
         )
         raise unsupported("sampling.delay", float(sampling.delay), "0 s", reason)
-    if sampling.observer not in KNOWN_STEPS:
-        reason = (
-            "Its estimate is off by about kf period / 2 times the torque that accelerates the"
-            " robot, which the bound does not have."
-        )
-        expected = " or ".join(f'"{step}"' for step in KNOWN_STEPS)
-        raise unsupported("sampling.observer", sampling.observer, expected, reason)
 
 
-def _timing(scenario: Scenario, limits: np.ndarray | None) -> list[str]:
+def _check_sensor(sensor: sensors.AnySensor) -> None:
+    """Raises ValueError for a sensor whose errors have no bound by those of a single sample."""
+    if type(sensor) is sensors.Ideal:
+        return
+    expected = "sensors.Ideal, or an Encoder with velocity=sensors.Measured() and without noise"
+    if type(sensor) is not sensors.Encoder:
+        reason = "The errors of this sensor have no bound here."
+        raise unsupported("sensor", type(sensor).__name__, expected, reason)
+    if type(sensor.velocity) is not sensors.Measured:
+        reason = "A velocity from positions of several samples has an error that the bound lacks."
+        raise unsupported("sensor.velocity", type(sensor.velocity).__name__, expected, reason)
+    for name, noise in (("noise", sensor.noise), ("velocity.noise", sensor.velocity.noise)):
+        if noise is not None and np.any(np.asarray(noise) > 0.0):
+            reason = "Normal noise has no bound, so that no set is invariant under it."
+            raise unsupported(f"sensor.{name}", np.asarray(noise).tolist(), expected, reason)
+
+
+def _measurement_error(sensor: sensors.AnySensor, n: int) -> jax.Array | None:
+    """Bound of the errors of positions, (n,) [rad]; None if they are exact."""
+    if type(sensor) is not sensors.Encoder:
+        return None
+    # Half of a count, and the offset, which the law does not know.
+    size = ROUNDING * (0.5 * sensor.resolution + jnp.abs(jnp.asarray(sensor.offset)))
+    if not np.any(np.asarray(size) > 0.0):
+        return None
+    return jnp.broadcast_to(size, (n,))
+
+
+def _check_limits(limits: np.ndarray | None, sensor: sensors.AnySensor) -> None:
+    """Raises ValueError for limits of a torque that is that of a measured state."""
+    if limits is None or type(sensor) is sensors.Ideal:
+        return
+    reason = "The bound of the torque is that of exact measurements. Leave out the limits."
+    raise unsupported("sensor", type(sensor).__name__, "sensors.Ideal with torque limits", reason)
+
+
+def _timing(scenario: Scenario, limits: np.ndarray | None, error: jax.Array | None) -> list[str]:
     """Sentences on time and on how the torque is applied."""
     sampling = scenario.sampling
     if sampling is None:
         parts = "sampling, saturation" if limits is None else "sampling"
         return [REAL_NUMBERS, APPLIED.format(parts=parts)]
+    readings = "exact measurements"
+    more: list[str] = []
+    if error is not None:
+        sizes = ", ".join(f"{size:.3g}" for size in np.asarray(error))
+        readings = f"positions with errors of at most {sizes} rad, and exact velocities,"
+        more = [ENCODERS]
     numbers = {"period": float(sampling.period), "observer": sampling.observer}
-    return [SAMPLED_REAL_NUMBERS, *(sentence.format(**numbers) for sentence in HELD_TORQUE)]
+    sentences = [sentence.format(readings=readings, **numbers) for sentence in HELD_TORQUE]
+    return [SAMPLED_REAL_NUMBERS, *sentences, *more]
 
 
 def _check_rate(
@@ -494,11 +548,14 @@ def _parts_of(scenario: Scenario) -> ArmParts:
     guard = jnp.asarray(law.barrier.guard)
     object.__setattr__(law, "barrier", without_guard(law.barrier))
     zero = jnp.zeros(())
-    observer, period = cast(observers.Momentum, scenario.observer), None
+    observer, period, gain = cast(observers.Momentum, scenario.observer), None, None
     if scenario.sampling is not None:
         period = scenario.sampling.period
+        discrete = observer.at_period(period)
         if scenario.sampling.observer == "poles":
-            observer = observer.at_period(period)
+            observer = discrete
+        elif scenario.sampling.observer == "exact":
+            gain = jnp.broadcast_to(discrete.kf, (scenario.n,))
     return ArmParts(
         cast(Robot, scenario.model).at(zero),
         cast(Robot, scenario.plant).at(zero),
@@ -509,6 +566,8 @@ def _parts_of(scenario: Scenario) -> ArmParts:
         scenario.bounds[0],
         guard,
         period,
+        gain,
+        _measurement_error(scenario.sensor, scenario.n),
     )
 
 

@@ -18,8 +18,10 @@ FACTORS = (2.0, 3.0, 6.0)
 """Bounds that are tried, in parts of the largest rates that were found; the least one with a proof
 is used. Larger ones make the enclosure of a path wider, but a proof that they hold shorter."""
 LOOSER = 3.0
-"""Factor of these bounds for all rates but those of torque and estimate: the enclosure of f' is the
-widest one, and a path hardly depends on it."""
+"""Factor of the bound of the rate of f, the third one: the enclosure of f' is the widest one, and a
+path hardly depends on it."""
+LEAST = 1e-9
+"""The least of these bounds [N m/s] or [N m]: a number that is 0 on the set is below it."""
 BOXES = 5_000_000
 """Boxes of the search with one of them."""
 
@@ -56,10 +58,10 @@ def proved_rates(
     """
     assert problem.held_torque is not None
     largest = found_rates(problem, constants, seed)
-    largest[2:] *= LOOSER
+    largest[2] *= LOOSER
     lower, upper, scales = problem.whole_set
     for factor in FACTORS:
-        limits = factor * largest
+        limits = np.maximum(factor * largest, LEAST)
         result = searched(
             problem.held_torque.excess,
             lower,

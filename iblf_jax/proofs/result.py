@@ -179,11 +179,13 @@ class Proof(Result):
     """For each weight a point with V_w' > 0, if every weight has one; () otherwise."""
     torque: TorqueRange | None = None
     """The torque of the law on the set, with bounds if the verdict is PROVED; None for a plant in
-    strict-feedback form, with `disturbance_rate`, and where V_w' > 0 at each weight."""
+    strict-feedback form, with `disturbance_rate` or errors of measurements, and where V_w' > 0
+    at each weight."""
     held_rates: np.ndarray | None = None
     """Of a sampled loop, proved bounds on the set of the rates of the law's torque, of the lag of
-    the observer, and of f of the law's torque, (3, n) [N m/s]; None without a proof of them, and of
-    a continuous loop."""
+    the observer, and of f of the law's torque, (3, n) [N m/s]; with errors of measurements two rows
+    more, by how much they change torque and lag at a sample [N m]; None without a proof of them,
+    and of a continuous loop."""
     boxes: int = 0
     """Number of boxes that were evaluated for V_w'."""
     done: float = 0.0

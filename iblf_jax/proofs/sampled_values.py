@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.control.observers import Momentum
+from iblf_jax.control.sensors import Ideal
 from iblf_jax.core import programs
 from iblf_jax.core.linalg import inner, matvec
 from iblf_jax.core.pytree import unwrapped
@@ -31,7 +32,7 @@ def before_sampling(scenario: Scenario) -> Scenario:
         return scenario
     if sampling.observer == "poles":
         observer = observer.at_period(sampling.period)
-    return dataclasses.replace(scenario, sampling=None, observer=observer)
+    return dataclasses.replace(scenario, sampling=None, observer=observer, sensor=Ideal())
 
 
 def terms(scenario: Scenario, t: jax.Array, state: LoopState) -> tuple[jax.Array, jax.Array]:

@@ -29,29 +29,49 @@ KF = np.array([100.0, 60.0])
 UNEVEN = 0.75 * np.pi
 """The time at which the widths of the tube on both sides differ most, by a factor of 5.9."""
 MASSES = {"plant.mass, plant.inertia": ij.factor(ij.interval(0.99, 1.01))}
-EULER, POLES = "euler", "poles"
+EULER, POLES, EXACT = STEPS = "euler", "poles", "exact"
 
 
 def sampled(scenario, period=PERIOD, observer=POLES, **parts):
     return dataclasses.replace(scenario, sampling=ij.Sampling(period, observer=observer, **parts))
 
 
+def encoder(counts=None, noise=None, offset=0.0, velocity=None):
+    velocity = ij.sensors.Measured() if velocity is None else velocity
+    return ij.sensors.Encoder(velocity=velocity, counts=counts, noise=noise, offset=offset)
+
+
+READING = 1e-3
+"""Largest error of the encoder of the tests, half of its step [rad]."""
+ROUGH = encoder(counts=np.pi / READING)
+
+
 @functools.cache
-def problem_of_paper_loop(observer=POLES):
+def problem_of_paper_loop(observer=POLES, sensor=None):
     scenario = sampled(paper_loop(), observer=observer)
-    observer = dataclasses.replace(scenario.observer, kf=KF)
-    return arm_problem(dataclasses.replace(scenario, observer=observer), MASSES)
+    observer, sensor = dataclasses.replace(scenario.observer, kf=KF), sensor or ij.sensors.Ideal()
+    return arm_problem(dataclasses.replace(scenario, observer=observer, sensor=sensor), MASSES)
 
 
-MEASURED = ij.sensors.Encoder(velocity=ij.sensors.Measured())
+def read_by(sensor, observer=POLES):
+    return dataclasses.replace(sampled(pendulum(), observer=observer), sensor=sensor)
+
+
+def limited(scenario):
+    law = ij.controllers.Saturated(scenario.controller, limit=100.0)
+    return dataclasses.replace(scenario, controller=law)
 
 
 @pytest.mark.parametrize(
     ("text", "scenario"),
     {
         "scenario.sampling.trigger": sampled(pendulum(), trigger=ij.EventTrigger(relative=0.1)),
-        "off by about kf period / 2": sampled(pendulum(), observer="exact"),
-        "scenario.sensor": dataclasses.replace(sampled(pendulum()), sensor=MEASURED),
+        "Normal noise has no bound": read_by(encoder(noise=1e-4)),
+        "scenario.sensor.velocity.noise": read_by(encoder(velocity=ij.sensors.Measured(0.1))),
+        "positions of several samples": read_by(
+            encoder(velocity=ij.sensors.FilteredDifference(100.0))
+        ),
+        "with torque limits": limited(read_by(ROUGH)),
     }.items(),
 )
 def test_a_sampling_that_the_bound_does_not_know_is_refused(text, scenario):
@@ -74,8 +94,10 @@ class SampledTwoLinks(TwoLinks):
 
     step = 1e-30
 
-    def __init__(self, gain, weight=WEIGHT):
+    def __init__(self, gain, weight=WEIGHT, momentum_gain=0.0, measured=None):
         self.gain = gain
+        self.measured = measured or (lambda q: q)
+        self.momentum_gain = momentum_gain
         self.weight = weight
 
     def along(self, function, state, rates):
@@ -86,7 +108,8 @@ class SampledTwoLinks(TwoLinks):
     def alpha_rate(self, t, q, v):
         q_d, dq_d, ddq_d, k_l, k_u, dk_l, dk_u = self.tube(t)
         # The rates of the widths, differentiated once more, are -0.14 sin of the same arguments.
-        wave, side = q_d - 0.5, 0.14 * np.sin(t[:, None] + self.phase[::-1])
+        wave = q_d - 0.5
+        side = 0.3 + wave - k_l
         bend = wave - side
         r_l, r_u = dk_l / k_l, dk_u / k_u
         kappa = np.sqrt(r_u**2 + r_l**2 + self.o)
@@ -146,11 +169,18 @@ class SampledTwoLinks(TwoLinks):
             return np.einsum("bij,bj->bi", M0, v)
 
         p_rate = self.along(momentum, (q, v), (v, a))
-        return np.ones_like(t), v, a, self.gain * (p_rate - phi_k - tau - n_k)
+        estimate = self.gain * (p_rate - phi_k - tau - n_k) + self.momentum_gain * p_rate
+        return np.ones_like(t), v, a, estimate
 
     def sample(self, state):
-        _, q, v, phi = state
-        return self.law(*state), phi, self.momentum_term(q, v)
+        """Torque, estimate and n of what is measured."""
+        t, q, v, phi = state
+        read = self.measured(q)
+        M0, _, _ = self.dynamics(q, np.ones_like(q))
+        M0_read, _, _ = self.dynamics(read, np.ones_like(q))
+        change = np.einsum("bij,bj->bi", M0_read - M0, v)
+        estimate = phi + (self.gain + self.momentum_gain) * change
+        return self.law(t, read, v, estimate), estimate, self.momentum_term(read, v)
 
     def moved(self, state, sample, factor, age, steps=8):
         """The state some time after the sample, by Runge and Kutta's method."""
@@ -186,10 +216,14 @@ class SampledTwoLinks(TwoLinks):
         state = (t, q, self.alpha(t, q) + e2, np.zeros_like(q))
         return self.with_f_tilde(state, f_tilde, factor), factor
 
+    def without_errors(self, state):
+        """The sample of exact measurements."""
+        _, q, v, phi = state
+        return self.law(*state), phi, self.momentum_term(q, v)
+
     def differences(self, state, sample):
         """D and L of a state after a sample."""
-        u, phi, n = self.sample(state)
-        tau, phi_k, n_k = sample
+        (u, phi, n), (tau, phi_k, n_k) = self.without_errors(state), sample
         return tau - u, n - n_k + phi - phi_k
 
     def with_f_tilde(self, state, f_tilde, factor):
@@ -233,6 +267,41 @@ class SampledTwoLinks(TwoLinks):
         return np.concatenate([t[:, None], s, factor], axis=1), level
 
 
+class SampledPendulum(SampledTwoLinks):
+    """The pendulum, whose reference and bounds are those of the first of two links."""
+
+    def tube(self, t):
+        return [x[:, :1] for x in super().tube(t)]
+
+    def dynamics(self, q, factor):
+        inertia = 2.0 * factor * 0.175**2 + 0.06
+        return inertia[..., None], None, 2.0 * factor * 0.175 * self.g * np.cos(q)
+
+    def coriolis(self, h, v, u):
+        return np.zeros_like(v)
+
+    def momentum_term(self, q, v):
+        return -self.dynamics(q, np.ones_like(q))[2]
+
+    def starts(self, count, level, seed, *, near=0.0):
+        generator = np.random.default_rng(seed)
+        t = generator.uniform(0.0, 2.0 * np.pi, count)
+        s = generator.normal(size=(3, count, 1))
+        if near:
+            t = UNEVEN + 0.1 * (t - np.pi) + np.pi * generator.integers(0, 2, count)
+            s[0] *= near
+        s /= np.linalg.norm(s, axis=0)
+        q_d, _, _, k_l, k_u, _, _ = self.tube(t)
+        q = q_d + np.sign(s[0]) * np.sqrt(-np.expm1(-level * s[0] ** 2)) * np.where(
+            s[0] > 0.0, k_u, k_l
+        )
+        M0 = self.dynamics(q, np.ones_like(q))[0][..., 0]
+        v = self.alpha(t, q) + np.sqrt(2.0 * level / M0) * s[1]
+        factor = 1.0 + 0.01 * generator.choice([-1.0, 0.0, 1.0], (count, 1))
+        f_tilde = np.sqrt(2.0 * level / self.weight) * s[2]
+        return self.with_f_tilde((t, q, v, np.zeros_like(q)), f_tilde, factor), factor
+
+
 def added(state, rates, size):
     """state + size rates; `size` is a number, or one for each run, (count, 1)."""
     sizes = [np.squeeze(size), size, size, size]
@@ -240,7 +309,18 @@ def added(state, rates, size):
 
 
 def gain_of(observer, kf=KF, period=PERIOD):
-    return -np.expm1(-kf * period) / period if observer == POLES else kf
+    return kf if observer == EULER else -np.expm1(-kf * period) / period
+
+
+def own_loop(observer, kf=KF, period=PERIOD, measured=None, links=SampledTwoLinks):
+    gain = gain_of(observer, kf, period)
+    momentum_gain = kf - gain if observer == EXACT else 0.0
+    return links(gain, momentum_gain=momentum_gain, measured=measured)
+
+
+@functools.cache
+def rough_pendulum(observer):
+    return arm_problem(read_by(ROUGH, observer), within(1.0))
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -248,6 +328,7 @@ def compiled_rates(places, constants, points, levels, D, L):
     def one(point, level, D, L):
         at = point_of(places, point, constants._replace(level=level))
         fresh = arm_motion.lyapunov_rate(at.parts, WEIGHT, at.errors, at.f_tilde)
+        fresh = fresh + arm_held.bias_addition(at.parts, WEIGHT, at.errors, at.f_tilde)
         added = arm_held.held_addition(at.parts, WEIGHT, at.errors, at.f_tilde, D, L)
         return fresh + added, arm_held.rates_at(at.parts, at.errors, at.f_tilde)
 
@@ -261,10 +342,10 @@ def rates_of_package(problem, points, levels, D, L):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("observer", [POLES, EULER])
+@pytest.mark.parametrize("observer", STEPS)
 def test_rate_of_a_held_torque_is_that_of_other_equations(observer):
     problem = problem_of_paper_loop(observer)
-    loop = SampledTwoLinks(gain_of(observer))
+    loop = own_loop(observer)
     state, factor = loop.starts(200, 1.0, 0)
     generator = np.random.default_rng(1)
     tau, phi_k, n_k = now = loop.sample(state)
@@ -277,9 +358,10 @@ def test_rate_of_a_held_torque_is_that_of_other_equations(observer):
 
 
 @pytest.mark.slow
-def test_first_order_in_the_age_is_exact():
-    problem = problem_of_paper_loop()
-    loop = SampledTwoLinks(gain_of(POLES))
+@pytest.mark.parametrize("observer", [POLES, EXACT])
+def test_first_order_in_the_age_is_exact(observer):
+    problem = problem_of_paper_loop(observer)
+    loop = own_loop(observer)
     start, factor = loop.starts(200, 0.1, 2)
     # At e1 = 0 the rates jump, and the remainder is of first order.
     is_far = np.all(np.abs(loop.errors(*start[:3])[0]) > 1e-3, axis=1)
@@ -306,8 +388,8 @@ class Enclosures(OfStructure):
     def __call__(self, x, constants):
         *leaves, limits, D, L = constants
         numbers = jax.tree.unflatten(self.structure, leaves)
-        limits = arm_held.PathRates(*limits)
-        at = coordinates(x, 2, self.places.coordinates)
+        limits, n = arm_held.PathRates(*limits), numbers.parts.kf.shape[0]
+        at = coordinates(x, n, self.places.coordinates)
         point = arm_errors(numbers, at)
         on_set = arm_held._rates(numbers, self.places, point, at, limits)
         numbers = numbers._replace(parts=arm_held.two_sided(numbers.parts, at.sign))
@@ -315,12 +397,19 @@ class Enclosures(OfStructure):
         path = arm_held._path(numbers, self.places, point, at.z, limits)
         error = arm_held.mass_error(numbers, self.places, path.at, at.z)
         rates = arm_held.first_rates(numbers, self.places, path.at, at.z)
-        means = arm_held.path_means(parts, path, error, rates, limits)
+        no_error = arm_held.FirstDifferences(jnp.zeros(n), jnp.zeros(n), True)
+        first = None
+        if parts.measurement_error is not None:
+            first = arm_held.first_differences(parts, path.at)
+        means = arm_held.path_means(parts, path, error, rates, limits, first)
         of_path = arm_held.mean_rates(parts, error, rates, means)
         under = arm_held.rates_under(parts, error, rates, D, L)
         e2 = point.errors.e2
         added = arm_held.added_terms(numbers, e2, error, rates.mismatch, *under)
         outputs = [(path.at.xi, path.at.e2, path.f_tilde), means, of_path, under, added, on_set]
+        outputs.append((first or no_error)[:2])
+        given = arm_held.FirstDifferences(D, L, True)
+        outputs.append(arm_held.first_terms(numbers, e2, error, rates.mismatch, given)[:2])
         enclosed = jnp.where(path.is_enclosed, 0.0, jnp.nan)
         return [jnp.ravel(leaf) + enclosed for leaf in jax.tree.leaves(outputs)]
 
@@ -332,19 +421,22 @@ OUTPUTS = (
     *("power", "push", "slope"),
     *("set_command", "set_command_slope", "set_lag", "set_lag_slope"),
     *("set_mismatch", "set_mismatch_slope"),
+    *("first_D", "first_L", "first_power", "first_push"),
 )
 Found = namedtuple("Found", OUTPUTS)
 """Lower or upper ends of `Enclosures`, one row for each box."""
 
 
-OwnRuns = namedtuple("OwnRuns", "loop start sample factor age end levels x path limits")
+OwnRuns = namedtuple("OwnRuns", "problem loop start sample factor age end levels x path limits")
 """Runs of `SampledTwoLinks` within a period, with nine states on each path, the coordinates of
-their ends, and a little more than the largest rates on each path, (count, 3, 2)."""
+their ends, and a little more than the largest rates on each path, (count, 3, 2); with errors of
+measurements also than D and L at its sample, (count, 5, 2)."""
 
 
-def enclosed(runs, problem, function, size, generator, *, period=PERIOD, more=()):
+def enclosed(runs, function, size, generator, *, period=PERIOD, more=()):
     """The lower and upper ends of a function over boxes that contain the ends of the runs."""
-    width = np.concatenate([problem.upper - problem.lower, np.zeros(3)])
+    problem = runs.problem
+    width = np.append(problem.upper - problem.lower, np.zeros(problem.sign_count + 1))
     below, above = generator.uniform(size=(2, *runs.x.shape)) * size + 1e-12
     low, high = runs.x - below * width, runs.x + above * width
     found = []
@@ -359,12 +451,17 @@ def enclosed(runs, problem, function, size, generator, *, period=PERIOD, more=()
 
 
 @functools.cache
-def own_runs(near=0.0, ends_without_f_tilde=False, count=60):
+def own_runs(near=0.0, ends_without_f_tilde=False, count=60, observer=POLES, rough=False):
     """With `near`, runs begin near e1 = 0 where the sides of the tube differ most, and paths cross
     it; one can choose that the runs end with f_tilde = 0.
+    With rounded positions they are those of the pendulum.
     """
-    loop = SampledTwoLinks(gain_of(POLES))
     generator = np.random.default_rng(3)
+    problem, loop = problem_of_paper_loop(observer), own_loop(observer)
+    if rough:
+        shift = READING * np.random.default_rng(7).choice([-1.0, -0.5, 1.0], (count, 1))
+        problem = rough_pendulum(observer)
+        loop = own_loop(observer, 100.0, measured=lambda q: q + shift, links=SampledPendulum)
     start, factor = loop.starts(count, LEVEL, 4, near=near)
     age = PERIOD * generator.choice([0.01, 0.3, 1.0, 1.0], (count, 1))
     for _ in range(4 * ends_without_f_tilde):
@@ -377,24 +474,31 @@ def own_runs(near=0.0, ends_without_f_tilde=False, count=60):
     sides = [np.sign(loop.errors(*x[:3])[0]) for x in (start, end)]
     assert not near or np.any(sides[0] != sides[1], axis=1).mean() > 0.1
     rates = np.abs([loop.held_rates(state, sample, factor) for state in path])
-    limits = 1.05 * np.moveaxis(rates.max(axis=0), 1, 0)
+    limits = rates.max(axis=0)
+    if rough:
+        limits = np.concatenate([limits, np.abs(loop.differences(start, sample))])
+    limits = 1.05 * np.moveaxis(limits, 1, 0)
     points, levels = loop.points(end, factor)
     # The times are those of the first period.
     points[:, 0] = np.mod(points[:, 0], 2.0 * np.pi)
-    x = np.array([coordinates_of(point, 2) for point in points])
-    return OwnRuns(loop, start, sample, factor, age, end, levels, x, path, limits)
+    x = np.array([coordinates_of(point, problem.sign_count) for point in points])
+    return OwnRuns(problem, loop, start, sample, factor, age, end, levels, x, path, limits)
+
+
+KINDS = [(POLES, False), (EXACT, True)]
+"""Steps of the observer, and whether the runs are those of a pendulum with rounded positions."""
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("observer", "rough"), KINDS)
 @pytest.mark.parametrize("near", [0.0, 0.02])
-def test_bound_over_boxes_is_above_the_rate_of_runs_between_samples(near):
+def test_bound_over_boxes_is_above_the_rate_of_runs_between_samples(near, observer, rough):
     """Boxes contain the end of a path of an own run."""
-    problem = problem_of_paper_loop()
-    runs = own_runs(near)
+    runs = own_runs(near, observer=observer, rough=rough)
     expected = runs.loop.rate_of_lyapunov(runs.end, runs.sample, runs.factor)
     generator, gaps = np.random.default_rng(1), []
     for size in (0.0, 1e-3, 1e-2, 0.03):
-        bounds = enclosed(runs, problem, problem.bound, size, generator)[1][0][:, 0]
+        bounds = enclosed(runs, runs.problem.bound, size, generator)[1][0][:, 0]
         assert not np.any(bounds < expected - 1e-9)
         if size <= 1e-3:
             assert np.all(np.isfinite(bounds))
@@ -404,12 +508,12 @@ def test_bound_over_boxes_is_above_the_rate_of_runs_between_samples(near):
 
 def enclosures_of(runs, size, *, period=PERIOD, D=None, L=None):
     """Lower and upper ends of `Enclosures` over boxes that contain the ends of runs."""
-    problem = problem_of_paper_loop()
-    function = Enclosures(problem.bound.structure, problem.bound.places, ())
+    bound = runs.problem.bound
+    function = Enclosures(bound.structure, bound.places, ())
     zero = np.zeros_like(runs.factor)
     more = [zero if x is None else x for x in (D, L)]
     generator = np.random.default_rng(1)
-    ends = enclosed(runs, problem, function, size, generator, period=period, more=more)
+    ends = enclosed(runs, function, size, generator, period=period, more=more)
     low, high = (Found(*some) for some in ends)
     # The bounds of rates of a single run are too small to enclose some paths.
     assert np.isnan(low.xi).any(axis=1).mean() < 0.1
@@ -425,17 +529,21 @@ def assert_inside(value, low, high, slack=0.0):
 def affine(found, name, f_tilde):
     """The ends of an affine function of f_tilde."""
     values = [getattr(some, name) for some in found]
-    slopes = [getattr(some, f"{name}_slope").reshape(-1, 2, 2) for some in found]
+    n = f_tilde.shape[1]
+    slopes = [getattr(some, f"{name}_slope").reshape(-1, n, n) for some in found]
     products = [slope * f_tilde[:, None, :] for slope in slopes]
     least = values[0] + np.minimum(*products).sum(axis=-1)
     return least, values[1] + np.maximum(*products).sum(axis=-1)
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("observer", "rough"), KINDS)
 @pytest.mark.parametrize(("near", "ends_without_f_tilde"), [(0.0, False), (0.02, True)])
-def test_enclosures_contain_the_path_and_the_means_of_runs(near, ends_without_f_tilde):
+def test_enclosures_contain_the_path_and_the_means_of_runs(
+    near, ends_without_f_tilde, observer, rough
+):
     """The bounds of the rates are hardly above those of each run."""
-    runs = own_runs(near, ends_without_f_tilde)
+    runs = own_runs(near, ends_without_f_tilde, observer=observer, rough=rough)
     loop, end, age = runs.loop, runs.end, runs.age
     f_tildes, differences, values = [], [], []
     for state in runs.path:
@@ -446,7 +554,7 @@ def test_enclosures_contain_the_path_and_the_means_of_runs(near, ends_without_f_
         f_tildes.append(loop.f_tilde(*state, runs.factor))
         differences.append(loop.differences(state, runs.sample))
         values.append((e1 / width, e2))
-    D, L = differences[-1]
+    (D_0, L_0), (D, L) = differences[0], differences[-1]
     paths = [f_tildes, *zip(*differences, strict=True)]
     mean_f_tilde, mean_D, mean_L = (np.tensordot(SIMPSON, np.array(path), 1) for path in paths)
     for size in (0.0, 1e-3, 1e-2):
@@ -462,7 +570,9 @@ def test_enclosures_contain_the_path_and_the_means_of_runs(near, ends_without_f_
         products = [some.growth * f_tildes[-1] for some in (low, high)]
         least, most = np.minimum(*products) + low.rest, np.maximum(*products) + high.rest
         assert_inside(mean_f_tilde, least, most, slack)
-        for name, rate in (("command", -D / age), ("lag", L / age)):
+        assert_inside(D_0, low.first_D, high.first_D)
+        assert_inside(L_0, low.first_L, high.first_L)
+        for name, rate in (("command", (D_0 - D) / age), ("lag", (L - L_0) / age)):
             least, most = affine((low, high), name, f_tildes[-1])
             assert_inside(rate, least, most, 1e-6)
 
@@ -471,11 +581,12 @@ SIMPSON = np.array([1.0, 4.0, 2.0, 4.0, 2.0, 4.0, 2.0, 4.0, 1.0]) / 24.0
 
 
 @pytest.mark.slow
-def test_terms_of_the_bound_are_those_of_other_equations():
+@pytest.mark.parametrize(("observer", "rough"), KINDS)
+def test_terms_of_the_bound_are_those_of_other_equations(observer, rough):
     """Over points and for a short period, enclosures are narrow."""
-    runs = own_runs()
+    runs = own_runs(observer=observer, rough=rough)
     loop, short = runs.loop, 1e-12
-    u, phi, n = now = loop.sample(runs.end)
+    u, phi, n = now = loop.without_errors(runs.end)
     sample = [x + np.random.default_rng(5).normal(size=x.shape) for x in now]
     D, L = loop.differences(runs.end, sample)
     found = enclosures_of(runs, 0.0, period=short, D=D, L=L)
@@ -490,7 +601,8 @@ def test_terms_of_the_bound_are_those_of_other_equations():
     added = (added - loop.rate_of_lyapunov(runs.end, now, runs.factor))[:, None]
     values = [some.power / short for some in found]
     slopes = [(some.push / short)[:, None, :] for some in found]
-    squares = [some.slope.reshape(-1, 2, 2) * WEIGHT / short for some in found]
+    joints = f_tilde.shape[1]
+    squares = [some.slope.reshape(-1, joints, joints) * WEIGHT / short for some in found]
     products = [f_tilde[:, None, :] * x for x in slopes]
     pairs = [np.einsum("bi,bij,bj->bij", f_tilde, x, f_tilde) for x in squares]
     least = values[0] + np.minimum(*products).sum(axis=2)
@@ -499,13 +611,21 @@ def test_terms_of_the_bound_are_those_of_other_equations():
     most = most + np.maximum(*pairs).sum(axis=(1, 2))[:, None]
     assert_inside(added, least, most)
     assert np.max(most - least) < 1e-2 * np.abs(added).max()
+    # What the D and L at the sample add.
+    added = loop.rate_of_lyapunov(runs.end, sample, runs.factor)
+    added = added - loop.rate_of_lyapunov(runs.end, now, runs.factor)
+    products = [f_tilde * some.first_push for some in found]
+    least = found[0].first_power[:, 0] + np.minimum(*products).sum(axis=1)
+    most = found[1].first_power[:, 0] + np.maximum(*products).sum(axis=1)
+    assert_inside(added, least, most)
+    assert np.max(most - least) < 1e-2 * np.abs(added).max()
 
 
 @pytest.mark.slow
 def test_rates_on_the_set_contain_those_of_other_equations():
     """Over points, the ends are near the rates under some D and L of the largest size."""
     runs = own_runs()
-    u, phi, n = runs.loop.sample(runs.end)
+    u, phi, n = runs.loop.without_errors(runs.end)
     sizes = PERIOD * runs.limits[:, :2]
     rates = []
     for signs in np.array(np.meshgrid(*[[-1.0, 1.0]] * 4)).reshape(4, -1).T:
@@ -557,10 +677,11 @@ def test_a_barrier_on_both_sides_contains_its_values_on_each(sign):
 
 
 @pytest.mark.slow
-def test_runs_of_the_package_are_those_of_other_equations():
+@pytest.mark.parametrize("observer", STEPS)
+def test_runs_of_the_package_are_those_of_other_equations(observer):
     """A run from a point of the level set, with the estimate of its last sample."""
-    problem = problem_of_paper_loop()
-    loop = SampledTwoLinks(gain_of(POLES))
+    problem = problem_of_paper_loop(observer)
+    loop = own_loop(observer)
     state, factor = loop.starts(1, LEVEL, 5)
     points, level = loop.points(state, factor)
     scenario = problem.scenario_at(points[0], problem.constants(WEIGHT, level[0]))
@@ -571,15 +692,69 @@ def test_runs_of_the_package_are_those_of_other_equations():
         state = loop.moved(state, loop.sample(state), factor, PERIOD)
 
 
+class FirstEnclosures(OfStructure):
+    """D and L at a sample, of one structure."""
+
+    def __call__(self, x, constants):
+        numbers = jax.tree.unflatten(self.structure, constants[:-1])
+        at = coordinates(x, 2, self.places.coordinates)
+        parts = arm_held.two_sided(numbers.parts, at.sign)
+        first = arm_held.first_differences(parts, arm_errors(numbers, at).errors)
+        return [first.D, first.L + jnp.where(first.is_inside, 0.0, jnp.nan)]
+
+
 @pytest.mark.slow
-def test_level_of_the_start_is_that_of_the_first_sample():
+def test_differences_at_samples_of_two_links_contain_those_of_other_equations():
+    """Over points, the ends are near the differences under the largest errors."""
+    problem, loop = problem_of_paper_loop(EXACT, ROUGH), own_loop(EXACT)
+    for near in (0.0, 0.02):
+        state, factor = loop.starts(60, LEVEL, 9, near=near)
+        points, levels = loop.points(state, factor)
+        points[:, 0] = np.mod(points[:, 0], 2.0 * np.pi)
+        x = np.array([coordinates_of(point, 2) for point in points])
+        limits = np.ones((60, 5, 2))
+        runs = OwnRuns(problem, loop, state, None, factor, None, state, levels, x, None, limits)
+        function = FirstEnclosures(problem.bound.structure, problem.bound.places, ())
+        low, high = enclosed(runs, function, 0.0, np.random.default_rng(1))
+        largest = np.zeros((2, 60, 2))
+        for signs in np.array(np.meshgrid(*[[-1.0, -0.4, 0.4, 1.0]] * 2)).reshape(2, -1).T:
+            loop.measured = lambda q, shift=READING * signs: q + shift
+            found = loop.differences(state, loop.sample(state))
+            for k in range(2):
+                assert_inside(found[k], low[k], high[k])
+            largest = np.maximum(largest, np.abs(found))
+        for k in range(2):
+            assert np.median(high[k] / largest[k]) < 1.2
+
+
+@pytest.mark.slow
+def test_runs_of_the_package_with_rounded_positions_are_those_of_other_equations():
+    def rounded(q):
+        return 2.0 * READING * np.round(q / (2.0 * READING))
+
+    problem, loop = problem_of_paper_loop(POLES, ROUGH), own_loop(POLES, measured=rounded)
+    state, factor = loop.starts(1, LEVEL, 5)
+    points, level = loop.points(state, factor)
+    scenario = problem.scenario_at(points[0], problem.constants(WEIGHT, level[0]))
+    run = ij.simulate(scenario, duration=6 * PERIOD, dt=PERIOD / 4)
+    for k in range(6):
+        sample = loop.sample(state)
+        np.testing.assert_allclose(run.q[4 * k], state[1][0], rtol=1e-8)
+        np.testing.assert_allclose(run.disturbance_estimate[4 * k], sample[1][0], rtol=1e-6)
+        state = loop.moved(state, sample, factor, PERIOD)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("observer", STEPS)
+def test_level_of_the_start_is_that_of_the_first_sample(observer):
     """The observer starts with eta = 0, so that its estimate is the gain times the momentum."""
     loop = pendulum(initial=ij.Initial(q=[0.8], dq=[1.0]))
     expected = start_of(arm_problem(loop, {}))
-    found = start_of(arm_problem(sampled(loop, 5e-3), {}))
+    found = start_of(arm_problem(sampled(loop, 5e-3, observer), {}))
     np.testing.assert_allclose(found.energy, expected.energy, rtol=1e-12)
     momentum = 2.0 * 0.175**2 + 0.06
-    estimate = gain_of(POLES, kf=100.0, period=5e-3) * momentum
+    loop = own_loop(observer, kf=100.0, period=5e-3)
+    estimate = (loop.gain + loop.momentum_gain) * momentum
     np.testing.assert_allclose(found.half_square, 0.5 * estimate**2, rtol=1e-12)
 
 
@@ -587,9 +762,12 @@ def test_level_of_the_start_is_that_of_the_first_sample():
 
 
 @functools.cache
-def proof(period, **options):
+def proof(period, observer=POLES, counts=None, **options):
     given = {"level": 0.5, "weight": WEIGHT, "parameters": within(1.0), "progress": False}
-    return ij.prove(sampled(pendulum(), period), **given | options)
+    scenario = sampled(pendulum(), period, observer)
+    if counts is not None:
+        scenario = dataclasses.replace(scenario, sensor=encoder(counts))
+    return ij.prove(scenario, **given | options)
 
 
 @pytest.mark.slow
@@ -611,13 +789,44 @@ def test_runs_of_two_links_stay_in_a_proved_set_at_all_times():
     scenario = sampled(paper_loop(), 0.5 * PERIOD)
     found = ij.prove(scenario, level=LEVEL, weight=WEIGHT, parameters=MASSES, progress=False)
     assert found.proved
-    loop = SampledTwoLinks(gain_of(POLES, kf=100.0, period=0.5 * PERIOD))
+    loop = own_loop(POLES, kf=100.0, period=0.5 * PERIOD)
     state, factor = loop.starts(10_000, LEVEL, 6)
     for _ in range(600):
         sample = loop.sample(state)
         for _ in range(2):
             state = loop.moved(state, sample, factor, 0.25 * PERIOD, steps=2)
             assert np.all(loop.lyapunov(*state, factor) <= LEVEL)
+
+
+@pytest.mark.slow
+def test_a_pendulum_with_the_exact_step_and_rounded_positions_is_proved():
+    """Own runs, with any errors up to half of a count, do not leave the set at any time."""
+    counts = 10_000.0
+    found = proof(PERIOD, EXACT, counts)
+    assert found.proved
+    assert 'a step of the kind "exact"' in repr(found)
+    assert "positions with errors of at most 0.000314 rad, and exact velocities" in repr(found)
+    assert found.torque is None and found.held_rates.shape == (5, 1)
+    error, generator = np.pi / counts, np.random.default_rng(8)
+    signs = generator.choice([-1.0, 1.0], (400, 1))
+
+    def measured(q):
+        # A quarter of the runs has errors of a constant sign, and others at random.
+        random = generator.uniform(-1.0, 1.0, q.shape)
+        return q + error * np.where(np.arange(len(q))[:, None] % 4, random, signs)
+
+    loop = own_loop(EXACT, 100.0, measured=measured, links=SampledPendulum)
+    state, factor = loop.starts(400, 0.5, 6)
+    start = loop.lyapunov(*state, factor)
+    np.testing.assert_allclose(start, 0.5, rtol=1e-9)
+    for _ in range(300):
+        sample = loop.sample(state)
+        for _ in range(2):
+            state = loop.moved(state, sample, factor, 0.5 * PERIOD, steps=2)
+            assert np.all(loop.lyapunov(*state, factor) < 0.5)
+    for run in found.adversarial_runs(2, duration=0.2):
+        assert run.ok
+        assert np.max(np.abs(run.xi)) <= found.tube.xi.max()
 
 
 @pytest.mark.slow
