@@ -1,5 +1,6 @@
 """Builds the site: `python docs/build.py`; the result is out/site/html/index.html.
 
+`--draft` executes no notebook: those that were not executed appear without their outputs.
 `--version NAME` says which version the pages belong to; they are in out/site/html/NAME. The front
 page leads to the last release there, or to "main", and `switcher.json` lists all of them.
 
@@ -20,7 +21,7 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -87,21 +88,23 @@ def new_work_folder() -> Path:
     return work
 
 
-def outdated(work: Path) -> list[Callable[[], object]]:
-    """The notebooks, scripts and examples of flags whose output is missing or older than they."""
+def outdated(work: Path, notebooks: Iterable[Path]) -> list[Callable[[], object]]:
+    """The scripts, examples of flags and given notebooks whose output is missing or older than
+    they.
+    """
     import flags
     import gallery
 
     return [
-        *(partial(execute, notebook, work) for notebook in NOTEBOOKS if not is_executed(notebook)),
+        *(partial(execute, notebook, work) for notebook in notebooks if not is_executed(notebook)),
         *(partial(gallery.page, script) for script in gallery.PAGES if not gallery.is_made(script)),
         *(partial(flags.section, name) for name in flags.CASES if not flags.is_made(name)),
     ]
 
 
-def execute_outdated() -> None:
+def execute_outdated(notebooks: Iterable[Path]) -> None:
     """Executes what is outdated, each processor one at a time."""
-    tasks = outdated(new_work_folder())
+    tasks = outdated(new_work_folder(), notebooks)
     if not tasks:
         return
     # JAX hangs in processes that are forked from one that has used it.
@@ -119,7 +122,11 @@ def enable_x64() -> None:
 
 
 def tutorial(notebook: Path) -> nbformat.NotebookNode:
-    """An executed notebook, whose pictures have the texts of its figures."""
+    """A notebook as it was executed, whose pictures have the texts of its figures; one that was
+    not executed is without outputs.
+    """
+    if not is_executed(notebook):
+        return nbformat.read(notebook, as_version=4)
     found = nbformat.read(EXECUTED / notebook.name, as_version=4)
     for cell in found.cells:
         shown = [output.get("data", {}) for output in cell.get("outputs", ())]
@@ -249,8 +256,10 @@ def main() -> int:
 
     parser = argparse.ArgumentParser(description="Builds the documentation site.")
     parser.add_argument("--version", default=DEVELOPMENT, help="which version the pages are of")
-    name = parser.parse_args().version
-    execute_outdated()
+    parser.add_argument("--draft", action="store_true", help="without executing notebooks")
+    options = parser.parse_args()
+    name = options.version
+    execute_outdated(() if options.draft else NOTEBOOKS)
     enable_x64()
     assemble()
     shutil.rmtree(HTML / name, ignore_errors=True)

@@ -129,7 +129,8 @@ def pytest_configure(config):
     if "not slow" in config.option.markexpr:
         jax.config.update("jax_numpy_dtype_promotion", "strict")
     is_worker = hasattr(config, "workerinput") or not config.getoption("numprocesses", None)
-    if is_worker and (folder := os.environ.get("TEST_TIMES")):
+    # Tests that run pytest would write over the files.
+    if is_worker and (folder := os.environ.pop("TEST_TIMES", None)):
         config.pluginmanager.register(Times(ROOT / folder))
 
 

@@ -79,11 +79,11 @@ def test_laws_that_are_alike_have_their_own_programs(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.members
-@pytest.mark.parametrize("part", range(4))
+@pytest.mark.parametrize("part", range(8))
 def test_every_member_has_its_own_program(tmp_path_factory, part):
-    """In four parts, with one folder in common if one process runs them; by Euler's method, whose
+    """In eight parts, with one folder in common if one process runs them; by Euler's method, whose
     programs are compiled in a third of the time, where the loop admits it."""
     folder = tmp_path_factory.getbasetemp() / "cache of members"
     names = sorted(scenarios())
     random.Random(1).shuffle(names)
-    check(names[part::4], "euler", folder)
+    check(names[part::8], "euler", folder)

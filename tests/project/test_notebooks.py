@@ -26,13 +26,20 @@ FOLDER = ROOT / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 GOALS = ("## Goals", "After this notebook you can")
 PREREQUISITES = ("Notebooks:", "Knowledge:", "Extras:", "Time:")
+LONG = ("05_certificates", "07_from_paper_to_robot", "09_from_log_to_gains", "10_flexible_arm")
+"""Notebooks that take more than a minute of a processor, but for that on tuning."""
 EXERCISES = range(2, 5)
 """Numbers of exercises that a notebook may have."""
 
 
-@pytest.mark.site
+def marked(path: Path):
+    """The name of a notebook; a long one is slow and not required for a draft of the site."""
+    is_long = path.stem in LONG
+    return pytest.param(path.name, marks=pytest.mark.slow if is_long else pytest.mark.site)
+
+
 @pytest.mark.usefixtures("optimised_kernels")
-@pytest.mark.parametrize("name", [path.name for path in NOTEBOOKS])
+@pytest.mark.parametrize("name", map(marked, NOTEBOOKS))
 def test_notebook_runs(name, tmp_path):
     notebook = build.execute(FOLDER / name, tmp_path)
     shown = [
@@ -46,6 +53,13 @@ def is_progress(output: dict) -> bool:
     """Whether an output of a cell is a bar, or a box, of progress."""
     text = str(output.get("text", ""))
     return "\r" in text or "%|" in text or any("widget" in kind for kind in output.get("data", {}))
+
+
+def test_a_draft_has_notebooks_that_were_not_executed(monkeypatch, tmp_path):
+    monkeypatch.setattr(build, "EXECUTED", tmp_path)
+    page = build.tutorial(NOTEBOOKS[0])
+    assert page.cells
+    assert not any(cell.get("outputs") for cell in page.cells)
 
 
 def test_a_bar_of_progress_is_found():
