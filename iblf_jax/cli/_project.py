@@ -58,6 +58,11 @@ class Project(NamedTuple):
     """Joint -> the inertia that `--rotor-inertia` added to the plant [kg m^2]."""
 
     @property
+    def rotors(self) -> str:
+        """The joints with an added inertia, each with its number [kg m^2]; empty without."""
+        return ", ".join(f"{joint} {inertia:g}" for joint, inertia in self.rotor_inertia.items())
+
+    @property
     def period(self) -> float:
         """The sampling period [s]."""
         return float(self.scenario.sampling.period)  # type: ignore[union-attr]
@@ -486,16 +491,15 @@ TIMES = (
 """Processor time of the three commands, measured with iblf_jax 1.0.0rc1."""
 
 
-def _about_rotors(added: Mapping[str, float]) -> list[str]:
+def _about_rotors(rotors: str) -> list[str]:
     """What `--rotor-inertia` changed, a paragraph of the README; empty if it changed nothing."""
-    if not added:
+    if not rotors:
         return []
-    joints = ", ".join(f"{joint} {inertia:g}" for joint, inertia in added.items())
     return [
         "",
         "The friction of some joints is too fast for the time step; as a rule, the file has the"
         " friction of their drives and not the inertia of their rotors. The simulated robot has an"
-        f" inertia there that is not in the file, chosen for the time step [kg m^2]: {joints}. The"
+        f" inertia there that is not in the file, chosen for the time step [kg m^2]: {rotors}. The"
         " friction is that of the file, and the law knows the robot of the file. Write the"
         " inertias of the rotors, which are the square of the gear ratio times those of the data"
         " sheets, into `armature` of [plant] and [model] if they are known.",
@@ -510,7 +514,7 @@ def _readme_text(project: Project, name: str) -> str:
             "",
             f"{project.about} The law runs every {1e3 * project.period:g} ms. It was run once"
             f" before these files were written: the run of {project.duration:g} s kept its bounds.",
-            *_about_rotors(project.rotor_inertia),
+            *_about_rotors(project.rotors),
             "",
             "The next three commands, in this folder:",
             "",

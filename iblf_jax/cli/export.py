@@ -120,11 +120,10 @@ def run(args: argparse.Namespace) -> int:
     if args.gains is not None:
         chosen["gains"] = [_tunable(text) for text in args.gains]
     options = run_options(args, file)
-    chosen |= {key: options[key] for key in ("dt", "method")}
-    if args.target == "ros2":
-        # A law has no integrator: only what the user gave is checked, not what the file has.
-        del chosen["method"]
-        chosen |= given_options(args, "method")
+    chosen["dt"] = options["dt"]
+    # A law has no integrator: only what the user gave is checked, not what the file has.
+    of_loop = {"method": options["method"]}
+    chosen |= given_options(args, "method") if args.target == "ros2" else of_loop
     try:
         print(export(file.scenario, output_folder(args.out), **chosen))
     except ToolchainError as error:

@@ -64,9 +64,10 @@ def run(args: argparse.Namespace) -> int:
             raise ValueError(str(error)) from error
     names = _project.write(project, output_folder(args.folder, "FOLDER"))
     print(f"written to {folder}: {', '.join(names)}")
-    if project.rotor_inertia:
-        joints = ", ".join(f"{name} {x:g}" for name, x in project.rotor_inertia.items())
-        print(f"inertia added to the simulated robot [kg m^2]: {joints}; README.md says why")
+    if project.rotors:
+        print(
+            f"inertia added to the simulated robot [kg m^2]: {project.rotors}; README.md says why"
+        )
     print(f"\nNext:\n  cd {folder}")
     for command, purpose in _project.COMMANDS[:3]:
         print(f"  {command:<46} # {purpose}")

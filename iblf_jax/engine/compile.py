@@ -17,7 +17,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import itertools
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
@@ -68,6 +68,9 @@ WARNINGS = "backend warnings"
 """Topic of `CACHE` for the warnings that this process has shown."""
 
 
+FAILED = "failed executors"
+"""Topic of `CACHE` for executors that failed, by their name and the key of what they should run."""
+
 OUT_OF_MEMORY = "RESOURCE_EXHAUSTED"
 """XLA's word for a lack of memory, which another executor does not change."""
 
@@ -78,7 +81,10 @@ def _warn_once(text: str) -> None:
 
 
 def first_that_works(
-    execution: ExecutionPlan, attempt: Callable[[Executor], T], by_scan: Callable[[], T]
+    execution: ExecutionPlan,
+    attempt: Callable[[Executor], T],
+    by_scan: Callable[[], T],
+    key: Hashable = None,
 ) -> T:
     """The value of `attempt` for the first executor of a plan that works, else that of `by_scan`.
 
@@ -90,21 +96,30 @@ def first_that_works(
       attempt: function of an executor; it raises ToolchainError if the executor is not available
         or XLA fails (`building`), and UnsupportedError if the executor cannot express the step.
       by_scan: function without arguments.
+      key: what decides, with the executor, whether it works; this process does not try again what
+        has failed for this key.  None to try it again in each call.
 
     Raises:
       StoppedError: the compiler was stopped twice, as at the end of the process.
     """
     for text in execution.warnings:
         _warn_once(text)
-    names = (*execution.backends, "vmap")
-    for name, following in itertools.pairwise(names):
+    names = [x for x in execution.backends if not CACHE.is_marked(FAILED, (x, key))]
+
+    def mark(failed: Iterable[str]) -> None:
+        for each in failed if key is not None else ():
+            CACHE.mark(FAILED, (each, key))
+
+    for name, following in itertools.pairwise((*names, "vmap")):
         try:
             return _attempted(attempt, registry.EXECUTORS[name])
         except StoppedError:
             raise
         except ToolchainError as error:
+            mark([name])
             _warn_once(plan.unavailable_warning(name, error, following))
         except UnsupportedError as reason:
+            mark(names)
             if execution.reports_unsupported:
                 _warn_once(plan.scan_warning(reason))
             break

@@ -60,7 +60,6 @@ from iblf_jax.engine.registry import Availability, Executor
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.structural_constants import constants_of
 from iblf_jax.engine.time_step import TimeStep, positions
-from iblf_jax.kernels import StoppedError, ToolchainError, UnsupportedError
 from iblf_jax.simulation.closed_loop import LoopState
 from iblf_jax.simulation.scenario import Scenario
 
@@ -403,11 +402,6 @@ def _step_states(
     return first_that_works(execution, lambda executor: by(kernel_stepper(executor)), by_scan)
 
 
-FAILED_JACOBIANS = "failed Jacobians"
-"""Topic of `CACHE` for kernels of `sampled_jacobians` that could not be lowered or built, by
-executor, request, structure and shapes; this process does not try it again."""
-
-
 def sampled_jacobians(scenario: Scenario, times: jax.Array, states: LoopState) -> jax.Array:
     """The derivatives of `closed_loop.perturbed_rate` of a sampled loop at many states, by the
     kernel that linearizes runs; studies build the same one.
@@ -431,21 +425,12 @@ def sampled_jacobians(scenario: Scenario, times: jax.Array, states: LoopState) -
         return _sampled_jacobians(scenario, times, states, backend=name, request=request)
 
     def attempt(executor: Executor) -> jax.Array:
-        try:
-            with building():
-                return by(executor.name)
-        except (ToolchainError, UnsupportedError) as error:
-            if not isinstance(error, StoppedError):
-                CACHE.mark(FAILED_JACOBIANS, (executor.name, request, structure, shapes))
-            raise
+        with building():
+            return by(executor.name)
 
     execution = _plan_of_jacobians(request, backend, structure, shapes)
-    backends = tuple(
-        name
-        for name in execution.backends
-        if not CACHE.is_marked(FAILED_JACOBIANS, (name, request, structure, shapes))
-    )
-    return first_that_works(execution._replace(backends=backends), attempt, partial(by, "vmap"))
+    key = (sampled_jacobians, request, structure, shapes)
+    return first_that_works(execution, attempt, partial(by, "vmap"), key)
 
 
 @CACHE.memoised(64)

@@ -20,7 +20,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import programs
-from iblf_jax.core.caches import CACHE
 from iblf_jax.engine import registry, thresholds
 from iblf_jax.engine.batch import Batch, Stepper, finalize, initialize, run_all
 from iblf_jax.engine.carry import Carry
@@ -41,18 +40,12 @@ from iblf_jax.engine.registry import Executor
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.time_step import TimeStep
 from iblf_jax.engine.waiting import wait_until_ready
-from iblf_jax.kernels import StoppedError, ToolchainError
 from iblf_jax.simulation.scenario import Scenario
 
 if TYPE_CHECKING:
     from jax.tree_util import PyTreeDef
 
     from iblf_jax.simulation.metrics import Fold
-
-
-FAILED_BUILDS = "failed builds"
-"""Topic of `CACHE` for kernels that could not be built, by executor, structure and shapes; this
-process does not try to build them again."""
 
 
 def run_one(
@@ -81,23 +74,14 @@ def run_one(
 
     def attempt(executor: Executor) -> Outcome:
         compiled = Compiled(executor.name, structure)
-        try:
-            with building():
-                return _run_by_executor(compiled, nodes, request, leaves)
-        except ToolchainError as error:
-            if not isinstance(error, StoppedError):
-                CACHE.mark(FAILED_BUILDS, (executor.name, structure, shapes))
-            raise
+        with building():
+            return _run_by_executor(compiled, nodes, request, leaves)
 
     def by_scan() -> Outcome:
         return _run_by_scan(structure, request, leaves)
 
-    backends = tuple(
-        name
-        for name in execution.backends
-        if not CACHE.is_marked(FAILED_BUILDS, (name, structure, shapes))
-    )
-    outcome = first_that_works(execution._replace(backends=backends), attempt, by_scan)
+    key = (run_one, structure, shapes)
+    outcome = first_that_works(execution, attempt, by_scan, key)
     wait_until_ready(outcome)
     return outcome
 

@@ -37,6 +37,7 @@ def start_levels(scenario: Scenario) -> jax.Array:
     initial, plant = scenario.initial, scenario.loop.plant
     if plant.order == 2 or initial.higher is not None:
         return initial.x
+    # Inside a trace the operations are part of the program that is traced.
     is_known = checks.is_concrete((plant, initial))
     start = _compiled_steady_start if is_known else _steady_start
     return start(plant, initial)  # type: ignore[no-any-return]

@@ -68,8 +68,9 @@ def write_pickles(names: list[str], folder: Path) -> None:
     operations of all others first.
     """
     folder.mkdir(exist_ok=True)
+    make = scenarios()
     for name in names:
-        (folder / f"{name}.pickle").write_bytes(pickle.dumps(scenarios()[name]()))
+        (folder / f"{name}.pickle").write_bytes(pickle.dumps(make[name]()))
 
 
 def in_any_order(lines: list[str]) -> list[str]:

@@ -261,7 +261,8 @@ def subproblems(constraints: Constraints, requested: Sequence[Subproblem]) -> li
         multipliers[:, r] = np.bincount(rows.start, found, count)
     lagrangian = gradient + (piece_gradients @ each[..., None])[..., 0].sum(axis=1)
     each = each.reshape(*each.shape[:2], copies, -1).sum(axis=2)
-    change_of_loss = _dot(gradient + 0.5 * (matrix @ step[..., None])[..., 0], step).tolist()
+    slope = gradient + 0.5 * (matrix @ step[..., None])[..., 0]
+    change_of_loss = np.sum(slope * step, axis=1).tolist()
     steps = zip(step, change_of_loss, violation, each, multipliers, lagrangian, strict=True)
     return [Step(*numbers) for numbers in steps]
 
@@ -397,11 +398,6 @@ def _pieces_that_may_bind(
     order = order[is_taken]
     count = np.minimum(count, most)
     return Rows(start[order], run[order], columns[piece[order]], place[is_taken], count)
-
-
-def _dot(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """The products x.y of vectors, (..., p)."""
-    return np.sum(x * y, axis=-1)
 
 
 def positive_definite(matrix: np.ndarray, scale: float) -> np.ndarray:
