@@ -6,6 +6,8 @@ is repeated in turn (`interleaved`) and the smallest time of each is kept.
 
 from __future__ import annotations
 
+import contextlib
+import importlib.metadata
 import json
 import os
 import platform
@@ -41,6 +43,8 @@ arm = ij.with_parts(
 """
 """An arm whose first results are measured, as the text of a program: sampled, with encoders and
 motors."""
+PEERS = ("scipy", "diffrax", "mujoco", "pin", "casadi", "openturns", "cma", "optuna")
+"""The distributions of other software that some benchmark runs."""
 
 
 def once(call: Callable[[], Any]) -> float:
@@ -117,7 +121,17 @@ def machine() -> dict[str, str]:
         "iblf_jax": ij.__version__,
         "commit": commit(),
         "backend": jax.default_backend(),
+        "peers": ", ".join(f"{name} {version}" for name, version in peers().items()),
     }
+
+
+def peers() -> dict[str, str]:
+    """The versions of the other software that is installed."""
+    found = {}
+    for name in PEERS:
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            found[name] = importlib.metadata.version(name)
+    return found
 
 
 def commit() -> str:

@@ -13,7 +13,7 @@ import argparse
 import json
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -57,6 +57,7 @@ class Comparison(NamedTuple):
     mislead."""
 
 
+NOT_NOTED = "The versions of the other software were not noted with {}."
 ERROR = "largest error [rad]"
 OF_ERRORS = "largest error {:.1e} rad"
 LOOP = {"loop": "paper", "type": "float64", "runs": 4096}
@@ -178,6 +179,12 @@ def beside(comparison: Comparison, conditions: Conditions) -> str:
     return "".join(f", {value}" for value in values)
 
 
+def in_short(comparison: Comparison, conditions: Conditions) -> str:
+    """The number of a row with its unit, without the words after it."""
+    unit, _, _ = comparison.unit.partition(" ")
+    return f"{words(value_of(comparison, conditions))} {unit}"
+
+
 def errors_of(benchmark: str, conditions: Conditions) -> list[float]:
     """The largest error of a row whose benchmark measures times only [rad], of `errors.py`; empty
     for a row that has none.
@@ -195,6 +202,18 @@ def measured_by(benchmark: str) -> str:
     return f"`benchmarks/{benchmark}.py`, {machine['date']}: {versions}"
 
 
+def versions_of_others(shown: Sequence[Comparison]) -> str:
+    """The versions of the other software of these rows, in sentences."""
+    noted: dict[str, list[str]] = {}
+    for name in dict.fromkeys(comparison.benchmark for comparison in shown):
+        noted.setdefault(result_of(name)["machine"].get("peers", ""), []).append(name)
+    sentences = []
+    for peers, names in noted.items():
+        rows = ", ".join(f"`{name}.json`" for name in names)
+        sentences.append(f"Installed with {rows}: {peers}." if peers else NOT_NOTED.format(rows))
+    return " ".join(sentences)
+
+
 def ratio(comparison: Comparison, name: str) -> float:
     """How many times better this package is than other software; below 1 it is worse."""
     ours = value_of(comparison, comparison.ours)
@@ -206,7 +225,7 @@ def row(comparison: Comparison) -> str:
     """A row of the table."""
     others = []
     for name, conditions in comparison.others.items():
-        value, times = words(value_of(comparison, conditions)), words(ratio(comparison, name))
+        value, times = in_short(comparison, conditions), words(ratio(comparison, name))
         others.append(f"{name}: {value} ({times}){beside(comparison, conditions)}")
     ours = words(value_of(comparison, comparison.ours))
     cells = [
@@ -245,8 +264,8 @@ def table() -> str:
     lines = [*head, *map(row, shown)]
     lines += [
         "",
-        "The versions of the other software were not noted with these numbers. The errors of the"
-        f" first and the third row are those of {measured_by('errors')}.",
+        f"The errors of the first and the third row are those of {measured_by('errors')}."
+        f" {versions_of_others(shown)}",
     ]
     if removed:
         names = " and ".join(f'"{task}"' for task in removed)
@@ -265,7 +284,7 @@ def three_numbers() -> str:
         chosen = next(x for x in COMPARISONS if x.benchmark == benchmark)
         (conditions,) = chosen.others.values()
         number = f"{words(value_of(chosen, chosen.ours))} {chosen.unit}"
-        other = words(value_of(chosen, conditions)) + beside(chosen, conditions)
+        other = in_short(chosen, conditions) + beside(chosen, conditions)
         described = text.format(ours=beside(chosen, chosen.ours), other=other)
         described = described.replace("largest error", "error")  # a narrow column
         lines.append(f"- [**{number}**](benchmarks.md): {described}")
