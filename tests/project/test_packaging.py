@@ -77,12 +77,6 @@ def test_the_classifiers_are_the_pythons_that_are_required():
     assert sys.version_info[:2] >= oldest
 
 
-def test_the_documentation_names_the_oldest_python():
-    oldest = ".".join(map(str, min(CLASSIFIED)))
-    for page in ("README.md", "docs/guide.md", "docs/start.md"):
-        assert f"Python {oldest} or newer" in (ROOT / page).read_text(encoding="utf-8"), page
-
-
 def test_workflows_use_a_python_of_the_classifiers():
     files = [*(ROOT / ".github").rglob("*.yml"), ROOT / ".readthedocs.yaml"]
     used = [

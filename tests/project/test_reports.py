@@ -96,15 +96,6 @@ def test_a_title_does_not_repeat_the_name_of_the_class(results):
 
 
 @pytest.mark.slow
-def test_the_page_of_a_tuning_begins_with_its_report(results):
-    first, second, *rest = reports.shown(results["TuneResult"]).words
-    assert first.startswith("Report on 4 fresh runs")
-    assert second.strip().startswith("bounds violated: 0 (0 of 4 runs")
-    assert rest[-1].startswith("Search: ")
-    assert "TuneResult(" not in rest[-1]
-
-
-@pytest.mark.slow
 def test_names_from_files_are_escaped(tmp_path):
     names = ("<script>alert(1)</script>", '"><img src=x>')
     robot = arm_cases.random_arm(2, seed=3, prismatic=0.0, joints=names)
