@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import re
 import warnings
 from decimal import Decimal
@@ -74,8 +75,8 @@ def test_every_leaf_refuses_what_does_not_fit_its_declaration(member):
         if field.default is not None:
             bad = (*bad, (None, ""))
         for value, word in bad:
-            name = f"{type(member).__name__}.{field.name}"
-            refuses(lambda: dataclasses.replace(member, **{field.name: value}), name, word)  # noqa: B023
+            call = functools.partial(dataclasses.replace, member, **{field.name: value})
+            refuses(call, f"{type(member).__name__}.{field.name}", word)
 
 
 @pytest.mark.parametrize(
@@ -208,23 +209,18 @@ TIMES = {
 VALUES = {
     "path | controller.K2": with_value("controller.K3"),
     "path | parameters(scenario)": with_value("engine.power"),
-    "path: got 'robot'": with_value("robot"),
     "path | plant.mass": with_value("plant.mass[2]"),
-    "path | plant.g": with_value("plant.g[0]"),
     "names joined by dots": with_value("plant.mass[0:1]"),
-    "path: got 3": with_value(3),
     "path: got 'plant.__class__'": with_value("plant.__class__"),
     "path: got 'controller.variant'": with_value("controller.variant"),
     "plant.mass | > 0": with_value("robot.mass", 0.0),
     "initial.q | finite": with_value("initial.q", float("nan")),
     "controller.K2 | (2,)": with_value("controller.K2", [1.0, 2.0, 3.0]),
-    "controller.K2[0] | ()": with_value("controller.K2[0]", [1.0, 2.0]),
     "controller.K2 | numbers": with_value("controller.K2", "20"),
     "controller.K2: got None": with_value("controller.K2", None),
     "controller.K2 | real numbers": with_value("controller.K2", 1j),
     "values | mapping": lambda: ij.with_parameters(WEAK, [("controller.K2", 1.0)]),
     "scenario: got 'paper' | ij.presets": lambda: ij.with_parameters("paper", {}),
-    "scenario | ij.presets": lambda: ij.parameters(ij.Scenario),
 }
 MISSPELT = {
     "part | 'contoller' | Did you mean controller?": lambda: ij.with_parts(
@@ -522,10 +518,3 @@ def test_every_warning_of_the_package_looks_for_the_users_line():
     )
     for path in sorted((ROOT / "iblf_jax").rglob("*.py")):
         assert path.name == "notices.py" or not by_hand.search(path.read_text()), path
-
-
-def test_the_article_of_a_noun():
-    for noun in ("Uniform", "user", "Universal", "unit", "hinge", "one-sided"):
-        assert checks.with_article(noun) == f"a {noun}"
-    for noun in ("Actuator", "Ideal", "unimportant part"):
-        assert checks.with_article(noun) == f"an {noun}"

@@ -61,17 +61,6 @@ def test_laws_with_the_same_budget_of_tuning_have_the_numbers_of_the_result(scri
     assert [f"{x:.6g}" for x in found[2:]] == [f"{1e3 * x:.6g}" for x in numbers]
 
 
-def test_the_four_questions_name_the_laws_of_the_table(scripts):
-    _, choosing = scripts
-    questions = choosing.four_questions(STORED, TUNED)
-    slow, delay = (next(x for x in questions if word in x) for word in ("*10 ms*", "*A delay*"))
-    assert "all 7 laws stay inside the bounds at 10 ms, and their errors differ by" in slow
-    assert "Backstepping(Integral); " in slow and "DynamicSurface" in slow
-    assert "Backstepping(Log)" not in slow  # it left the bounds
-    assert "ComputedTorque" not in slow  # it claims nothing about bounds
-    assert delay.endswith("up to 16 ms BarrierBackstepping(Integral, Integral) or SafetyFilter.")
-
-
 @pytest.mark.release
 def test_a_row_regenerates_to_the_digits_of_the_page(scripts):
     laws, _ = scripts

@@ -55,13 +55,6 @@ def is_progress(output: dict) -> bool:
     return "\r" in text or "%|" in text or any("widget" in kind for kind in output.get("data", {}))
 
 
-def test_a_draft_has_notebooks_that_were_not_executed(monkeypatch, tmp_path):
-    monkeypatch.setattr(build, "EXECUTED", tmp_path)
-    page = build.tutorial(NOTEBOOKS[0])
-    assert page.cells
-    assert not any(cell.get("outputs") for cell in page.cells)
-
-
 def test_a_bar_of_progress_is_found():
     assert is_progress({"output_type": "stream", "text": "tune:  40%|####      | 4/10"})
     assert is_progress({"data": {"application/vnd.jupyter.widget-view+json": {}}})

@@ -71,16 +71,12 @@ FILES = {
         import iblf_jax as ij
         def tuned():
             return ij.tune()
-        def scene():
-            return "scene.txt"
         """,
     "tests/cases.py": """
         import iblf_jax as ij
         CASES = [ij.tune]
-        WORDS = []
         """,
     "tests/data/arm.urdf": "",
-    "tests/scene.txt": "",
     "docs/page.md": "",
     "README.md": "",
     "LICENSE": "",
@@ -90,10 +86,8 @@ TESTS = {
     "length": "from iblf_jax.world.robots import Arm\ndef test(): Arm().length()",
     "plot": "import iblf_jax as ij\ndef test(): ij.robots.Arm().plot()",
     "tune": "import iblf_jax as ij\ndef test(): ij.tune()",
-    "submodule": "import iblf_jax.tuning\ndef test(): iblf_jax.tuning.tune()",
     "fixture": "def test(tuned): ...",
     "helper": "from cases import CASES\ndef test(): CASES",
-    "words": "from cases import WORDS\ndef test(): WORDS",
     "proof": "import iblf_jax as ij\ndef test(): ij.proofs.page()",
     "all_names": "import iblf_jax as ij\ndef test(): [getattr(ij, x) for x in dir(ij)]",
     "script": "CODE = 'import iblf_jax as ij\\nij.tune()'\ndef test(): run(CODE)",
@@ -103,7 +97,6 @@ TESTS = {
     "data": "def test(): open('data/arm.urdf')",
     "pages": "def test(): ROOT.glob('*.md')",
     "site": "def test(): ROOT / 'docs' / 'page.md'",
-    "run_helper": "def test(): run('cases.py')",
 }
 
 
@@ -129,7 +122,7 @@ def names(graph: Graph, *changed: str) -> set[str] | None:
 
 USE_ALL = {"all_names", "command", "site"}
 """Tests that use the whole package."""
-TUNE = {"tune", "submodule", "fixture", "helper", "script", "run_helper"} | USE_ALL
+TUNE = {"tune", "fixture", "helper", "script"} | USE_ALL
 
 
 @pytest.mark.parametrize(
@@ -139,18 +132,15 @@ TUNE = {"tune", "submodule", "fixture", "helper", "script", "run_helper"} | USE_
         ("iblf_jax/world/links.py", {"length", "registered"} | USE_ALL),
         ("iblf_jax/plotting.py", {"plot", "command", "site"}),
         ("iblf_jax/tuning/search.py", {"by_name"} | TUNE),
-        ("iblf_jax/tuning/__init__.py", TUNE),
         ("iblf_jax/tuning/starts.py", {"by_name"} | TUNE),
         ("iblf_jax/proofs.py", {"proof"} | USE_ALL),
         ("iblf_jax/tuning/c/tune.h", {"by_name"} | TUNE),
-        ("tests/cases.py", {"helper", "words", "run_helper"}),
+        ("tests/cases.py", {"helper"}),
         ("tests/data/arm.urdf", {"data"}),
         ("tests/folder/test_tune.py", {"tune"}),
         ("tests/folder/test_that_was_removed.py", set()),
         ("docs/page.md", {"pages", "site"}),
-        ("docs/another/page.txt", {"site"}),
         ("README.md", {"pages"}),
-        ("tests/scene.txt", None),
     ],
 )
 def test_a_file_selects_the_tests_that_reach_it(graph, changed, tests):

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import re
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -222,20 +220,6 @@ def test_the_text_of_a_figure_names_quantities_curves_and_colours():
     assert alt_text.describe(Figure()) == "0 plots"
 
 
-@pytest.mark.parametrize(
-    ("label", "expected"),
-    [
-        (r"then $|e_1| \leq 0.0004$ rad", "then abs(e_1) at most 0.0004 rad"),
-        (
-            "first 2 s: the transient,\nthen $|f - \\hat f|$",
-            "first 2 s: the transient, then abs(f - f_hat)",
-        ),
-    ],
-)
-def test_the_text_of_a_figure_keeps_magnitudes_and_inequalities(label, expected):
-    assert alt_text._words(label) == expected
-
-
 def test_the_citation_of_the_package_is_that_of_its_citation_file():
     page = (ROOT / "docs" / "citation.md").read_text(encoding="utf-8")
     first = page.split("```bibtex\n")[1].split("```")[0]
@@ -264,33 +248,3 @@ def test_the_front_page_leads_to_the_last_release(built, preferred, tmp_path):
     last = [row["version"] for row in rows if row["name"].endswith("(last release)")]
     assert last == [name for name in [preferred] if name != "main"]
     assert f"url={preferred}/index.html" in (tmp_path / "index.html").read_text()
-
-
-FAULTY = """<!DOCTYPE html><html><head><link rel="icon" href="data:,"></head><body><main>
-<pre style="overflow: auto">{line}</pre><img src="gone.png"><table><tr><td>{line}</td></tr></table>
-<script>console.error("a failure")</script><script src="http://127.0.0.1:9/x.js"></script>
-</main></body></html>"""
-
-
-@pytest.mark.site
-@pytest.mark.skipif(
-    not importlib.util.find_spec("selenium") or not shutil.which("chromedriver"),
-    reason="the extra `browser` and Chromium with its driver",
-)
-def test_the_check_in_a_browser_names_what_is_wrong(tmp_path):
-    (tmp_path / "index.html").write_text(FAULTY.format(line="x" * 300))
-    command = [sys.executable, str(ROOT / "tools" / "check_site.py"), str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 1, done.stderr
-    for fault in (
-        "there is no gone.png",
-        "the image gone.png has no text",
-        "gone.png fails",
-        "requests http://127.0.0.1:9/x.js",
-        "a failure",
-        "1280 pixels, dark: cut code: pre",
-        "390 pixels, light: the page is wider than the screen",
-        "390 pixels, light: off the screen: table",
-    ):
-        assert fault in done.stdout, fault
-    assert "390 pixels, light: cut code" not in done.stdout
