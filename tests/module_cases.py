@@ -37,20 +37,3 @@ class NetworkObserver:
 
     def derivative(self, t, q, dq, tau, model, state):
         return self.observer.derivative(t, q, dq, tau + self.net(dq), model, state)
-
-
-@ij.component
-class NetworkLaw:
-    """tau = G0 + K (q_d - q) - D q' + net(q')."""
-
-    K: ij.Leaf = ij.leaf("N m/rad", sign="positive")
-    D: ij.Leaf = ij.leaf("N m s/rad", sign="positive")
-    net: Any
-
-    def init(self, q, dq, context):
-        return ()
-
-    def command(self, t, q, dq, f_hat, context, state):
-        tube, no = context.tube(t), jnp.zeros(q.shape, bool)
-        tau = context.model.gravity(q) + self.K * (tube.q_d - q) - self.D * dq + self.net(dq)
-        return ij.controllers.Command(tau, tube.dq_d, 0.0 * q, no, no), ()

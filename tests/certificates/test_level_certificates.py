@@ -345,32 +345,6 @@ def test_a_robot_is_certified_with_its_observer(plant, order):
     assert certificate[f"e, level {order}"].margin > 0
 
 
-@pytest.mark.release
-def test_the_flexible_two_link_arm_is_certified(paper):
-    flexible = ij.plants.FlexibleJoint(paper.plant, stiffness=300.0, motor_inertia=0.02)
-    law = ij.controllers.BarrierBackstepping(k=(3.0, 20.0, 60.0, 150.0), barriers=MAPPING)
-    loop = {"controller": law, "observer": ij.observers.Momentum(kf=20)}
-    scenario = dataclasses.replace(paper, plant=flexible, model=flexible, **loop)
-    certificate = certify(scenario, duration=1.0, dt=5e-4)
-    assert certificate.holds
-    assert certificate["equality"].verdict == "holds"
-    assert len(certificate.levels) == 4
-    assert certificate.levels[2].name == "motor position"
-
-
-@pytest.mark.slow
-def test_the_rigid_law_on_a_flexible_arm_has_the_flexibility_in_f():
-    flexible = ij.plants.FlexibleJoint(LINK, stiffness=300.0, motor_inertia=0.01)
-    law = ij.controllers.Backstepping(k1=2.0, K2=5.0, barrier=ij.barriers.Integral())
-    scenario = robot_scenario(flexible, 2, law, model=LINK)
-    certificate = certify(scenario, duration=0.04, dt=5e-4)
-    assert certificate["inequality, case 2"].verdict == "holds"
-    assert certificate.numbers["case"] == 2
-    # The spring's torque less the motor's is a part of f.
-    rigid = certify(robot_scenario(LINK, 2, law), duration=0.04, dt=5e-4)
-    assert certificate.numbers["F_d"] > 3 * rigid.numbers["F_d"]
-
-
 @pytest.mark.slow
 def test_alpha_outside_the_bounds_of_its_level_fails():
     scenario = double_integrator(

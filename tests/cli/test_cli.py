@@ -21,7 +21,6 @@ from PIL import Image
 import iblf_jax as ij
 from iblf_jax import _start, cli
 from iblf_jax.cli import _claims, _paper_figures, doctor
-from iblf_jax.core.disk_cache import keep_programs
 from iblf_jax.files import scenario as scenario_file
 from iblf_jax.files.rollouts import load_datasets
 
@@ -213,16 +212,6 @@ def test_every_command_of_a_new_project_runs(command, monkeypatch, tmp_path, opt
 
 
 @pytest.mark.slow
-def test_new_names_friction_that_no_time_step_resolves(command, tmp_path):
-    # The last link of this file has the friction of its drive, but no inertia of the rotor.
-    code, _, err = command("new", "a", "--robot", f"{ROOT}/tests/data/arms/xarm7.urdf")
-    assert code == 2
-    assert "At rest the joint joint7 has 22 N m s/rad on 0.00014 kg m^2" in err
-    assert "--rotor-inertia" in err
-    assert not (tmp_path / "a").exists()
-
-
-@pytest.mark.slow
 def test_rotor_inertia_makes_a_project_of_a_robot_with_stiff_friction(command, tmp_path):
     file = ROOT / "tests" / "data" / "arms" / "xarm7.urdf"
     code, out, _ = command("new", "a", "--robot", str(file), "--rotor-inertia")
@@ -266,13 +255,6 @@ def test_new_refuses_before_it_writes(command, tmp_path):
         assert message in err
     assert [path.name for path in (tmp_path / "full").iterdir()] == ["mine.txt"]
     assert not (tmp_path / "a").exists()
-
-
-@pytest.mark.slow
-def test_a_new_project_of_a_preset_has_its_scenario(command, tmp_path):
-    assert command("new", "mine", "--preset", "zhang_yan_2024")[0] == 0
-    found = ij.load_scenario(tmp_path / "mine" / "scenario.toml")
-    assert found.plant.mass.tolist() == [2.0, 0.85]
 
 
 def test_doctor_names_what_is_missing(command, monkeypatch, tmp_path):
@@ -398,22 +380,6 @@ def test_only_a_command_replaces_the_interrupt_handler(monkeypatch):
         monkeypatch.setattr(sys, "argv", argv)
         monkeypatch.setattr(sys, "orig_argv", orig)
         assert _start._is_a_command() == command, orig
-
-
-@pytest.mark.parametrize("cache", ["file", "missing"])
-def test_the_cache_is_optional(cache, tmp_path, monkeypatch):
-    """The cache of compiled programs is optional: one that cannot be written is not used."""
-    seen = {}
-    monkeypatch.setattr(jax.config, "update", seen.__setitem__)
-    monkeypatch.setattr(type(jax.config), "jax_compilation_cache_dir", None, raising=False)
-    monkeypatch.setattr(type(jax.config), "jax_enable_compilation_cache", True, raising=False)
-    (tmp_path / "file").write_text("")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / cache))
-    monkeypatch.setattr("iblf_jax.core.disk_cache._reloads_badly", lambda: False)
-    keep_programs.cache_clear()
-    cli.prepare_jax()
-    assert seen["jax_enable_x64"] is True
-    assert ("jax_compilation_cache_dir" in seen) == (cache == "missing")
 
 
 def test_a_missing_extra_of_ros_is_named_without_a_traceback(monkeypatch, tmp_path, capsys):

@@ -75,26 +75,6 @@ def test_each_level_of_a_level_observer_obeys_its_equation(rng):
         assert np.max(np.abs(d[1])) > 1e-2
 
 
-@pytest.mark.slow
-def test_an_observer_of_robots_serves_level_2(rng):
-    """With f = M d_2 and p_tilde = M q' - p_hat: p_tilde' = f_tilde - l1 p_tilde and
-    f_hat' = l2 p_tilde."""
-    loop = scenario(3, ij.observers.ExtendedState(bandwidth=[40.0, 30.0]))
-    robot, bandwidth = loop.model.robot, loop.observer.bandwidth
-    for _ in range(3):
-        state = random_state(loop, rng)
-        f_hat, dot, d = estimate_and_rate(loop, jnp.asarray(0.4), state)
-        M = robot.mass_matrix(state.q)
-        f, p_tilde = M @ d[1], M @ state.dq - state.observer.p_hat
-        assert np.max(np.abs(f)) > 1e-2
-        rate, _ = jax.jit(evaluate)(loop, jnp.asarray(0.4), state)
-        rest = ij.robots.mass_matrix_rate(robot, state.q, state.dq) @ state.dq
-        p_dot = rest + M @ rate.dq - rate.observer.p_hat
-        np.testing.assert_allclose(dot, bandwidth**2 * p_tilde, atol=1e-9)
-        expected = f - f_hat - 2.0 * bandwidth * p_tilde
-        np.testing.assert_allclose(p_dot, expected, rtol=1e-8, atol=1e-8)
-
-
 def test_the_start_of_a_level_observer():
     x, plant = jnp.ones((3, 2)), PLANTS[3]
     for start, expected in (("matched", 0.3), ("zero", np.array([[0.3], [2.3], [4.3]]))):

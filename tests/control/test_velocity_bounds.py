@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import iblf_jax as ij
-from iblf_jax import bounds, plotting
+from iblf_jax import bounds
 from iblf_jax.files.scenario import scenario_to_toml
 from iblf_jax.simulation import metrics
 
@@ -91,37 +91,6 @@ def test_files_hold_them_and_say_their_unit():
     assert units["bounds[1].lower.offset"] == "rad/s"
     assert units["bounds[1].lower.phase"] == units["bounds[0].lower.offset"] == "rad"
     assert ij.simulation.paths.unit_at(scenario, "bounds[1].upper.amplitude[0]") == "rad/s"
-
-
-@pytest.mark.slow
-def test_requirements_on_velocities():
-    scenario = paper(speeds((-0.6, -0.6)))
-    objective = ij.objectives.tracking() + ij.objectives.velocity_margin_above(0.02)
-    short = {"duration": 0.3, "dt": 1e-3, "progress": False}
-    effort = ij.tuning.Effort(iterations=12)
-    result = ij.tune(scenario, ["controller.k1"], objective, effort=effort, **short)
-    line = result.report.verdicts[0]
-    assert (line.name, line.unit, line.verdict) == ("velocity margin > 0.02 rad/s", "rad/s", "pass")
-    run = result.nominal[1]
-    assert float(np.min(run.metrics.velocity_margin)) == pytest.approx(line.value)
-    assert float(np.min(result.nominal[0].metrics.velocity_margin)) < 0.02
-    with pytest.raises(ValueError, match="bounds of the second level"):
-        ij.tune(paper(None), ["controller.k1"], objective, **short)
-
-
-@pytest.mark.slow
-def test_figures(watched, violated):
-    figure = plotting.velocities({"wide": watched, "narrow": violated})
-    assert len(figure.axes) == 4
-
-    def drawn(figure):
-        lines = figure.axes[0].get_lines()
-        return next(line for line in lines if line.get_label() == "bounds")
-
-    np.testing.assert_allclose(drawn(figure).get_ydata()[0], watched.dq_lower[0, 0])
-    box = drawn(plotting.velocity_portrait(watched, 1))
-    np.testing.assert_allclose(box.get_ydata(), [-1.4, -1.4, 0.5, 0.5, -1.4])
-    np.testing.assert_allclose(box.get_xdata()[:2], [watched.lower[0, 1], watched.upper[0, 1]])
 
 
 def test_limits_of_a_robot():

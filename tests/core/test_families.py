@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 import pickle
 import subprocess
@@ -16,7 +15,7 @@ import jax.numpy as jnp
 import pytest
 
 import iblf_jax as ij
-from iblf_jax.core.families import Part, adopt, required_members
+from iblf_jax.core.families import Part, adopt
 from iblf_jax.core.pytree import note_code
 
 OWN = """
@@ -201,23 +200,3 @@ def test_a_class_that_takes_members_from_another_object_takes_the_defaults_last(
     assert of_other.jump_times().size == 0
     with pytest.raises(AttributeError, match="unknown"):
         _ = of_other.unknown
-
-
-def test_required_members_are_abstract_methods_and_attributes_without_a_value():
-    found = required_members(ij.barriers.Barrier)
-    assert found == ("guard", "slope", "value", "virtual_velocity")
-
-
-def test_adoption_is_done_once_and_is_inherited():
-    own = own_class()
-    adopt(own, ij.barriers.Barrier)
-    first = dict(vars(own))
-    adopt(own, ij.barriers.Barrier)
-    assert dict(vars(own)) == first
-    assert issubclass(type("Steeper", (own,), {}), ij.barriers.Barrier)
-
-
-def test_copies_have_the_members():
-    barrier = law_with(own_class()(gain=4.0)).barrier
-    for twin in (copy.copy(barrier), copy.deepcopy(barrier)):
-        assert float(twin.gain) == 4.0 and twin.value_unit == "1"

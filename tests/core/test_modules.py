@@ -198,17 +198,6 @@ def test_stores_describe_modules_without_addresses(scenario):
         assert "0x" not in text and "leaky_relu" in text and "0.3" in text
 
 
-def test_tables_show_a_large_module_as_one_row(paper):
-    deep = eqx.nn.MLP(4, 2, 16, 7, key=jax.random.key(0))
-    table = ij.parameters(ij.with_parts(paper, disturbance=Learned(deep)))
-    rows = [row for row in repr(table).splitlines() if "disturbance" in row]
-    numbers = sum(x.size for x in jax.tree.leaves(eqx.filter(deep, eqx.is_array)))
-    assert len(rows) == 1 and f"16 arrays, {numbers} numbers" in rows[0]
-    assert sum("disturbance" in p.path for p in table) == 16
-    small = repr(ij.parameters(Learned(mlp(width=16))))
-    assert "64 numbers from" in small
-
-
 class Unregistered:
     """A network that JAX does not know."""
 
@@ -256,31 +245,6 @@ def test_arrays_of_integers_are_structure():
     assert np.array_equal(again.net["order"], [2, 0, 1]) and again.net["w"][0] == 2.0
     other = Learned({"w": np.ones(3), "order": np.array([2, 1, 0])})
     assert jax.tree.structure(part) != jax.tree.structure(other)
-
-
-def test_flax_modules_are_fields(paper):
-    nnx = pytest.importorskip("flax.nnx")
-
-    class Net(nnx.Module):
-        def __init__(self, rngs):
-            self.hidden = nnx.Linear(4, 3, rngs=rngs)
-            self.out = nnx.Linear(3, 2, rngs=rngs)
-            self.activation = nnx.gelu
-
-        def __call__(self, x):
-            return self.out(self.activation(self.hidden(x)))
-
-    net = Net(nnx.Rngs(0))
-    scenario = ij.with_parts(paper, disturbance=Learned(net))
-    path = "disturbance.net.out.bias.value"
-    assert path in paths_below(scenario)
-    changed = ij.with_parameters(scenario, {path: [1.0, -1.0]})
-    assert jax.tree.structure(changed) == jax.tree.structure(scenario)
-    x = jnp.arange(4.0)
-    double = ij.astype(changed, "float64")
-    torque = jax.jit(lambda s: s.disturbance.torque(0.0, x[:2], x[2:], s.plant, s.model))(double)
-    expected = np.asarray(net(x.astype("float32"))) + np.array([1.0, -1.0])
-    assert np.allclose(torque, expected, atol=1e-6)
 
 
 def test_components_with_modules_are_copied_by_pickle(scenario):

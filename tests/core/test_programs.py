@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from pathlib import Path
 
 import jax
@@ -10,11 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax._src import monitoring as jax_monitoring
-from many_scenarios import CompileCounter, scenarios
 
 import iblf_jax as ij
 from iblf_jax.core import programs
-from iblf_jax.simulation.scenario import canonical
 
 needs_maps = pytest.mark.skipif(
     programs.count_maps() == 0, reason="this system does not count memory maps"
@@ -75,25 +72,6 @@ def test_a_program_that_is_not_optimised_may_be_a_part_of_another():
     assert float(jax.jit(doubled)(3.0)) == 6.0
     assert float(jax.jit(lambda: doubled(3.0))()) == 6.0
     assert float(jax.grad(doubled)(3.0)) == 2.0
-
-
-@pytest.mark.slow
-@needs_maps
-def test_a_few_dozen_scenarios_take_the_memory_maps_of_a_few(monkeypatch):
-    """Each compiled program takes some, and Linux gives a process 65,530: a process with a few
-    dozen arms ended in a segmentation fault."""
-    monkeypatch.setattr(programs.PROGRAMS, "size", 6)
-    programs.PROGRAMS.release(len(programs.PROGRAMS))
-    some = iter(list(itertools.islice(scenarios(), 48)))
-    for scenario in itertools.islice(some, 12):
-        canonical(scenario)
-    before = programs.count_maps()
-    with CompileCounter() as compiled:
-        for scenario in some:
-            canonical(scenario)
-    assert compiled.count >= 36
-    assert len(programs.PROGRAMS) == 6
-    assert programs.count_maps() < before + 3 * 36
 
 
 @pytest.mark.slow

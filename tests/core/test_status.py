@@ -145,18 +145,6 @@ def test_an_infeasible_reference_is_an_error_with_joint_and_time(paper):
 
 
 @pytest.mark.slow
-def test_a_spline_beyond_its_bounds_is_an_error_that_names_the_waypoints(paper):
-    waypoints = np.array([[0.5, 0.5], [0.8, 0.8], [0.8, 0.8]])
-    parts = {
-        "reference": ij.references.WaypointSpline(times=(0.0, 0.2, 0.5), waypoints=waypoints),
-        "bounds": ij.Bounds(lower=ij.bounds.Constant(0.0), upper=ij.bounds.Constant(0.81)),
-        "initial": ij.Initial(q=[0.5, 0.5]),
-    }
-    with pytest.raises(ValueError, match=r"Assumption 2.*beyond its waypoints: move those"):
-        quiet(ij.with_parts(paper, **parts), duration=0.5, dt=1e-3)
-
-
-@pytest.mark.slow
 def test_nothing_raises_inside_jit_and_flags_come_back(thrown):
     with warnings.catch_warnings(action="error"):
         status = jax.jit(lambda s: ij.simulate(s, **SHORT, throw=True).status)(thrown)

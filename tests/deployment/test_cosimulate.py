@@ -41,9 +41,11 @@ def two_link(robot, *, inside: str = "", elbow: str = "", outside: str = "") -> 
         ' contype="0" conaffinity="0"/>'
         for i in (0, 1)
     ]
-    return f"""<mujoco><compiler angle="radian"/><option timestep="0.0008" gravity="0 -{float(robot.g)} 0"/><worldbody>
+    return f"""<mujoco><compiler angle="radian"/>
+      <option timestep="0.0008" gravity="0 -{float(robot.g)} 0"/><worldbody>
       <body name="upper"><joint name="shoulder" axis="0 0 1"/>{bodies[0]}
-        <body name="fore" pos="{length[0]} 0 0"><joint name="elbow" axis="0 0 1" {elbow}/>{bodies[1]}{inside}</body></body>
+        <body name="fore" pos="{length[0]} 0 0"><joint name="elbow" axis="0 0 1" {elbow}/>
+          {bodies[1]}{inside}</body></body>
       {outside}</worldbody></mujoco>"""
 
 
@@ -133,8 +135,9 @@ def _written(name: str, text: str) -> str:
 
 
 DRIVES = """<tendon><fixed name="wire"><joint joint="elbow" coef="1"/></fixed></tendon><actuator>
-  <position joint="elbow" kp="50"/> <position jointinparent="elbow" kp="50"/> <position tendon="wire" kp="50"/>
-  <general site="hand" gear="0 1 0 0 0 0" biastype="affine" biasprm="5 0 0"/> <motor joint="turntable"/></actuator>"""
+  <position joint="elbow" kp="50"/> <position jointinparent="elbow" kp="50"/>
+  <position tendon="wire" kp="50"/> <motor joint="turntable"/>
+  <general site="hand" gear="0 1 0 0 0 0" biastype="affine" biasprm="5 0 0"/></actuator>"""
 
 
 @pytest.mark.slow
@@ -153,11 +156,16 @@ def test_a_models_own_drives_are_off():
     assert largest_difference(driven.q, plain.q) < 1e-12
 
 
-GRIPPER = """<body name="left" pos="0.1 0 0"><joint name="l" type="slide" axis="0 1 0"/><geom size="0.01" mass="0.1"/></body>
-  <body name="right" pos="0.1 0 0"><joint name="r" type="slide" axis="0 -1 0"/><geom size="0.01" mass="0.1"/></body>"""
-AROUND = """<tendon><fixed name="split"><joint joint="l" coef="0.5"/><joint joint="r" coef="0.5"/></fixed></tendon>
-  <equality><joint joint1="l" joint2="r"/></equality><actuator><position tendon="split"/><position jointinparent="l"/></actuator>
-  <sensor><jointpos joint="l"/></sensor><keyframe><key name="home" qpos="0 0 0.01 0.01"/></keyframe>"""
+GRIPPER = "".join(
+    f'<body name="{name}" pos="0.1 0 0"><joint name="{name[0]}" type="slide" axis="0 {along} 0"/>'
+    '<geom size="0.01" mass="0.1"/></body>'
+    for name, along in (("left", 1), ("right", -1))
+)
+AROUND = """<tendon><fixed name="split"><joint joint="l" coef="0.5"/>
+  <joint joint="r" coef="0.5"/></fixed></tendon><sensor><jointpos joint="l"/></sensor>
+  <equality><joint joint1="l" joint2="r"/></equality>
+  <actuator><position tendon="split"/><position jointinparent="l"/></actuator>
+  <keyframe><key name="home" qpos="0 0 0.01 0.01"/></keyframe>"""
 
 
 @pytest.mark.slow
@@ -211,19 +219,6 @@ def test_a_run_that_flies_away_is_told():
     assert int(run.status) & int(ij.Status.BOUND_VIOLATED)
     with pytest.raises(ij.SimulationError):
         ij.cosimulate(wild, spec_of(PAPER.plant), period=5e-3, throw=True, **TIMING)
-
-
-@pytest.mark.slow
-def test_records(tmp_path):
-    short = {"duration": 0.2, "dt": 1e-3, "period": 1e-3}
-    every = ij.cosimulate(DRIVEN, spec_of(PAPER.plant), **short)
-    some = ij.cosimulate(DRIVEN, spec_of(PAPER.plant), record_every=10, **short)
-    assert some.t.shape == (21,)
-    np.testing.assert_array_equal(some.q, every.q[::10])
-    np.testing.assert_array_equal(some.actuator_state, every.actuator_state[::10])
-    np.testing.assert_array_equal(some.metrics.rmse, every.metrics.rmse)
-    some.to_xarray()
-    ij.save_rollouts(some, tmp_path / "run.nc")
 
 
 def test_an_arm_without_shapes_is_drawn_as_its_skeleton():

@@ -113,25 +113,7 @@ def test_the_c_of_a_law_with_a_state_of_its_own_passes_its_self_test(tmp_path, c
 
 
 @pytest.mark.release
-def test_a_law_that_estimates_levels_as_an_fmu(tmp_path):
-    scenario = OBSERVED["drive"]()
-    ij.export(scenario, tmp_path, target="fmu")
-    run = ij.simulate(scenario, duration=DURATION, dt=1e-3)
-    inputs = {"time": run.t, "q": run.measured.q}
-    starts = {"dq": run.dq[0].tolist(), "x_3": run.x[0, 2].tolist()}
-    file = tmp_path / "iblf_law.fmu"
-    found = run_fmu(file, ["tau"], DURATION, 1e-3, inputs, start_values=starts)
-    np.testing.assert_allclose(found["tau"][1:], run.tau[:-1], atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("case", "method"),
-    [
-        pytest.param(noisy, "euler_maruyama", marks=pytest.mark.release),
-        pytest.param(switched, "rk4", marks=pytest.mark.release),
-        pytest.param(OBSERVED["robot"], "rk4", marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.parametrize(("case", "method"), [(noisy, "euler_maruyama"), (switched, "rk4")])
 def test_a_sampled_closed_loop_as_an_fmu_is_simulate(tmp_path, case, method):
     ij.export(case(), tmp_path, target="fmu-loop", method=method, seed=3)
     run = ij.simulate(case(), duration=DURATION, dt=1e-3, method=method, seed=3)

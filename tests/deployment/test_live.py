@@ -95,6 +95,7 @@ def test_sliders_and_curves_agree_after_a_switch_of_the_law(two_laws, tmp_path):
 
 @pytest.mark.slow
 def test_numbers_of_the_address_are_those_of_sliders_and_curves(two_laws, tmp_path):
+    """Values that are not used are named."""
     address = "?law=log&controller.K2=130&initial.q[0]=0.55&observer.kf=many&initial.q[1]="
     actions = [{}, {"law": "integral"}, {"law": "log"}]
     begin, other, back = in_node(two_laws, tmp_path, actions, address)
@@ -109,10 +110,6 @@ def test_numbers_of_the_address_are_those_of_sliders_and_curves(two_laws, tmp_pa
     expected = simulated("log", **{"controller.K2": 130.0, "initial.q[0]": 0.55})
     np.testing.assert_allclose(begin["q"], expected, atol=1e-9)
     assert in_node(two_laws, tmp_path, [{}], "?law=constructor")[0]["law"] == "integral"
-
-
-@pytest.mark.slow
-def test_values_of_the_address_that_are_not_used_are_named(two_laws, tmp_path):
     plain, good = (
         in_node(two_laws, tmp_path, [{}], address)[0]
         for address in ("", "?controller.K2=30&initial.q[1]=0.7")
@@ -209,6 +206,7 @@ def test_names_of_scenarios_are_words(monkeypatch):
             ij.explore(bad)
 
 
+@pytest.mark.slow
 def test_gains_starts_and_bounds_have_sliders(page):
     table = json.loads(re.search(r"const LOOPS = (.*);", page.text)[1])[""]["table"]
     sliders = {p["path"]: p for p in table["parameters"] if "slider" in p}

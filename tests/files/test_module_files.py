@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import shutil
 import subprocess
-from pathlib import Path
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from module_cases import Learned, NetworkLaw, NetworkObserver
+from module_cases import Learned, NetworkObserver
 
 import iblf_jax as ij
 from iblf_jax.files.identification import load_identification_file
@@ -144,53 +142,6 @@ def test_files_of_studies_receive_modules(kind, tmp_path):
     assert same(loaded, scenario)
 
 
-@pytest.mark.slow
-def test_a_saved_tuning_receives_modules(tmp_path):
-    path, scenario = tmp_path / "a.toml", with_net(Opaque(0.1 * jnp.ones((2, 4))))
-    ij.save_scenario(scenario, path, run={"duration": 0.05, "dt": 1e-3})
-    path.write_text(path.read_text() + FILES["tuning"][0])
-    given = {"disturbance.net": Opaque(jnp.zeros((2, 4)))}
-    effort = ij.tuning.Effort(iterations=1, starts=1)
-    result = ij.tune_file(path, modules=given, effort=effort, progress=False)
-    result.save(tmp_path / "tuning")
-    with pytest.raises(ValueError, match=r'modules=\{"disturbance.net": module\}'):
-        ij.load(tmp_path / "tuning")
-    again = ij.load(tmp_path / "tuning", modules=given)
-    assert same(again.scenario, result.scenario)
-
-
-@pytest.mark.slow
-def test_a_law_with_a_module_on_a_robot_of_a_file(monkeypatch, tmp_path):
-    pytest.importorskip("mujoco")  # reads the robot
-    monkeypatch.setitem(ij.controllers.MEMBERS, "network_law", NetworkLaw)
-    examples = Path(__file__).parents[2] / "examples"
-    shutil.copy(examples / "arm.urdf", tmp_path)
-    arm = (examples / "arm.toml").read_text()
-    law = NetworkLaw(K=[60.0] * 3, D=[20.0] * 3, net=Opaque(0.1 * jnp.ones((3, 3))))
-    (tmp_path / "a.toml").write_text(arm)
-    scenario = ij.with_parts(ij.load_scenario(tmp_path / "a.toml"), controller=law)
-    ij.save_scenario(scenario, tmp_path / "b.toml")
-    tables = (tmp_path / "b.toml").read_text()
-    start, end = tables.index("[controller]"), tables.index("[initial]")
-    (tmp_path / "b.toml").write_text(arm + tables[start:end])
-    given = {"controller.net": Opaque(jnp.zeros((3, 3)))}
-    loaded = ij.load_scenario(tmp_path / "b.toml", modules=given)
-    assert same(loaded.controller.law, law)
-    assert (loaded.controller.limit > 0.0).all()
-
-
-def test_flax_modules_are_passed(tmp_path):
-    nnx = pytest.importorskip("flax.nnx")
-    net = nnx.Linear(4, 2, rngs=nnx.Rngs(0))
-    scenario = with_net(net)
-    ij.save_scenario(scenario, tmp_path / "a.toml")
-    with pytest.raises(ValueError, match=r"flax\.nnx.*Linear, expected the module itself"):
-        ij.load_scenario(tmp_path / "a.toml")
-    given = {"disturbance.net": nnx.Linear(4, 2, rngs=nnx.Rngs(1))}
-    again = ij.load_scenario(tmp_path / "a.toml", modules=given)
-    assert np.allclose(again.disturbance.net.kernel[...], net.kernel[...])
-
-
 MALICIOUS = (
     *("os:system", "builtins:eval", "json:os.system", "jax:os.system", "not_a_package:f"),
     "jax.nn:no_such_function",
@@ -210,17 +161,12 @@ def test_files_lead_to_no_function_of_python_and_import_nothing(tmp_path):
 BROKEN = {
     "no JSON": "{",
     "a number": "3",
-    "an unknown kind": '{"pickle": "x"}',
     "no array": '{"dict": {"v": "array"}}',
-    "too few arrays": '{"dict": {}}',
     "no dataclass": '{"class": "jax.nn:relu", "fields": {}}',
     "other fields": '{"class": "equinox.nn:Linear", "fields": {"weight": "array"}}',
-    "a constant without a dtype": '{"dict": {"w": "array", "c": {"constant": [1]}}}',
     "a constant of objects": '{"constant": [1], "dtype": "O"}',
-    "a constant of no dtype": '{"constant": [1], "dtype": "<i3"}',
     "a ragged constant": '{"constant": [[1], [1, 2]], "dtype": "<i8"}',
     "a constant out of range": '{"constant": [300], "dtype": "|i1"}',
-    "a constant of words": '{"constant": ["x"], "dtype": "<i8"}',
     "nested": "[" * 60 + "]" * 60,
 }
 

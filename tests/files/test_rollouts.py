@@ -14,7 +14,7 @@ import xarray
 from conftest import SHORT
 from loops_of_plants import rigid_law
 from made_up_runs import ALWAYS
-from plant_cases import body, pendulum
+from plant_cases import pendulum
 
 import iblf_jax as ij
 from iblf_jax.files import rollouts
@@ -72,16 +72,6 @@ def test_a_batch(batch):
     assert "controller.K2" not in json.loads(data.attrs["parameters"])
     assert json.loads(data.attrs["parameters"])["plant.mass"] == [2.0, 0.85]
     xarray.testing.assert_equal(data.q.isel(run=1, drop=True), batch[1].to_xarray().q)
-
-
-@pytest.mark.slow
-def test_batches_of_batches_and_of_different_steps(batch):
-    runs = jax.tree.map(lambda x: jnp.stack([x, x]), batch)
-    t = runs.t * jnp.array([[1.0], [2.0], [3.0]])
-    assert runs.to_xarray().q.dims == ("run_0", "run_1", "time", "joint")
-    data = dataclasses.replace(runs, t=t).to_xarray()
-    assert data.t.dims == ("run_0", "run_1", "time")
-    np.testing.assert_array_equal(data.t, t)
 
 
 def test_states_of_any_structure(short_run, tmp_path):
@@ -256,27 +246,6 @@ def test_signals_of_levels_have_dimensions_and_units_also_in_a_file(levels_run, 
     assert np.array_equal(data.higher_level, [3])
     assert data.level.attrs["description"] == "level of the plant, from 1: angle, speed, current"
     assert data.joint.attrs["description"] == "component of a level, from 0: pendulum"
-
-
-@pytest.mark.slow
-def test_a_study_has_dimensions_and_units_of_levels():
-    start = {"initial.x[2]": ij.offset(ij.uniform(-1.0, 1.0))}
-    study = ij.monte_carlo(pendulum(), start, runs=4, duration=0.1, dt=1e-3)
-    data = study.to_xarray()
-    assert data.level_margin.dims == ("run", "higher_level", "joint")
-    assert data.level_margin.attrs["units"] == "A"
-    assert data["initial.x[2]"].attrs["units"] == "A"
-    assert np.allclose(data["initial.x[2]"], study.samples["initial.x[2]"])
-    # The level starts where it was drawn, so its margin is at most that of the start.
-    drawn = np.abs(study.samples["initial.x[2]"])
-    assert np.all(np.asarray(study.metrics.level_margin)[:, 0] <= 20.0 - drawn + 1e-12)
-
-
-@pytest.mark.slow
-def test_components_of_different_units():
-    data = ij.simulate(body(), duration=0.1, dt=1e-2).to_xarray()
-    assert data.q.attrs == {"units": "m, m, rad", "description": "pose"}
-    assert data.margin.attrs["units"] == "m, m, rad"
 
 
 @pytest.mark.slow

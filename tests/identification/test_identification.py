@@ -247,10 +247,15 @@ def test_the_end_of_each_log_is_held_back_as_its_share_says(rng):
 
 
 @pytest.mark.slow
-def test_several_logs_and_one_that_is_held_back(scenario, log):
-    parts = [part_of(log, slice(0, 700)), part_of(log, slice(760, None))]
-    both = ij.identify(scenario, parts, PATHS, held_out=part_of(log, slice(0, 600)))
-    assert np.max(np.abs(z_scores(both, TRUTH))) < 4.0
+def test_several_logs_with_outliers_and_one_that_is_held_back(scenario, log, rng):
+    q = log["q"].copy()
+    hit = rng.choice(q.size, 40, replace=False)
+    q.ravel()[hit] += rng.choice([-0.05, 0.05], 40)
+    spoilt = log | {"q": q}
+    parts = [part_of(spoilt, slice(0, 700)), part_of(spoilt, slice(760, None))]
+    options = {"held_out": part_of(log, slice(0, 600)), "loss": "huber", "widths": False}
+    both = ij.identify(scenario, parts, PATHS, **options)
+    assert np.max(np.abs(both.values["robot.mass"] / MASS - 1.0)) < 2e-3
     assert np.sum(~both.kept) == 4 and len(both.logs) == 3
 
 
@@ -261,15 +266,6 @@ def test_a_delay_of_the_command_is_a_leaf(scenario, log):
     known = ij.identify(lab, commanded, [*PATHS, "sampling.delay"], widths=False)
     assert abs(float(known.scenario.sampling.delay) - 4e-3) < 5 * known.delay_error < 1e-3
     assert set(known.values) == set(PATHS)
-
-
-@pytest.mark.slow
-def test_outliers_are_borne_by_huber(scenario, log):
-    rng, q = np.random.default_rng(2), log["q"].copy()
-    hit = rng.choice(q.size, 40, replace=False)
-    q.ravel()[hit] += rng.choice([-0.05, 0.05], 40)
-    known = ij.identify(scenario, {**log, "q": q}, PATHS, loss="huber", widths=False)
-    assert np.max(np.abs(known.values["robot.mass"] / MASS - 1.0)) < 2e-3
 
 
 @pytest.mark.slow
@@ -353,7 +349,6 @@ def test_a_fit_that_lacks_nothing_has_no_finding(known, scenario, other_logs):
     [
         (VISCOUS, 0.0, PATHS[:2], "sign", COULOMB),
         (0.0, COULOMB, PATHS[:1], "velocity", VISCOUS),
-        (VISCOUS, [0.2, 0.0], PATHS[:2], "sign", [None, 0.1]),
         (VISCOUS, 2.0 * COULOMB, PATHS[:2], "sign", -COULOMB),
     ],
 )
@@ -434,11 +429,7 @@ def velocities_in_degrees(x):
 WRONG = {
     "degrees": (scaled("q", np.degrees(1.0)), "It would fit in degrees"),
     "newton_millimetres": (scaled("tau", 1e3), "times what .* robot needs .* Convert it to N m"),
-    "kilopond_metres": (scaled("tau", 1 / 9.81), "with tau in kgf m, they would explain"),
-    "torques_exchanged": (exchanged("tau"), r"with tau\[0\] and tau\[1\] exchanged"),
-    "positions_exchanged": (exchanged("q"), r"with q\[0\] and q\[1\] exchanged"),
     "joints_exchanged": (exchanged("q", "tau"), "with joints 0 and 1 exchanged, q and tau"),
-    "other_sign": (scaled("tau", -1.0), "with tau of the other sign"),
     "one_sign": (scaled("tau", np.array([1.0, -1.0])), r"with tau\[1\] of the other sign, they"),
     "milliseconds": (scaled("t", 1e3), "got .* rad of motion in .* Divide times in ms by 1000"),
     "rows_without_numbers": (
@@ -540,18 +531,6 @@ def test_damaged_files_of_logs_are_refused(spoil, words, tmp_path, lines):
 
 
 # ----------------------------------------------------------------- report, parts
-
-
-@pytest.mark.slow
-def test_the_report_is_words_json_and_a_page(known, tmp_path):
-    text = repr(known)
-    assert "robot.mass[0]" in text and "held back" in text and "6 of" not in text.split("\n")[2]
-    data = json.loads(json.dumps(known.to_dict(), allow_nan=False))
-    assert data["numbers"][0]["value"] == known.numbers[0].value
-    ij.report(known, tmp_path / "known.html")
-    page = (tmp_path / "known.html").read_text()
-    assert page.startswith("<!DOCTYPE html>")
-    assert "data:image/png;base64," in page and "robot.mass[1]" in page
 
 
 @pytest.mark.slow

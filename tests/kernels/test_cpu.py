@@ -3,7 +3,6 @@ falls back."""
 
 from __future__ import annotations
 
-import re
 import shutil
 from functools import partial
 
@@ -272,30 +271,3 @@ def test_copies_at_the_end_of_a_batch_have_the_results_of_their_runs():
         found = ends(rows)
         np.testing.assert_array_equal(found.floats, each.floats[:, rows])
         np.testing.assert_array_equal(found.ints, each.ints[:, rows])
-
-
-def test_the_places_of_numbers_that_nobody_reads_any_more_are_used_again():
-    """A step in many functions, each of which reads a number of the one before it."""
-
-    def step(shared, per_run, carry, index):
-        (x,) = carry
-        for _ in range(60):
-            x = jnp.cos(x) + 0.1 * jnp.sin(x)
-        return [x], []
-
-    number = Shapes((((), np.dtype("float64")),))
-    program = compile_step(step, np.dtype("float64"), Shapes(()), Shapes(()), number).program
-    text = cpu.c_source(program, shared=0, per_run=0, segment=8)
-    assert len(re.findall(r"SEPARATE void segment_", text)) > 20
-    assert int(re.search(r"F x\[(\d+)\];", text)[1]) <= 4
-
-
-def test_records_come_back_run_by_run_and_sample_by_sample():
-    rng, runs, samples = np.random.default_rng(0), 4, 3
-    one = {"a": jax.ShapeDtypeStruct((), int), "b": jax.ShapeDtypeStruct((2, 3), float)}
-    rows = [rng.integers(9, size=(samples, 1, runs)), rng.normal(size=(samples, 6, runs))]
-    found = packed.unpacked_records(one, rows)
-    assert found["a"].dtype == int
-    for r, k in np.ndindex(runs, samples):
-        assert found["a"][r, k] == rows[0][k, 0, r]
-        np.testing.assert_array_equal(found["b"][r, k].ravel(), rows[1][k, :, r])

@@ -381,15 +381,3 @@ def test_a_step_that_does_not_lower_runs_on_vmap_and_says_so():
         assert run().status.shape == (2,)
     with warnings.catch_warnings(action="error"):
         run()
-
-
-def test_a_repeated_operation_is_one_node():
-    """A step with 21 tangents of seven joints has 2 million operations on constants, of which
-    nearly all repeat an earlier one."""
-    b = program.Builder(np.float64)
-    two, three = b.constant(2.0, "f"), b.constant(3.0, "f")
-    x = b.input("carry", 0, "f")
-    results = {b.emit("mul", two, three), *b.emit_each("mul", [(two, three)] * 3, "f")}
-    assert [b.value(node) for node in results] == [6.0]
-    sums = b.emit_each("add", [(x, two), (two, x), (x, three)], "f")
-    assert sums[0] == sums[1] != sums[2]

@@ -444,20 +444,6 @@ def test_who_waits_for_a_stopped_build_builds_it(slow_compiler):
     assert slow_compiler.read_text().split() == ["once"] * 2
 
 
-def test_a_stopped_compiler_is_asked_again_for_its_version(tmp_path, monkeypatch):
-    fake(tmp_path, monkeypatch, "echo fake 1.0")
-    command = toolchain.compiler()
-
-    def stopped(*arguments):
-        raise toolchain.StoppedError("the compiler was stopped")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(toolchain, "_run", stopped)
-        with pytest.raises(toolchain.StoppedError):
-            toolchain._version(command)
-    assert toolchain._version(command).line == "fake 1.0"
-
-
 FRESH = """
 import jax
 events = []
@@ -467,7 +453,8 @@ jnp.ones(3) + 1.0  # something of the user's that JAX has compiled before
 import iblf_jax as ij
 print(repr(jax.config.jax_compilation_cache_dir), end=" ")
 ij.simulate(ij.presets.zhang_yan_2024(), duration=0.05, dt=1e-3)
-print(repr(jax.config.jax_compilation_cache_dir), [sum(e.endswith(x) for e in events) for x in ("cache_hits", "cache_misses")])
+counts = [sum(e.endswith(x) for e in events) for x in ("cache_hits", "cache_misses")]
+print(repr(jax.config.jax_compilation_cache_dir), counts)
 """
 
 
@@ -532,7 +519,6 @@ def without_home(_, patch):
 UNUSABLE = {
     "a file in its place": lambda base, _: (base.mkdir(), (base / "iblf_jax").write_text("")),
     "a link in its place": lambda base, _: (base.mkdir(), (base / "iblf_jax").symlink_to(base)),
-    "under a file": lambda base, _: base.write_text(""),
     "in /proc": lambda _, patch: patch.setenv("XDG_CACHE_HOME", "/proc/self/nothing"),
     "no home": without_home,
     "a name too long": lambda base, patch: patch.setenv("XDG_CACHE_HOME", f"{base}/{'x' * 300}"),
@@ -619,15 +605,6 @@ def test_the_flags_follow_the_kind_of_compiler(text):
     assert ("-fslp-vectorize" in flags) == (kind == "clang")
 
 
-@pytest.mark.parametrize(
-    ("machine", "kind", "flag"),
-    [("arm64", "clang", "-mcpu"), ("aarch64", "gcc", "-march"), ("x86_64", "clang", "-march")],
-)
-def test_the_flag_of_the_processor(monkeypatch, machine, kind, flag):
-    monkeypatch.setattr(toolchain.platform, "machine", lambda: machine)
-    assert f"{flag}=native" in toolchain.flags_of(kind)
-
-
 @needs_compiler
 def test_a_compiler_is_identified_once(cache, tmp_path, monkeypatch):
     """Not at the import; again where another program has taken its place."""
@@ -668,19 +645,15 @@ def test_ziglang_where_the_system_has_no_compiler(cache, tmp_path, monkeypatch):
 
 COMPILERS = {
     "says no version": (compiles('"$REAL" "$@"', ":"), "prints nothing"),
-    "says empty lines": (compiles('"$REAL" "$@"', "echo; echo"), "prints nothing"),
     "says bytes": (compiles('"$REAL" "$@"', r"printf '\377\376\200'"), "no text"),
     "fails with bytes": (compiles(r"printf 'error: \377\376\n' >&2; exit 1"), "failed: error"),
     "is killed": (compiles("kill -9 $$"), "signal 9"),
     "makes nothing": (compiles("exit 0"), "left no file"),
-    "makes an empty file": (compiles(': > "$out"'), "left no file"),
     "makes a pipe": (compiles('mkfifo "$out"'), "left no file"),
-    "makes text": (compiles('echo hello > "$out"'), "does not load"),
     "lacks the symbol": (
         compiles('echo "int x;" | "$REAL" -x c++ -shared -fPIC - -o "$out"'),
         "undefined symbol",
     ),
-    "says very much": (compiles("yes error >&2; exit 1"), "failed: error"),
     "hangs": (compiles("sleep 100"), "longer than 0.5 s"),
     "hangs in a child": (compiles("sleep 100 | cat"), "longer than 0.5 s"),
     "hangs at its version": (compiles("exit 0", "sleep 100"), "longer than 0.5 s"),

@@ -7,7 +7,6 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import re
-import types
 import warnings
 
 import jax.numpy as jnp
@@ -23,9 +22,8 @@ from stored_results import stored
 
 import iblf_jax as ij
 from iblf_jax import Status, plotting
-from iblf_jax.plotting import _panels, _proofs, _scales, _style, _tuning, certificates
+from iblf_jax.plotting import _panels, _scales, _style
 from iblf_jax.plotting._curves import curves_of, rounding_error
-from iblf_jax.studies.statistics import scalar_samples
 from iblf_jax.studies.summaries import LEVELS, initial_margins
 
 
@@ -60,32 +58,6 @@ def test_a_clipped_peak_has_its_sign_its_run_and_its_joint():
         assert np.ptp(axes.get_ylim()) < 60
 
 
-def test_a_peak_of_a_region_names_no_joint():
-    run = made_up(chain(1))
-    margin = jnp.asarray(0.1 + 0.01 * np.sin(np.asarray(run.t)))[:, None]
-    run = dataclasses.replace(run, region_margin=jnp.tile(margin, 3).at[50, 2].set(-9.0))
-    pair = {"a": run, "b": dataclasses.replace(run, status=jnp.int32(Status.REGION_VIOLATED))}
-    regions = [ij.regions.HalfSpace(normal=[1.0, 0.0], offset=1.0)] * 3
-    for one in pair.values():
-        object.__setattr__(one.scenario, "regions", regions)
-    figure = plotting.region_margins(pair)
-    assert "joint" not in "".join(text for axes in figure.axes for text in texts_of(axes))
-
-
-def test_the_bars_of_a_tuning_have_the_signs_of_the_torques():
-    run = made_up(chain(2))
-    axes = Figure().subplots()
-    _tuning._peaks(axes, curves_of({"before": run, "tuned": run}), np.array([40.0, 20.0]))
-    heights = [bar.get_height() for bar in axes.patches]
-    tau = np.asarray(run.tau)
-    expected = [column[np.argmax(np.abs(column))] for column in tau.T]
-    assert np.all(np.sign(expected) == -1.0)
-    np.testing.assert_allclose(heights, expected * 2)
-    assert texts_of(axes) == [f"{x:.3g}".replace("-", "\N{MINUS SIGN}") for x in expected] * 2
-    limits = [line.get_ydata()[0] for line in axes.get_lines()[:4]]
-    assert limits == [-40.0, 40.0, -20.0, 20.0]
-
-
 def zoom_titles(figure):
     return [axes.get_title().replace("\n", " ") for axes in figure.axes[1::2]]
 
@@ -105,31 +77,6 @@ def test_a_zoom_of_the_transient_says_so_and_bounds_what_follows():
     later = np.asarray(run.tau)[np.asarray(run.t) > figure.axes[1].get_xlim()[1]]
     for title, torques in zip(zoom_titles(figure), later.T, strict=True):
         assert title.endswith(f"then {torques.min():.3g} to {torques.max():.3g} N m")
-
-
-def test_other_zooms_have_other_reasons():
-    run = made_up(chain(2), duration=20.0)
-    assert "first 0.1 s of a transient of " in zoom_titles(plotting.errors(run, zoom=0.1))[0]
-    relative = zoom_titles(plotting.errors(run))[0]
-    assert re.fullmatch(r".*then \$\|\\xi\| \\leq\$ [\d.e-]+", relative), relative  # without a unit
-    still = dataclasses.replace(run, e=0.0 * run.e, xi=0.0 * run.xi)
-    assert "no transient" in zoom_titles(plotting.errors(still))[0]
-    bad = runaway(chain(2))
-    assert "every run failed" in zoom_titles(plotting.positions(bad))[0]
-    both = plotting.positions({"good": run, "bad": bad})
-    assert "the transient (failed runs aside)" in zoom_titles(both)[0]
-
-
-@pytest.mark.slow
-def test_a_comparison_states_the_reason_for_each_window(paper):
-    options = {"duration": 8.0, "dt": 2e-3, "equal_effort": False}
-    compared = ij.compare(paper, ["integral", "log"], **options)
-    in_print = compared.plot(style="paper").axes[:2]
-    assert [axes.get_title() for axes in in_print] == ["gains as given", ""]
-    error, torque = compared.plot().axes[:2]
-    assert error.get_title().startswith("gains as given\nfirst ")
-    assert "the transient" in error.get_title()
-    assert torque.get_title().startswith(f"first {torque.get_xlim()[1]:.3g} s: the laws differ")
 
 
 def test_a_certificate_until_a_time_says_so():
@@ -175,21 +122,6 @@ def study():
     return cases.study(64)
 
 
-@pytest.mark.slow
-def test_a_scatter_shows_every_run(study):
-    margins = np.asarray(study.metrics["margin"]).copy()
-    margins[3] = -1e4
-    far = dataclasses.replace(
-        study, metrics=ij.Metrics({"margin": margins}, study.metrics.unit_pairs)
-    )
-    worst = margins.min(axis=1)
-    drawn_numbers = scalar_samples(study.samples).values()
-    for axes, x in zip(plotting.scatter(far).axes, drawn_numbers, strict=True):
-        assert axes.get_yscale() == "symlog"
-        assert_inside(worst, axes.get_ylim())
-        assert_inside(x, axes.get_xlim())
-
-
 def test_a_run_that_diverged_does_not_squeeze_the_velocity_portrait():
     good = made_up(chain(2))
     alone = plotting.velocity_portrait(good).axes[0].get_ylim()
@@ -212,18 +144,6 @@ def test_only_the_joint_that_left_its_bounds_is_marked():
     assert [crosses_of(axes) for axes in run.plot().axes[:3]] == [[], [0.2], []]
 
 
-def test_a_velocity_that_left_its_bounds_is_not_marked_among_the_positions():
-    run = made_up(chain(2))
-    lower, upper = (
-        jnp.stack([row, jnp.full_like(row, limit)], axis=1)
-        for row, limit in ((run.lower, -3.0), (run.upper, 3.0))
-    )
-    run = dataclasses.replace(run, level_lower=lower, level_upper=upper)
-    run = changed(run, 0, 30, 5.0, "dq", Status.VELOCITY_VIOLATED)
-    assert [crosses_of(axes) for axes in plotting.velocities(run).axes[::2]] == [[0.3], []]
-    assert not any(crosses_of(axes) for axes in plotting.positions(run).axes)
-
-
 def test_a_run_that_diverged_inside_its_bounds_is_marked_in_every_panel():
     run = made_up(chain(2), status=int(Status.NOT_FINITE))
     stopped = {
@@ -231,20 +151,6 @@ def test_a_run_that_diverged_inside_its_bounds_is_marked_in_every_panel():
     }
     run = with_signals(run, **stopped)
     assert [crosses_of(axes) for axes in plotting.torques(run).axes[::2]] == [[1.0], [1.0]]
-
-
-def test_a_refutation_is_red_for_the_joint_that_leaves_its_bounds():
-    run = changed(made_up(chain(2)), 1, 20, 9.0)
-    state = types.SimpleNamespace(t=0.0)
-    found = types.SimpleNamespace(
-        replay=lambda: run, violation=types.SimpleNamespace(state=state), duration=4.0
-    )
-    red = []
-    for joint in range(2):
-        axes = Figure().subplots()
-        _proofs._draw_violation(axes, found, joint)
-        red.append(to_hex(axes.get_lines()[0].get_color()) == to_hex(_style.failure()))
-    assert red == [False, True]
 
 
 def noise(run, size=1e-17):
@@ -268,60 +174,12 @@ def test_a_panel_of_rounding_errors_says_zero(size):
             assert ("rounding" in says_zero[0]) == (size > 0.0)
 
 
-@pytest.mark.slow
-def test_the_overview_says_zero():
-    run = made_up(chain(2))
-    still = dataclasses.replace(run, disturbance=0.0 * run.q, disturbance_estimate=noise(run))
-    (axes,) = [axes for axes in drawn(still.plot()).axes if "broad" in axes.get_ylabel()]
-    assert texts_of(axes)[0].startswith("zero\n($|f| \\leq$ ")
-    assert not any("zero" in text for axes in run.plot().axes for text in texts_of(axes))
-
-
 def test_a_constant_has_no_axis_that_magnifies_rounding_errors():
     run = made_up(chain(2))
     run = dataclasses.replace(run, tau=5.0 + noise(run, 1e-15))
     for axes in drawn(plotting.torques(run)).axes:
         assert axes.yaxis.get_offset_text().get_text() == ""
         assert np.ptp(axes.get_ylim()) > 0.1
-
-
-T = np.linspace(0.0, 1.0, 50)
-
-
-def bounded(axes, size):
-    signal = certificates.Bounded("estimation error", r"$|\tilde f|$", "N m")
-    certificates._draw_bounded(axes, T, np.full(50, size), np.full(50, 2.0), signal)
-    assert axes.get_yscale() == ("log" if size == 1e-3 else "linear")
-
-
-def inequality(axes, size):
-    traces = types.SimpleNamespace(t=T, left=np.full(50, -size), V=np.exp(-T))
-    certificates._draw_inequality(axes, traces, 0.0 * T, "terms")
-
-
-def disturbances(axes, size):
-    columns = np.stack([np.exp(-T), np.exp(-2.0 * T)], axis=1)[:, :, None]
-    traces = types.SimpleNamespace(t=T, d_tilde=np.full((50, 2), size), error=columns)
-    certificates._disturbances(axes, traces)
-
-
-@pytest.mark.parametrize("draw", [bounded, inequality, disturbances])
-def test_a_certificate_says_zero(draw):
-    for size in (0.0, 1e-17, 1e-3):
-        axes = Figure().subplots()
-        draw(axes, size)
-        assert any(text.startswith("zero") for text in texts_of(axes)) == (size < 1e-3)
-
-
-def test_a_zoom_of_rounding_errors_has_no_transient():
-    run = made_up(chain(2))
-    decaying = 1e-15 * np.exp(-5.0 * np.asarray(run.t))[:, None] * np.ones(2)
-    run = dataclasses.replace(
-        run, disturbance=0.0 * run.q, disturbance_estimate=jnp.asarray(decaying)
-    )
-    titles = zoom_titles(plotting.uncertain_terms(run))
-    assert "no transient, then zero" in titles[0]
-    assert titles[1] == "then zero"
 
 
 def with_margins(study, margins):
@@ -349,16 +207,6 @@ def test_histograms_name_one_margin_for_all_runs_and_peaks_as_sizes(study):
     metrics = ij.Metrics({"peak_torque": peaks}, (("peak_torque", "N m"),))
     figure = plotting.histograms(dataclasses.replace(study, metrics=metrics))
     assert figure.axes[0].get_xlabel() == "peak torque (absolute value) [N m]"
-
-
-def test_a_tuning_says_when_the_start_sets_its_margin(paper):
-    start = float(initial_margins(paper, {})[LEVELS[0]].min())
-    for margins, is_start in (([start, np.nan, start], True), ([start, start - 1e-6], False)):
-        history = {"margin": np.array(margins)[:, None]}
-        result = types.SimpleNamespace(history=history, best_start=0, scenario=paper)
-        axes = Figure().subplots()
-        _tuning._margin(axes, result)
-        assert ("that of the start" in axes.get_title()) == is_start
 
 
 PUBLIC = sorted(
@@ -408,21 +256,6 @@ def test_a_figure_is_drawn_into_the_users_figure_and_returned(name, short_run, s
     assert left.axes and not right.axes
     alone = Figure()
     assert function(*arguments, figure=alone) is alone and alone.axes
-
-
-def test_a_lyapunov_function_that_is_a_noise_is_a_band():
-    run = made_up(chain(2), duration=20.0)
-    noise = np.exp(np.random.default_rng(0).normal(0.0, 1.0, len(run.t)))
-    for V, is_band in ((run.V, False), (jnp.asarray(noise), True)):
-        axes = plotting.overview(with_signals(run, V=V)).axes[-1]
-        assert axes.get_ylabel().startswith("Lyapunov function")
-        assert bool(axes.collections) is is_band
-        if is_band:
-            assert len(axes.get_lines()[0].get_xdata()) == _panels.NOISE_BLOCKS
-            (band,) = axes.collections
-            low, high = np.nanmin(noise), np.nanmax(noise)
-            ends = band.get_paths()[0].vertices[:, 1]
-            np.testing.assert_allclose([ends.min(), ends.max()], [low, high])
 
 
 def test_every_figure_function_takes_a_style_and_a_figure():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from loops_of_plants import flexible_joint
 from made_up_runs import chain, made_up
-from plant_cases import ANGLES, body, pendulum, symmetric
+from plant_cases import body, pendulum
 
 import iblf_jax as ij
 from iblf_jax import plotting
@@ -52,31 +52,6 @@ def test_the_overview_has_a_row_for_every_level_with_bounds_and_virtual_control(
 
 
 @pytest.mark.slow
-def test_regions_are_named_by_the_robot_inside_a_plant(flexible_run):
-    wall = ij.regions.HalfSpace(normal=[1.0, 0.0], offset=-0.1)
-    beside = ij.with_parts(flexible_run.scenario, regions=(wall,))
-    run = ij.simulate(beside, duration=0.05, dt=1e-3)
-    assert int(run.status) == 0
-    legends = [axes.get_legend() for axes in run.plot().axes]
-    texts = [text.get_text() for x in legends if x is not None for text in x.get_texts()]
-    assert "0: the tip" in texts
-    labels = labels_of(plotting.region_margins(run))
-    assert any("the tip" in label for label in labels), labels
-
-
-@pytest.mark.slow
-def test_a_level_without_bounds_shows_none_and_keeps_its_virtual_control_in_view():
-    law = ij.controllers.BarrierBackstepping(k=(3.0, 10.0, 30.0))
-    only_third = pendulum(controller=law, bounds=(ANGLES, None, symmetric(20.0)))
-    speed = ij.simulate(only_third, duration=0.5, dt=1e-2).plot().axes[1]
-    lines = {line.get_label(): line.get_ydata() for line in speed.get_lines()}
-    assert "bounds" not in lines
-    guide = lines[r"virtual control $\alpha_{i-1}$"]
-    low, high = speed.get_ylim()
-    assert low < np.min(guide) and high > np.max(guide)
-
-
-@pytest.mark.slow
 def test_figures_have_the_names_and_units_of_the_plant(run, body_run):
     assert labels_of(plotting.levels(run))[::2] == [
         "angle $x_1$ [rad]",
@@ -105,18 +80,6 @@ def test_levels_of_plants_of_different_orders_are_refused(run, body_run):
         plotting.levels({"third": run, "second": made_up(chain(1))})
     with pytest.raises(ValueError, match="a component, 0 to 2"):
         plotting.levels(body_run, 3)
-
-
-@pytest.mark.slow
-def test_bounds_of_levels_mark_where_a_run_failed():
-    law = ij.controllers.BarrierBackstepping(k=(3.0, 10.0, 30.0))
-    scenario = pendulum(controller=law, bounds=(ANGLES, None, symmetric(2.0)))
-    with pytest.warns(UserWarning, match="Level 3"):
-        run = ij.simulate(scenario, duration=0.3, dt=5e-3)
-    (curve,) = curves_of(run)
-    first = int(np.argmax(np.abs(np.asarray(run.x)[:, 2, 0]) >= 2.0))
-    assert curve.exit_index("level_3", 0) == curve.exit_index("tau", 0) == first
-    assert curve.exit_index("q", 0) is None
 
 
 @pytest.mark.slow
@@ -160,15 +123,3 @@ def test_reports_show_levels_with_their_units(run, tmp_path):
     scenario = ij.report(pendulum(), tmp_path / "scenario.html").read_text()
     assert "3 levels: angle [rad], speed [rad/s], current [A]; input: input [V]" in scenario
     assert "1 component: pendulum" in scenario
-
-
-@pytest.mark.slow
-def test_a_sweep_reduces_a_metric_of_levels_to_the_worst_one():
-    points = {"controller.k[2]": [20.0, 30.0], "initial.x[2][0]": [0.0, 10.0]}
-    data = ij.sweep(pendulum(), points, duration=0.1, dt=1e-2)
-    figure = plotting.heat_map(data, "level_margin", x="controller.k[2]", y="initial.x[2][0]")
-    axes = figure.axes[0]
-    assert axes.get_ylabel() == "initial.x[2][0] [A]"
-    shown = axes.collections[0].get_array() if axes.collections else axes.images[0].get_array()
-    expected = data["level_margin"].min(("higher_level", "joint")).values
-    assert np.allclose(np.sort(np.ravel(shown)), np.sort(np.ravel(expected)))

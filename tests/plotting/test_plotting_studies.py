@@ -64,19 +64,6 @@ def test_scatter_shows_the_correlation(study):
 
 
 @pytest.mark.slow
-def test_a_heat_map_of_equal_values_says_so(table):
-    def title(**values):
-        metric = next(iter(values))
-        return drawn(plotting.heat_map(table.assign(values), metric)).axes[0].get_title()
-
-    dim = next(iter(table.margin.dims))
-    growing = table.margin + table[dim]
-    assert title(margin=growing) == ""
-    assert title(margin=0.0 * growing + 0.25).endswith("as margins of the start (t = 0) are")
-    assert title(fastest_mode=0.0 * growing.min("joint") + 0.25) == "equal at all points"
-
-
-@pytest.mark.slow
 def test_heat_maps_show_shares_and_medians(table):
     figure = drawn(plotting.heat_map(table, ["violated", "margin"]))
     maps = [axes for axes in figure.axes if axes.images and not axes.get_label()]

@@ -86,11 +86,3 @@ def test_results_that_are_withdrawn_are_not_there(monkeypatch):
     names = withdrawn.BENCHMARKS
     assert names
     assert not [name for name in names if (FOLDER / "results" / f"{name}.json").exists()]
-
-
-def test_a_commit_that_is_not_known_has_its_reason(monkeypatch, tmp_path):
-    monkeypatch.syspath_prepend(FOLDER)
-    timing = importlib.import_module("_timing")
-    assert timing.commit() == timing.machine()["commit"]
-    monkeypatch.setattr(timing.ij, "__file__", str(tmp_path / "iblf_jax" / "__init__.py"))
-    assert timing.commit().startswith("unknown: iblf_jax was imported from another folder")

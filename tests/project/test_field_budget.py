@@ -100,18 +100,6 @@ def test_two_barriers_give_one_law_up_to_a_weight():
     np.testing.assert_allclose(integral, 2.0 * log, rtol=1e-12)
 
 
-def test_a_refused_result_leaves_the_former_one(tmp_path, monkeypatch, capsys):
-    law = {"front": [{"level": 1.0, "error": 0.1, "left": ""}]}
-    result = {"laws": {"A": law, "B": law}, "processor_seconds": 1.0}
-    monkeypatch.setattr(equal_budget, "compare", lambda *arguments: result)
-    monkeypatch.setattr(sys, "argv", ["equal_budget.py", "--task", "T", "--out", str(tmp_path)])
-    (tmp_path / "T.json").write_text("{}")
-    assert equal_budget.main() == 1
-    assert "T: refused" in capsys.readouterr().out
-    assert (tmp_path / "T.json").read_text() == "{}"
-    assert json.loads((tmp_path / "T.json.part").read_text())["laws"] == result["laws"]
-
-
 # ---------------------------------------------------------------------------- the task
 
 
@@ -226,26 +214,6 @@ def test_readme_and_article_have_the_numbers_of_the_results():
 def test_the_page_has_all_tasks_and_what_a_law_does_not_keep():
     found = field_budget.results()
     check_page(found)
-    above = {"points": 258, "derivatives": 60, "left": "its effort is above the limit"}
-    front = [{"level": level, **above} for level in equal_budget.LEVELS]
-    published = found["liu_2018"]["laws"][equal_budget.PUBLISHED]
-    published["robustness"]["noise"][2] = "leaves the bounds"
-    other = {"gains": ["controller.k1"], "front": front, "robustness": None}
-    result = found["liu_2018"] | {
-        "laws": {equal_budget.PUBLISHED: published, "B": other},
-        "units": ["rad", "N m"],
-        "input_limits": [[-1.0, 1.0]],
-        "constraints": ["h [m]"],
-        "not_applicable": {"C": "it has no gains"},
-    }
-    page = field_budget.page({"liu_2018": result})
-    assert "| B | 0 of 1 | – |" in page
-    assert "| published law | 1 of 1 | 1 |" in page
-    assert "| – | B | its effort is above the limit |" in page
-    assert "1 of 5: leaves the" in page
-    assert "Limits of the input: -1 to 1 N m. Constraints: h \\[m\\]." in page
-    assert "Not in the table: C, it has no gains." in page
-    assert "Chosen, but without a result: " in page
 
 
 def check_page(found):

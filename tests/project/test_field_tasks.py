@@ -196,23 +196,6 @@ def test_a_result_that_is_not_one_of_the_task_is_refused(short):
     assert "within a period of 0.1 s" in external.faults_of(sampled, t, x, u)[0]
 
 
-def test_a_held_input_is_one_of_a_task_with_a_period(short):
-    task = short[0] | {"duration": 0.1}
-    sampled = task | {"sampling": {"period": 0.01, "delay": 0.0}}
-    t = np.linspace(0.0, 0.1, 21)
-    x, u = [np.array(task["start"])], []
-    for k, time in enumerate(t):
-        u.append(textbook(time, x[-1]) if k % 2 == 0 else u[-1])
-        one = np.array([time, time + 0.005])
-        x.append(integrated_held(task, one, x[-1], u[-1]))
-    assert external.faults_of(sampled, t, np.array(x[:-1]), np.array(u)) == []
-
-
-def integrated_held(task, times, x, u):
-    step = times[1:] - times[:1]
-    return external._integrated(task, times[:1], step, x[None], u[None], u[None], 8)[0]
-
-
 def test_numbers_of_a_result(short):
     task, t, x, u = short
     e = x[:, 0] - np.sin(t)

@@ -55,13 +55,6 @@ def is_progress(output: dict) -> bool:
     return "\r" in text or "%|" in text or any("widget" in kind for kind in output.get("data", {}))
 
 
-def test_a_draft_has_notebooks_that_were_not_executed(monkeypatch, tmp_path):
-    monkeypatch.setattr(build, "EXECUTED", tmp_path)
-    page = build.tutorial(NOTEBOOKS[0])
-    assert page.cells
-    assert not any(cell.get("outputs") for cell in page.cells)
-
-
 def test_a_bar_of_progress_is_found():
     assert is_progress({"output_type": "stream", "text": "tune:  40%|####      | 4/10"})
     assert is_progress({"data": {"application/vnd.jupyter.widget-view+json": {}}})
@@ -80,10 +73,6 @@ def test_a_notebook_is_installed_by_one_line_where_the_package_is_not(path):
     assert f'pip install "iblf_jax @ git+{found[2]}"' in start
     extras = set((found[1] or "[]")[1:-1].split(",")) - {""}
     assert extras == needed - {"notebooks"}  # such a service has what opens a notebook
-
-
-def test_there_are_notebooks():
-    assert "01_reproduce_the_paper.ipynb" in {path.name for path in NOTEBOOKS}
 
 
 def target_of_next(cells: list) -> Path:
@@ -119,6 +108,7 @@ def test_a_notebook_has_goals_prerequisites_exercises_and_a_link(path):
 
 
 def test_each_notebook_leads_to_the_next():
+    assert NOTEBOOKS[0].name == "01_reproduce_the_paper.ipynb"
     for path, following in itertools.pairwise(NOTEBOOKS):
         assert target_of_next(nbformat.read(path, as_version=4).cells) == following
 

@@ -228,15 +228,6 @@ def test_every_annotation_can_be_evaluated():
     assert wrong == {}
 
 
-@pytest.mark.parametrize(
-    "module", [m for m in MODULES if hasattr(m, "__all__")], ids=lambda m: m.__name__
-)
-def test_all_lists_what_exists(module):
-    """A missing comma joins two names into one that does not exist."""
-    assert [name for name in module.__all__ if not hasattr(module, name)] == []
-    assert len(set(module.__all__)) == len(module.__all__)
-
-
 def test_entry_points_document_arguments_returns_and_errors():
     for function in (ij.simulate, ij.with_parameters, ij.with_parts, ij.vector_field, ij.compare):
         words = ["Args:", "Returns:", "Raises:", *inspect.signature(function).parameters]

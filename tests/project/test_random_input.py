@@ -73,7 +73,7 @@ FIRST = {
     for name in entry_cases.arguments_of(entry)
 }
 """Argument -> the first entry point that has it.  There all values are tried; entry points that
-come later share what checks it, and try every fourth value."""
+come later share what checks it, and try every eighth value."""
 LONG = {
     *("tune", "pareto", "excitation", "recommended_dt", "presets.ur5", "presets.iiwa14"),
     *("presets.arm_scenario", "tuning.check", "cosimulate", "identify"),
@@ -117,14 +117,14 @@ def test_anything_in_the_place_of_any_argument(entry, tmp_path, monkeypatch):
     call goes on to its runs."""
     monkeypatch.chdir(tmp_path)
     place = list(entry_cases.entries()).index(entry)
-    fourth = {label: NASTY[label] for label in list(NASTY)[place % 4 :: 4]}
+    eighth = {label: NASTY[label] for label in list(NASTY)[place % 8 :: 8]}
     for name in entry_cases.arguments_of(entry):
         if name == "progress":
             continue
         is_first = FIRST[name] == entry
         with without_runs():
             call = lambda **given: entry_cases.call(entry, **given)  # noqa: E731
-            count = refusals(call, name, NASTY if is_first else fourth)
+            count = refusals(call, name, NASTY if is_first else eighth)
         assert count or not is_first or f"{entry} {name}" in ACCEPTED, name
     assert depth_left()
 
@@ -144,21 +144,8 @@ def test_anything_in_the_place_of_the_arguments_of_a_method(method, tmp_path, mo
 
 WORDS = [
     *("", " ", "9" * 5000, "x" * 5000, "a\0b", "\ud800", "a\nb", "[" * 3000 + "=1"),
-    *(
-        str(2**63),
-        "nan",
-        "-1",
-        "0",
-        "1e400",
-        "/",
-        "/dev/null",
-        "--",
-        "-",
-        "[1,2]",
-        "a=b",
-        "=",
-        "a=",
-    ),
+    *(str(2**63), "nan", "-1", "0", "1e400", "/", "/dev/null", "--", "-", "[1,2]"),
+    *("a=b", "=", "a="),
     *("law=7", "localhost:99999", "::1", ",", "rk5", "folder.toml", "folder.nc"),
     *("missing.toml", "missing/x.nc", "empty.toml", "loop.toml", "pipe.toml"),
     *("controller.K2=nan", "controller.K2=" + "[" * 5000, "plant.mass[999999999999]=1"),
@@ -199,14 +186,13 @@ def test_any_word_in_the_place_of_any_other_on_the_command_line(
     words, lines = itertools.cycle(WORDS), [fine]
     for action in COMMANDS[command]._actions[1:]:
         option = action.option_strings[0] if action.option_strings else ""
-        for word in itertools.islice(words, 2):
-            if not option:
-                lines.append([word, *fine[1:]])
-                continue
-            lines.append([*fine, option, word])
-            if action.nargs != 0:
-                lines.append([*fine, f"{option}={word}"])
-        lines.append([*fine, f"{option}=--"] if option else ["--"])
+        first, second = itertools.islice(words, 2)
+        if not option:
+            lines += [[first, *fine[1:]], [second, *fine[1:]], ["--"]]
+            continue
+        lines += [[*fine, option, first], [*fine, f"{option}=--"]]
+        if action.nargs != 0:
+            lines.append([*fine, f"{option}={second}"])
     codes = set()
     for line in lines:
         with without_runs():
@@ -312,7 +298,7 @@ def test_with_parameters(paper, path, value):
     assert changed <= {p.split("[")[0] for p in paths.expand(path)}
 
 
-@pytest.mark.parametrize("name", ["a\nb", "a]b", 'quo"te', "1", '"x"', "back\\slash", "\u2028"])
+@pytest.mark.parametrize("name", ["a\nb]\u2028", 'quo"te\\', "1", '"x"'])
 def test_names_of_links_of_any_characters(name, tmp_path):
     """Each listed path leads to its value, and back, in files too."""
     arm = ij.presets.ur5()

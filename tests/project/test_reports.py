@@ -11,7 +11,6 @@ import pytest
 from stored_results import stored
 
 import iblf_jax as ij
-from iblf_jax import reports
 
 
 class Results(dict):
@@ -75,33 +74,6 @@ def test_numbers_are_those_of_the_result(results):
     worst = np.sort(study.metrics.margin, axis=0)[7].min()  # the median of 16 runs
     row = re.search(r"<td[^>]*>margin</td>.*?</tr>", study._repr_html_())[0]
     assert f"{worst:.4g}" in row
-
-
-@pytest.mark.slow
-def test_a_title_does_not_repeat_the_name_of_the_class(results):
-    """Of every kind: the heading, then the numbers, without the class's name around them."""
-    for kind in set(SAYS) - {"TuneResult"}:  # the test below looks at its report
-        parts = reports.shown(results[kind])
-        assert f"{kind}(" not in " ".join(parts.words), kind
-        assert not parts.words[0].startswith(parts.title), kind
-    study = reports.shown(results["Study"])
-    assert study.title == "Monte-Carlo study: 15 of 16 runs keep the bounds"
-    run = reports.shown(results["Rollout"])
-    assert run.title == "Run: the bounds are kept"
-    assert run.words[1].startswith("smallest margin: ") and ", joint " in run.words[1]
-    assert study.words[0].startswith("16 runs of 0.1 s, dt = 0.002 s, seed 0")
-    assert reports.shown(results["Comparison"]).words == [
-        "2 laws, 0.1 s, dt = 0.002 s, rk4; worst joint"
-    ]
-
-
-@pytest.mark.slow
-def test_the_page_of_a_tuning_begins_with_its_report(results):
-    first, second, *rest = reports.shown(results["TuneResult"]).words
-    assert first.startswith("Report on 4 fresh runs")
-    assert second.strip().startswith("bounds violated: 0 (0 of 4 runs")
-    assert rest[-1].startswith("Search: ")
-    assert "TuneResult(" not in rest[-1]
 
 
 @pytest.mark.slow

@@ -71,16 +71,12 @@ FILES = {
         import iblf_jax as ij
         def tuned():
             return ij.tune()
-        def scene():
-            return "scene.txt"
         """,
     "tests/cases.py": """
         import iblf_jax as ij
         CASES = [ij.tune]
-        WORDS = []
         """,
     "tests/data/arm.urdf": "",
-    "tests/scene.txt": "",
     "docs/page.md": "",
     "README.md": "",
     "LICENSE": "",
@@ -90,10 +86,8 @@ TESTS = {
     "length": "from iblf_jax.world.robots import Arm\ndef test(): Arm().length()",
     "plot": "import iblf_jax as ij\ndef test(): ij.robots.Arm().plot()",
     "tune": "import iblf_jax as ij\ndef test(): ij.tune()",
-    "submodule": "import iblf_jax.tuning\ndef test(): iblf_jax.tuning.tune()",
     "fixture": "def test(tuned): ...",
     "helper": "from cases import CASES\ndef test(): CASES",
-    "words": "from cases import WORDS\ndef test(): WORDS",
     "proof": "import iblf_jax as ij\ndef test(): ij.proofs.page()",
     "all_names": "import iblf_jax as ij\ndef test(): [getattr(ij, x) for x in dir(ij)]",
     "script": "CODE = 'import iblf_jax as ij\\nij.tune()'\ndef test(): run(CODE)",
@@ -103,7 +97,6 @@ TESTS = {
     "data": "def test(): open('data/arm.urdf')",
     "pages": "def test(): ROOT.glob('*.md')",
     "site": "def test(): ROOT / 'docs' / 'page.md'",
-    "run_helper": "def test(): run('cases.py')",
 }
 
 
@@ -129,7 +122,7 @@ def names(graph: Graph, *changed: str) -> set[str] | None:
 
 USE_ALL = {"all_names", "command", "site"}
 """Tests that use the whole package."""
-TUNE = {"tune", "submodule", "fixture", "helper", "script", "run_helper"} | USE_ALL
+TUNE = {"tune", "fixture", "helper", "script"} | USE_ALL
 
 
 @pytest.mark.parametrize(
@@ -139,18 +132,15 @@ TUNE = {"tune", "submodule", "fixture", "helper", "script", "run_helper"} | USE_
         ("iblf_jax/world/links.py", {"length", "registered"} | USE_ALL),
         ("iblf_jax/plotting.py", {"plot", "command", "site"}),
         ("iblf_jax/tuning/search.py", {"by_name"} | TUNE),
-        ("iblf_jax/tuning/__init__.py", TUNE),
         ("iblf_jax/tuning/starts.py", {"by_name"} | TUNE),
         ("iblf_jax/proofs.py", {"proof"} | USE_ALL),
         ("iblf_jax/tuning/c/tune.h", {"by_name"} | TUNE),
-        ("tests/cases.py", {"helper", "words", "run_helper"}),
+        ("tests/cases.py", {"helper"}),
         ("tests/data/arm.urdf", {"data"}),
         ("tests/folder/test_tune.py", {"tune"}),
         ("tests/folder/test_that_was_removed.py", set()),
         ("docs/page.md", {"pages", "site"}),
-        ("docs/another/page.txt", {"site"}),
         ("README.md", {"pages"}),
-        ("tests/scene.txt", None),
     ],
 )
 def test_a_file_selects_the_tests_that_reach_it(graph, changed, tests):
@@ -165,33 +155,9 @@ def test_what_all_depend_on_or_nobody_knows_selects_all(graph, changed):
     assert names(graph, "tests/folder/test_tune.py", changed) is None
 
 
-# --- where a change begins ------------------------------------------------------------------------
-
-
-@pytest.fixture
-def repository(tmp_path, monkeypatch) -> Path:
-    """A repository with two commits on main, and two more on a branch, which is checked out."""
-    for name in [x for x in os.environ if x.startswith("GIT_")]:
-        monkeypatch.delenv(name)
-    monkeypatch.setattr(select_tests, "ROOT", tmp_path)
-    run(tmp_path, "init", "--quiet", "--initial-branch=main")
-    for name in ("a", "b"):
-        commit(tmp_path, name)
-    run(tmp_path, "checkout", "--quiet", "-b", "branch")
-    for name in ("c", "d"):
-        commit(tmp_path, name)
-    return tmp_path
-
-
-def run(folder: Path, *arguments: str) -> None:
+def git(folder: Path, *arguments: str) -> None:
     identity = ("-c", "user.name=A", "-c", "user.email=a@b.c")
     subprocess.run(["git", *identity, *arguments], cwd=folder, check=True, capture_output=True)
-
-
-def commit(folder: Path, name: str) -> None:
-    (folder / name).write_text(name)
-    run(folder, "add", name)
-    run(folder, "commit", "--quiet", "-m", name)
 
 
 def changed() -> list[str] | None:
@@ -200,29 +166,30 @@ def changed() -> list[str] | None:
     return None if base is None else select_tests.changed_files(base)
 
 
-def test_a_branch_changes_what_it_adds_to_main(repository):
-    (repository / "new").write_text("")
-    (repository / "a").write_text("another")
-    assert changed() == ["a", "c", "d", "new"]
-
-
-def test_a_merge_changes_what_it_adds_to_main(repository):
-    run(repository, "checkout", "--quiet", "main")
-    run(repository, "merge", "--quiet", "--no-ff", "branch")
-    assert changed() == ["c", "d"]
-
-
-def test_on_main_nobody_knows_where_the_change_begins(repository):
-    run(repository, "checkout", "--quiet", "main")
+def test_a_change_is_what_a_branch_or_a_merge_adds_to_main(tmp_path, monkeypatch):
+    """With two commits of a branch that has two more than main; on main itself it is not known."""
+    for name in [x for x in os.environ if x.startswith("GIT_")]:
+        monkeypatch.delenv(name)
+    monkeypatch.setattr(select_tests, "ROOT", tmp_path)
+    git(tmp_path, "init", "--quiet", "--initial-branch=main")
+    for name in "abcd":
+        if name == "c":
+            git(tmp_path, "checkout", "--quiet", "-b", "branch")
+        (tmp_path / name).write_text(name)
+        git(tmp_path, "add", name)
+        git(tmp_path, "commit", "--quiet", "-m", name)
+    (tmp_path / "new").write_text("")
+    (tmp_path / "b").unlink()
+    assert changed() == ["b", "c", "d", "new"]
+    (tmp_path / "new").unlink()
+    git(tmp_path, "checkout", "--quiet", "--force", "main")
     assert changed() is None
-
-
-def test_a_base_that_does_not_exist_is_not_known(repository):
+    git(tmp_path, "merge", "--quiet", "--no-ff", "branch")
+    assert changed() == ["c", "d"]
     assert select_tests.changed_files("0" * 40) is None
 
 
-def test_an_empty_base_selects_all(repository, graph, monkeypatch, capsys):
-    """Also on a branch, of which it is known where it begins."""
+def test_an_empty_base_selects_all(graph, monkeypatch, capsys):
     monkeypatch.setattr(select_tests, "Graph", lambda: graph)
     monkeypatch.setattr(sys, "argv", ["select_tests.py"])
     monkeypatch.setenv("BASE", "")
@@ -230,14 +197,6 @@ def test_an_empty_base_selects_all(repository, graph, monkeypatch, capsys):
     printed = capsys.readouterr()
     assert printed.out.split() == sorted(graph.distances)
     assert "not known where the change begins" in printed.err
-
-
-def test_a_removed_file_is_changed(repository):
-    (repository / "b").unlink()
-    assert changed() == ["b", "c", "d"]
-
-
-# --- this repository ------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -248,8 +207,7 @@ def test_changes_of_this_package():
     assert proofs >= {"arm_proofs", "attacks", "prove", "cli", "results", "site", "field"}
     assert not proofs & {"arm", "decays"}
     assert len(proofs) < len(graph.tests) / 2
-    barriers = names(graph, "iblf_jax/control/barriers/tan.py")
-    assert barriers >= {"decays", "laws"}
+    assert names(graph, "iblf_jax/control/barriers/tan.py") >= {"decays", "laws"}
     assert names(graph, "iblf_jax/deployment/ros2/templates/setup.cfg") >= {"ros_package"}
     assert names(graph, "tests/data/costs.json") >= {"costs"}
     assert names(graph, "tests/independent_chains.py") >= {"strict_feedback", "decays"}

@@ -94,13 +94,12 @@ def test_a_change_runs_the_slow_tests_of_the_files_that_it_reaches():
     assert slow - set(chosen) == {test for test in slow if test.startswith(one)} != set()
     assert any(test.startswith(one) for test in chosen) and slow & set(chosen)
     assert collected(f"{other} {one}")[0].startswith(other)
-    assert collected(f"{one} {other}")[0].startswith(one)
 
 
 @pytest.mark.slow
 def test_slow_tests_that_begin_late_are_skipped():
     """And the others run."""
-    names = "test_a_base_that_does_not_exist_is_not_known or test_changes_of_this_package"
+    names = "test_an_empty_base_selects_all or test_changes_of_this_package"
     file = str(ROOT / "tests" / "project" / "test_select_tests.py")
     printed = run_tests("-rs", "-k", names, file, SLOW_MINUTES="0")
     assert "slow, and not begun within 0 minutes" in printed

@@ -73,7 +73,8 @@ def test_names_docstrings_and_comments_are_standard_terms(folder):
     for path in [place] if place.is_file() else place.rglob("*.py"):
         source = path.read_text()
         assert not private_names(source), path
-        assert not private_words(prose_in(source)), path
+        if private_words(source):  # in code, too, where it is none
+            assert not private_words(prose_in(source)), path
 
 
 def test_pages_use_standard_terms():

@@ -676,20 +676,26 @@ def test_a_barrier_on_both_sides_contains_its_values_on_each(sign):
             assert least <= values.min() and values.max() <= most
 
 
+def rounded(q):
+    return 2.0 * READING * np.round(q / (2.0 * READING))
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("observer", STEPS)
-def test_runs_of_the_package_are_those_of_other_equations(observer):
+@pytest.mark.parametrize(
+    ("observer", "sensor", "measured"), [*((x, None, None) for x in STEPS), (POLES, ROUGH, rounded)]
+)
+def test_runs_of_the_package_are_those_of_other_equations(observer, sensor, measured):
     """A run from a point of the level set, with the estimate of its last sample."""
-    problem = problem_of_paper_loop(observer)
-    loop = own_loop(observer)
+    problem, loop = problem_of_paper_loop(observer, sensor), own_loop(observer, measured=measured)
     state, factor = loop.starts(1, LEVEL, 5)
     points, level = loop.points(state, factor)
     scenario = problem.scenario_at(points[0], problem.constants(WEIGHT, level[0]))
     run = ij.simulate(scenario, duration=6 * PERIOD, dt=PERIOD / 4)
     for k in range(6):
+        sample = loop.sample(state)
         np.testing.assert_allclose(run.q[4 * k], state[1][0], rtol=1e-8)
-        np.testing.assert_allclose(run.disturbance_estimate[4 * k], state[3][0], rtol=1e-6)
-        state = loop.moved(state, loop.sample(state), factor, PERIOD)
+        np.testing.assert_allclose(run.disturbance_estimate[4 * k], sample[1][0], rtol=1e-6)
+        state = loop.moved(state, sample, factor, PERIOD)
 
 
 class FirstEnclosures(OfStructure):
@@ -725,23 +731,6 @@ def test_differences_at_samples_of_two_links_contain_those_of_other_equations():
             largest = np.maximum(largest, np.abs(found))
         for k in range(2):
             assert np.median(high[k] / largest[k]) < 1.2
-
-
-@pytest.mark.slow
-def test_runs_of_the_package_with_rounded_positions_are_those_of_other_equations():
-    def rounded(q):
-        return 2.0 * READING * np.round(q / (2.0 * READING))
-
-    problem, loop = problem_of_paper_loop(POLES, ROUGH), own_loop(POLES, measured=rounded)
-    state, factor = loop.starts(1, LEVEL, 5)
-    points, level = loop.points(state, factor)
-    scenario = problem.scenario_at(points[0], problem.constants(WEIGHT, level[0]))
-    run = ij.simulate(scenario, duration=6 * PERIOD, dt=PERIOD / 4)
-    for k in range(6):
-        sample = loop.sample(state)
-        np.testing.assert_allclose(run.q[4 * k], state[1][0], rtol=1e-8)
-        np.testing.assert_allclose(run.disturbance_estimate[4 * k], sample[1][0], rtol=1e-6)
-        state = loop.moved(state, sample, factor, PERIOD)
 
 
 @pytest.mark.slow

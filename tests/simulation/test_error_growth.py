@@ -106,20 +106,6 @@ def test_the_stated_error_holds(name, rng):
         assert np.median(ratios) < 1000.0
 
 
-@pytest.mark.slow
-def test_a_fine_encoder_on_an_arm_of_six_joints_is_no_fault():
-    """At 500 Hz, where a code may differ: 131,072 counts are accurate, and the run says so."""
-    velocity = ij.sensors.FilteredDifference(cutoff=400.0)
-    arm = ij.with_parts(
-        ij.presets.ur5(),
-        sampling=ij.Sampling(period=2e-3),
-        sensor=ij.sensors.Encoder(counts=131072.0, velocity=velocity),
-    )
-    found = run(arm, 6.0, 2e-3)
-    assert found.ok
-    assert 0.0 < float(found.metrics[RELATIVE]) < TOLERANCE
-
-
 LIMIT_CYCLE = {
     "controller.K2": [5.41514, 1.61418],
     "controller.k1": [2.82538, 0.94105],
@@ -147,21 +133,6 @@ def test_a_limit_cycle_in_which_rounding_is_no_noise_is_covered():
         print(difference / stated)
         assert np.all(difference < stated)
         assert difference[1] > 4.0 * 2 * np.pi / 11409.0
-
-
-@pytest.mark.slow
-def test_a_loop_whose_codes_are_certain_has_the_error_of_the_open_loop():
-    """At an eighth of the step no code can differ, and the estimate falls with the fourth power."""
-    quantised = sampled(actuator=QUANTISER)
-    words = r"rounds a reading.*actuator\.step.*dt=0\.0002"
-    with pytest.warns(ij.SimulationWarning, match=words):
-        coarse = ij.simulate(quantised, duration=2.0, dt=2e-3)
-    fine = run(quantised, 2.0, 2.5e-4)
-    assert is_flagged(coarse) and not is_flagged(fine)
-    assert float(coarse.metrics[error_growth.BOUND]) > TOLERANCE
-    assert float(fine.metrics[error_growth.BOUND]) == 0.0
-    error = np.max(np.abs(fine.q[::8] - run(quantised, 2.0, 2e-3 / 32, 32).q))
-    assert error < float(np.max(fine.metrics.numerical_error)) < 200.0 * error
 
 
 def linearised(scenario):

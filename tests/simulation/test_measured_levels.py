@@ -103,21 +103,6 @@ def test_unmeasured_levels_of_a_flexible_joint(motor, all_measured):
     np.testing.assert_allclose(run.measured.higher[late, 0], theta, atol=1e-5)
 
 
-@pytest.mark.slow
-def test_a_law_of_robots_without_a_velocity_sensor():
-    """A StateObserver on a robot estimates q' and f from positions."""
-    paper = ij.presets.zhang_yan_2024(variant="corrected")
-    push = ij.disturbances.Step(size=[0.5, -0.3], time=0.0)
-    sensor = Levels((Direct(), None))
-    observer = ij.observers.StateObserver(bandwidth=300.0)
-    parts = {"observer": observer, "sensor": sensor, "disturbance": push}
-    sampled = ij.with_parts(paper, sampling=ij.Sampling(period=1e-3), **parts)
-    run = simulated(ij.with_parameters(sampled, {"controller.K2": 4.0}))
-    assert run.disturbance_estimate.shape == run.q.shape
-    np.testing.assert_allclose(run.disturbance_estimate[-1], [0.5, -0.3], atol=0.01)
-    np.testing.assert_allclose(run.measured.dq[-2], run.dq[-2], atol=0.01)
-
-
 # --- noise ----------------------------------------------------------------------------------------
 
 

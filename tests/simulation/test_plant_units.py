@@ -2,12 +2,11 @@
 
 import numpy as np
 import pytest
-from loops_of_plants import band, electric_drive, flexible_joint
+from loops_of_plants import flexible_joint
 from plant_cases import body, pendulum
 
 import iblf_jax as ij
 from iblf_jax.simulation.paths import get, unit_at
-from iblf_jax.simulation.units import signal_meanings, signal_unit
 
 
 @pytest.fixture(scope="module")
@@ -87,24 +86,6 @@ def test_levels_of_the_start_are_addressed_and_replaced():
             get(scenario, path)
 
 
-@pytest.mark.slow
-def test_metrics_and_signals_have_the_units_and_names_of_the_plant(pendulum_run):
-    scenario, units = pendulum_run.scenario, pendulum_run.metrics.units
-    assert units["ise"] == "rad^2 s" and units["effort"] == "V^2 s"
-    assert units["estimate_rmse"] == "rad/s; rad/s^2; A/s" and units["level_margin"] == "A"
-    of_body = ij.simulate(body(), duration=1.0, dt=1e-2).metrics
-    assert of_body.units["ise"] == "m^2 s, m^2 s, rad^2 s"
-    assert of_body.units["effort"] == "N^2 s, N^2 s, N^2 m^2 s"
-    assert of_body.units["numerical_error"] == "m, m, rad" and "m, m, rad" in repr(of_body)
-    assert (signal_unit(scenario, "tau"), signal_unit(scenario, "x")) == ("V", "rad; rad/s; A")
-    assert signal_unit(body(), "e1", 2) == "rad"
-    meanings = signal_meanings(scenario)
-    assert (meanings["q"], meanings["dq_upper"]) == ("angle", "upper bound of speed")
-    robot = ij.presets.zhang_yan_2024()
-    assert signal_meanings(robot)["q"] == "joint position"
-    assert signal_unit(robot, "disturbance") == "N m"
-
-
 def test_margins_of_all_levels(pendulum_run):
     x, alpha = np.asarray(pendulum_run.x), np.asarray(pendulum_run.x - pendulum_run.e)
     metrics = pendulum_run.metrics
@@ -116,16 +97,3 @@ def test_margins_of_all_levels(pendulum_run):
     assert np.allclose(metrics.alpha_margin, np.min(3.0 - np.abs(alpha[:, 1]), axis=0))
     assert metrics.first_level_violation_time == np.inf
     assert metrics.first_level_violation_level == -1
-
-
-@pytest.mark.slow
-def test_the_input_above_gravity_is_that_of_the_plant():
-    """A motor-driven arm at rest takes the voltage that holds it, and nothing above."""
-    law = ij.controllers.BarrierBackstepping(k=(3.0, 20.0, 60.0))
-    at_rest = ij.references.Sinusoid(offset=0.5, amplitude=0.0)
-    parts = {"reference": at_rest, "bounds": band(-0.2, 1.2), "initial": ij.Initial(q=[0.5, 0.5])}
-    folds = (ij.metrics.AboveGravity(), ij.metrics.Torque())
-    scenario = electric_drive(controller=law, **parts)
-    metrics = ij.simulate(scenario, duration=0.1, dt=1e-3, metrics=folds).metrics
-    assert metrics.units["effort_above_gravity"] == "V"
-    assert float(metrics.effort_above_gravity) < 1e-9 * float(np.max(metrics.torque_rms))

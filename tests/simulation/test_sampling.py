@@ -36,7 +36,10 @@ MOTOR = ij.actuators.Motor(
     no_load_speed=[6.0, 8.0],
 )
 OFFSET = np.array([1e-3, -2e-3])
+
+
 MOVED = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+
 ENCODER = ij.sensors.Encoder(
     counts=65536, offset=OFFSET, velocity=ij.sensors.FilteredDifference(cutoff=700.0)
 )
@@ -209,29 +212,6 @@ def test_a_drive_with_limits_is_that_of_an_independent_program():
 
 
 FILTERED = ij.sensors.FilteredDifference(cutoff=700.0)
-
-
-@pytest.mark.slow
-def test_batches_are_single_runs_and_backends_agree():
-    sensor = ij.sensors.Encoder(counts=65536, noise=1e-5, velocity=FILTERED)
-    scenario = ij.with_parts(SLOW, sampling=ij.Sampling(period=1e-3), sensor=sensor)
-    timing = {"duration": 0.08, "dt": 1e-3, "method": "heun"}
-    draws = {"plant.mass": ij.factor(ij.uniform(0.9, 1.1))}
-    study = ij.monte_carlo(scenario, draws, runs=3, seed=4, **timing)
-    run = study.replay(2)
-    assert np.allclose(run.metrics.rmse, study.metrics["rmse"][2], rtol=1e-12)
-    # The trajectory has the run's own noise.
-    again = np.sqrt(np.mean(run.e1**2, axis=0))
-    assert np.allclose(again, study.metrics["rmse"][2], rtol=1e-2)
-    first = ij.simulate(scenario, seed=4, **timing)
-    other = ij.simulate(scenario, seed=5, **timing)
-    assert np.any(first.measured.dq != other.measured.dq)
-    # Where nothing but the noise differs.
-    lone = ij.monte_carlo(scenario, {}, runs=2, seed=4, **timing)
-    assert np.any(lone.metrics["rmse"][0] != lone.metrics["rmse"][1])
-    assert np.allclose(lone.metrics["rmse"][0], first.metrics.rmse, rtol=1e-9)
-    by_scan = ij.simulate(scenario, seed=4, backend="vmap", **timing)
-    assert np.allclose(by_scan.q, first.q, atol=1e-12)
 
 
 @pytest.mark.slow
@@ -448,37 +428,6 @@ def test_ranges_end_where_a_count_is_more_than_the_drive_gives():
     assert np.all(layout(canonical(slower), gains, 1e-3, "rk4")[1].high < box.high)
     hopeless = ij.with_parts(scenario, actuator=ij.actuators.Motor(bandwidth=600.0, rate_limit=1.0))
     assert layout(canonical(hopeless), gains, 1e-3, "rk4")[1].reasons[0][1] == BY_PERIOD + TOGETHER
-
-
-@pytest.mark.slow
-def test_tuning_finds_its_way_out_of_a_loop_that_is_sampled_too_slowly():
-    """Where the loop grows from sample to sample its gradient points nowhere: the search begins at
-    gains with which it does not."""
-    scenario = ij.with_parts(PAPER, sampling=ij.Sampling(period=4e-3))
-    assert ij.simulate(scenario, duration=0.1, dt=1e-3, metrics=()).metrics.sampling_radius > 1
-    goal = ij.objectives.tracking() + 0.3 * ij.objectives.effort()
-    gains, effort = ["controller.K2", "observer.kf"], ij.tuning.Effort(iterations=6)
-    how = {"duration": 0.2, "dt": 1e-3, "progress": False}
-    best = ij.tune(scenario, gains, goal, effort=effort, **how)
-    run = ij.simulate(best.scenario, duration=0.1, dt=1e-3, metrics=())
-    assert run.metrics.sampling_radius < 1
-    assert not int(run.status) & int(Status.SAMPLING_TOO_SLOW)
-
-
-@pytest.mark.slow
-def test_a_step_with_the_poles_has_no_bias():
-    """f_hat lags by the robot's motion over a period otherwise.  Its poles are in
-    `control/test_observers`."""
-    scenario = ij.with_parts(SLOW, observer=ij.observers.ExtendedState(l1=100.0, l2=6000.0))
-    exact, poles, euler = (
-        np.max(ij.simulate(loop, duration=0.3, dt=1e-3).metrics.estimate_rmse)
-        for loop in (
-            ij.with_parts(scenario, sampling=ij.Sampling(2e-3, observer=way))
-            for way in ("exact", "poles", "euler")
-        )
-    )
-    assert poles < 0.5 * exact
-    assert poles < 1.2 * euler
 
 
 @pytest.mark.parametrize(

@@ -155,16 +155,6 @@ def test_a_filter_by_name_is_around_the_unconstrained_law():
     )  # a filter is a law's own, unlike a torque limit
 
 
-@pytest.mark.slow
-def test_a_law_without_a_factor_is_said_so():
-    # A limit far below what the integral form does: no gain makes this one work as hard.
-    capped = controllers.Saturated(law=controllers.PDGravity(Kp=60.0, Kd=20.0), limit=[8.0, 1.0])
-    comparison = ij.compare(SCENARIO, {"integral": "integral", "capped": capped}, **BRIEF)
-    assert math.isnan(comparison.factors["capped"])
-    assert "capped" not in comparison.equal_effort
-    assert "capped: no factor; its effort stays below" in repr(comparison)
-
-
 @ij.component
 class Bang:
     """A user's law without gains."""
@@ -198,31 +188,6 @@ def test_laws_of_a_users_own():
 
 
 @pytest.mark.slow
-def test_the_figure_shows_every_law_in_the_same_colour_on_both_sides(comparison):
-    figure = comparison.plot(joint=1)
-    assert len(figure.axes) == 6
-    left, right = (
-        {line.get_label(): line.get_color() for line in axes.lines} for axes in figure.axes[:2]
-    )
-    assert list(left)[:3] == ["integral", "log", "pd"]
-    assert left == right
-    fewer = dataclasses.replace(
-        comparison,
-        equal_effort={"integral": comparison.rollouts["integral"], "pd": comparison.rollouts["pd"]},
-    )
-    axes = fewer.plot().axes
-    assert {line.get_label(): line.get_color() for line in axes[1].lines}["pd"] == left["pd"]
-    assert [text.get_text() for text in axes[5].texts] == ["no factor"] + ["never"] * sum(
-        not np.isfinite(np.max(run.metrics.settling_time)) for run in fewer.equal_effort.values()
-    )
-    assert len(dataclasses.replace(comparison, factors={}, equal_effort={}).plot().axes) == 3
-    with pytest.raises(ValueError, match="joint"):
-        comparison.plot(joint=2)
-    with pytest.raises(ValueError, match=r"ij\.compare"):
-        ij.plotting.comparison(comparison.rollouts["log"])
-
-
-@pytest.mark.slow
 def test_command_line(tmp_path, capsys):
     words = ["--laws", "integral", "log", "--out", str(tmp_path / "out")]
     words += ["--duration", "2", "--record-every", "10"]
@@ -241,56 +206,6 @@ def test_command_line(tmp_path, capsys):
 
 
 # ------------------------------------------------------ efforts that do not grow with the factor
-
-
-@ij.component
-class Wavy:
-    """A PD law whose stiffness falls and rises with its gain k, and which is stiff in a band of
-    gains."""
-
-    gains = ("k",)
-    k: object = ij.leaf("1", sign="positive", shape="scalar", default=1.0)
-    low: object = ij.leaf("1", shape="scalar", default=1.17)
-    high: object = ij.leaf("1", shape="scalar", default=1.23)
-    damping: object = ij.leaf("N m s/rad", shape="scalar", default=4000.0)
-
-    def init(self, q, dq, context):
-        return ()
-
-    def command(self, t, q, dq, f_hat, context, state):
-        tube, L = context.tube(t), jnp.log(self.k)
-        Kp = 60.0 * jnp.maximum(1.0 + 2.0 * L + 0.7 * L**2, 0.05)
-        in_band = (self.k > self.low) & (self.k < self.high) | (self.k > 1.4) & (self.k < 1.6)
-        Kd = jnp.where(in_band, self.damping, 20.0)
-        tau = context.model.gravity(q) - Kp * (q - tube.q_d) - Kd * (dq - tube.dq_d)
-        never = jnp.zeros(q.shape, bool)
-        return controllers.Command(tau, tube.dq_d, jnp.zeros_like(q), never, never), ()
-
-
-@pytest.mark.slow
-def test_the_factor_nearest_one_is_found_beyond_trials_that_fail():
-    """The effort is the target's at 0.045 and at 1.28; the trials between 1.17 and 1.23 and from
-    1.4 to 1.6 fail."""
-    laws = {"at 1.28": Wavy(k=1.28), "at 1": Wavy()}
-    wavy = ij.compare(SCENARIO, laws, **BRIEF)
-    assert wavy.factors["at 1"] == pytest.approx(1.28, rel=1e-4)
-    found = wavy.searches["at 1"]
-    assert found.crossings == pytest.approx([1.28, 0.045], abs=0.002)
-    assert all(1.17 <= factor <= 1.23 or factor >= 1.4 for factor in found.failed)
-    assert "time step is too large" in next(why for x, why in found.failed.items() if x < 1.23)
-    text = repr(wavy)
-    [line] = [line for line in text.splitlines() if line.startswith("at 1: ")]
-    assert line == (
-        "at 1: factor 1.28; the nearest to 1 of 2 factors with this effort; with"
-        f" dt={found.smaller_dt:g} failed trials nearer to 1 may be valid."
-    )
-    assert found.smaller_dt < 1e-3
-    words = found.in_words()
-    assert "of which 1.28 is the nearest to 1" in words
-    assert f"{len(found.factors)} factors from 0.0312 to 32 were run" in words
-    data = json.loads(json.dumps(found.to_dict(), allow_nan=False))
-    assert len(data["trials"]["status"]) == len(found.factors)
-    assert {entry["factor"] for entry in data["failed"]} == set(found.failed)
 
 
 def banded(low, high, flags):

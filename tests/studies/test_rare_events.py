@@ -222,15 +222,6 @@ def test_the_bound_of_samples_around_a_distant_point_holds():
     assert half.probability == pytest.approx(2 * upper_bound(4096, 0.95))
 
 
-def test_the_limit_of_levels_is_reported():
-    found = subset_simulation(
-        linear(2, 6.0).margin, 2, runs=500, seed=0, share=0.1, levels=3, confidence=0.95
-    )
-    assert len(found.levels) == 3
-    assert "limit of 3 levels" in " ".join(found.notes)
-    assert found.probability >= stats.norm.sf(6.0)
-
-
 MARGINS = {
     "frequent": (lambda z: 0.5 - z[:, 0], 0.5),
     # As discrete parameters give: levels with ties, and a step below which floor gives 0.

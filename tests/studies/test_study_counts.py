@@ -18,7 +18,6 @@ from iblf_jax import Status
 from iblf_jax.core import progress
 from iblf_jax.core.status import FAILED
 from iblf_jax.kernels import messages
-from iblf_jax.studies import monte_carlo, sensitivity
 
 
 @pytest.fixture(scope="module")
@@ -84,35 +83,6 @@ def test_what_statistics_are_over_is_said(study):
     np.testing.assert_allclose(least, study.metrics.margin.min(0))
 
 
-def test_a_progress_bar_ends_where_it_should(monkeypatch):
-    shown = []
-
-    def bar(*args, **options):
-        shown.append(progress.bar(True, *args[1:], **options))
-        return shown[-1]
-
-    monkeypatch.setattr(monte_carlo, "bar", bar)
-    monkeypatch.setattr(sensitivity, "bar", bar)
-    cases.study(300)
-    ij.sensitivity(
-        ij.presets.zhang_yan_2024(), cases.perturbations(0.01, 0.003), points=64, **cases.options()
-    )
-    assert [(x.n, x.total) for x in shown] == [(300, 300), (320, 320)]
-
-
-@pytest.mark.parametrize(
-    ("watched", "seconds", "line"),
-    [(True, 0.3, "iblf_jax: g++ compiles\n"), (True, 0.0, ""), (False, 0.3, "")],
-)
-def test_a_slow_operation_is_announced_in_a_terminal(monkeypatch, capsys, watched, seconds, line):
-    monkeypatch.setattr(messages, "SLOW", 0.1)
-    monkeypatch.setattr(messages, "has_reader", lambda: watched)
-    with messages.announce_if_slow("g++ compiles"):
-        time.sleep(seconds)
-    time.sleep(0.2)
-    assert capsys.readouterr().err == line
-
-
 def test_the_line_of_a_notebook_is_replaced_and_not_in_stored_outputs(monkeypatch, capsys):
     shown = []
 
@@ -171,20 +141,3 @@ def test_a_slow_call_prints_one_line_or_a_bar(monkeypatch, capsys, options, has_
 
     assert (with_bar() if has_bar else outer(**options)) == "sum"
     assert capsys.readouterr().err == ("iblf_jax: adding up\n" if shown else "")
-
-
-@pytest.mark.parametrize(
-    "call",
-    [
-        lambda: ij.simulate(ij.presets.zhang_yan_2024(), duration=0.01, dt=1e-3),
-        lambda: cases.study(3),
-    ],
-)
-def test_calls_that_compile_have_a_line(monkeypatch, capsys, call):
-    monkeypatch.setattr(messages, "SLOW", 0.0)
-    monkeypatch.setattr(messages, "has_reader", lambda: True)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        call()
-    first = capsys.readouterr().err.splitlines()[0]
-    assert first.startswith(("iblf_jax: simulating", "iblf_jax: compiling the program of a study"))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import tomllib
 from types import SimpleNamespace
 from typing import NamedTuple
@@ -97,19 +96,6 @@ def test_the_most_likely_failure_fails_again(rare):
     run = likely.replay(record_every=5)
     assert has_flag(run.status, Status.BOUND_VIOLATED)
     np.testing.assert_allclose(np.min(run.metrics.margin), likely.margin, atol=1e-9)
-
-
-@pytest.mark.slow
-def test_the_words_of_a_result(rare):
-    found, _, _ = rare
-    text = repr(found)
-    assert re.match(r"FailureProbability\(\S+e-0\d, 95% interval \S+ to \S+, coefficient", text)
-    for words in ("Subset simulation with", "most likely failure found: distance 4.8", "l.q[1]"):
-        assert words in text
-    data = found.to_xarray()
-    assert data.z.shape == found.failures.z.shape
-    assert data.attrs["estimate"] == found.estimate
-    assert data["initial.q[1]"].shape == (len(found.failures),)
 
 
 @pytest.mark.slow
@@ -263,34 +249,6 @@ def test_a_run_without_a_margin_fails(scenario, monkeypatch):
     assert found.excluded == 0
 
 
-@pytest.mark.slow
-def test_importance_sampling_without_failures_reports_subset_simulation(
-    scenario, rare, monkeypatch
-):
-    _, perturbations, probability = rare
-    sample = _failure_probability.importance_sampling
-
-    def without_failures(limit_state, points, **options):
-        return sample(lambda z: np.ones(len(z)), points, **options)
-
-    monkeypatch.setattr(_failure_probability, "importance_sampling", without_failures)
-    found = failure_probability(scenario, perturbations, estimator="importance", runs=100)
-    assert found.estimator == "subset"
-    assert not found.is_upper_bound
-    assert 0.1 < found.estimate / probability < 10  # from 500 samples of a level
-    assert "reported instead" in found.notes[0]
-
-
-def test_a_few_samples_of_subset_simulation_refute_importance_sampling_only_by_far():
-    """500 samples of a level have a coefficient of variation above 0.5."""
-    estimate = SimpleNamespace(high=1.2e-6)
-    near = SimpleNamespace(probability=6e-6, coefficient_of_variation=0.6)
-    far = SimpleNamespace(probability=6e-5, coefficient_of_variation=0.6)
-    assert _failure_probability._missed_by_importance(estimate, near) == ()
-    (note,) = _failure_probability._missed_by_importance(estimate, far)
-    assert "probably do not represent all failures" in note
-
-
 class AnalyticSpace:
     """A margin of several pieces in place of runs.
 
@@ -413,20 +371,6 @@ def test_the_check_keeps_an_estimate_that_it_confirms():
         first, checked = checked_estimate(lambda z: 4.75 - z[:, :1], [[-1.0, 0.0]], seed)
         replaced += checked.estimate.estimator != first.estimator
     assert replaced <= 2
-
-
-@pytest.mark.slow
-def test_a_note_says_that_chains_cannot_follow_noise(scenario):
-    noisy = ij.with_parts(scenario, process_noise=ij.process_noise.Additive(0.2))
-    perturbations, distance = start_perturbations(scenario, 4.0)
-    with pytest.raises(ValueError, match=r"method: got 'rk4'.*method=.euler_maruyama"):
-        ij.failure_probability(noisy, perturbations, duration=0.02)
-    options = {"method": "euler_maruyama", "runs": 300}
-    found = failure_probability(noisy, perturbations, **options)
-    assert "Markov chains" in found.notes[-1]
-    assert found.interval[0] < exact(distance, 4.0) < found.interval[1]
-    crude = failure_probability(noisy, perturbations, estimator="monte_carlo", **options)
-    assert not any("Markov chains" in note for note in crude.notes)
 
 
 def test_noise_is_a_function_of_the_point():

@@ -2,7 +2,6 @@
 
 import types
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
@@ -72,20 +71,6 @@ def test_the_gradient_by_208_numbers_is_that_of_central_differences(scheduled):
     losses = evaluation.values(problem, points).loss
     slopes = (losses[:4] - losses[4:]) / (2 * step)
     np.testing.assert_allclose(directions @ gradient, slopes, rtol=1e-5)
-
-
-@pytest.mark.slow
-def test_both_modes_have_the_same_gradient_of_a_sampled_loop_with_noise_and_a_requirement(paper):
-    sensor = ij.sensors.Encoder(noise=1e-4, velocity=ij.sensors.Measured(noise=1e-3))
-    scenario = ij.with_parts(paper, sensor=sensor, sampling=ij.Sampling(2e-3))
-    gains, wanted = ["controller.K2", "controller.k1"], goal() + objectives.peak_torque_below(5.0)
-    options = {"duration": 0.1, "dt": 1e-3, "perturbations": DRAWS, "runs": 3}
-    problem = TuningProblem.build(scenario, gains, wanted, **options).for_solver(LBFGS())
-    candidates = problem.candidates(problem.box.z[None])
-    reverse = evaluation.reverse_derivatives(problem, candidates)
-    forward = evaluation.forward_derivatives(problem, candidates)
-    np.testing.assert_allclose(reverse.gradient, forward.gradient, rtol=1e-10)
-    np.testing.assert_allclose(reverse.value.loss, forward.value.loss, rtol=1e-12)
 
 
 @pytest.mark.slow
@@ -183,25 +168,6 @@ def test_a_mini_batch_without_the_worst_runs_warns(risk):
         solver.step(evaluate, solver.init(evaluate.space, np.ones((1, 2))), 0.0)
 
 
-@pytest.mark.slow
-def test_other_optimisers_survive_points_without_a_finite_loss():
-    class Cliff(Bowls):
-        def __call__(self, z):
-            found = super().__call__(z)
-            beyond = z[:, :1] > 0.5
-            gradient = np.where(beyond, np.nan, found.gradient * 10.0)
-            return found._replace(gradient=gradient)
-
-    evaluate = Cliff()
-    evaluate.centres += 0.6 - evaluate.centres.mean(axis=0)
-    solver = Optax(optax.chain(optax.adam(0.1), optax.contrib.reduce_on_plateau()))
-    state = solver.init(evaluate.space, np.full((1, 2), -1.0))
-    z, found = steps(solver, evaluate, state, 60)
-    assert np.all(np.isfinite(z))
-    assert min(value.loss[0] for value in found) < 0.7 * found[0].loss[0]
-    assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(state["inner"]))
-
-
 @pytest.mark.parametrize(
     ("solver", "words"),
     [
@@ -230,14 +196,6 @@ def test_a_checkpoint_knows_the_numbers_of_an_optimiser():
     ]:
         one, other = (described_solver(Optax(make(x)), 60) for x in numbers)
         assert one != other
-
-
-def test_a_solver_without_known_options_has_no_checkpoint():
-    class Own:
-        name = "own"
-
-    with pytest.raises(ValueError, match="a solver whose class is a dataclass"):
-        described_solver(Own(), 60)
 
 
 @pytest.mark.slow

@@ -17,7 +17,6 @@ from iblf_jax.files.tuning import load_tuning_file
 from iblf_jax.testing import ContractError
 from iblf_jax.testing.metrics import samples
 from iblf_jax.tuning import quantities
-from iblf_jax.tuning.objectives import for_scenario
 from iblf_jax.tuning.quantities import MetricResult, Quantities
 
 TUNING = {"duration": 0.5, "dt": 1e-3, "method": "euler", "report": ij.tuning.Report(runs=1)}
@@ -162,18 +161,8 @@ def test_a_quantity_of_ones_own_passes():
 
 BROKEN = {
     "bare": ("finish", lambda self, acc: acc, "(smooth value, exact value, pieces)"),
-    "pieces": (
-        "finish",
-        lambda self, acc: (acc, acc, acc),
-        "the pieces of finish(acc) have shape ()",
-    ),
     "largest": ("finish", lambda self, acc: (acc, acc, 2 * acc[None]), "the largest of its pieces"),
     "grows": ("update", lambda self, acc, sample: acc + sample.dq, "which a scan carries"),
-    "not outer": (
-        "curvature",
-        lambda self, acc, sample: sample.dq,
-        "iblf_jax.engine.derivatives.Outer",
-    ),
     "row": ("hessian", lambda self, products, *_: products[0], "hessian gives shape"),
     "triangle": ("hessian", lambda self, products, *_: jnp.triu(products), "not symmetric"),
     "root": (
@@ -185,11 +174,6 @@ BROKEN = {
         "finish",
         lambda self, acc: (jax.lax.stop_gradient(acc), acc, acc[None]),
         "differs from its finite difference",
-    ),
-    "float64": (
-        "init",
-        lambda self, sample: jnp.zeros((), "float64"),
-        "the smooth value is float64 for float32 arguments",
     ),
 }
 
@@ -319,23 +303,16 @@ def test_limits_of_single_joints_and_weights(three_joints):
             r"peak_torque_below: limit: got -5.*> 0.*peak_torque_below\(limit=140.0\)",
         ),
         (lambda o: o.peak_torque_below("much"), r"peak_torque_below: limit: got 'much'"),
-        (lambda o: o.error_below([0.1, 0.0]), r"error_below: limit: got \[0.1"),
         (lambda o: o.velocity_margin_above(np.nan), "velocity_margin_above: limit"),
-        (lambda o: o.peak_torque(0.0), "peak_torque: limit"),
         (lambda o: o.margin(-0.1), "margin: target"),
-        (lambda o: o.effort(scale=0.0), "effort: scale"),
         (lambda o: o.metric(Swing(), "swing", scale=-1.0), r"scale: .* numbers > 0"),
         (lambda o: o.metric("tracking", "rmse"), r"MetricResult.fold: got 'tracking', expected a"),
-        (lambda o: o.error_below(0.1, allowed=2.0), "error_below: allowed"),
         (lambda o: o.violation_probability_below(1.5), "violation_probability_below: probability"),
         (lambda o: o.tracking(joints=[True, 1]), "tracking: joints.*cannot be mixed"),
         (lambda o: o.tracking(joints=True), "tracking: joints"),
         (lambda o: o.effort(joints=[1.0, 0.0]), r"effort: joints: got \[1.0.*weights="),
-        (lambda o: o.effort(joints=np.array([0.5])), "effort: joints: got .*weights="),
         (lambda o: o.effort(joints=2.0), "effort: joints: got 2.0.*weights="),
         (lambda o: o.tracking(joints=[]), "tracking: joints.*at least one joint"),
-        (lambda o: o.tracking(joints={0}), "tracking: joints"),
-        (lambda o: o.tracking(weights=[[1.0]]), "tracking: weights"),
         (lambda o: o.peak_torque_below([1, 2], weights=[1, 2, 3]), "peak_torque_below: weights"),
         (lambda o: o.peak_torque_below(5.0, weights=-1.0), "below: weights: got -1.*>= 0"),
         (lambda o: o.tracking(weights=[0.0, 0.0]), "tracking: weights: got .*least one weight > 0"),
@@ -354,13 +331,11 @@ def test_errors_name_the_argument_of_the_function(call, message):
         (lambda o: o.tracking(joints=[1, 1]), "tracking: joints.*joint 1 twice.*weights="),
         (lambda o: o.tracking(joints=[True]), "tracking: joints.*2 truth values"),
         (lambda o: o.tracking(joints="joint 2"), "tracking: joints: got 'joint 2'.*Did you mean"),
-        (lambda o: o.tracking(joints="2:"), "tracking: joints.*at least one joint"),
         (lambda o: o.tracking(weights=[1, 2, 3]), r"tracking: weights.*\(3,\)"),
         (
             lambda o: o.tracking() + o.peak_torque_below([1, 2, 3]),
             r"peak_torque_below: limit: got \[1. 2. 3.\].*2, one for each",
         ),
-        (lambda o: o.tracking() + o.error_below(0.1, joints=3), "error_below: joints: got 3"),
     ],
 )
 def test_joints_that_the_robot_does_not_have(goal, message, paper):
@@ -372,18 +347,6 @@ def test_the_name_of_a_requirement_calls_a_slice_joints():
     below = ij.objectives.error_below
     assert "of joints 0:2 <" in below(0.1, joints=slice(0, 2)).name
     assert "of joint 1 <" in below(0.1, joints=1).name
-
-
-@pytest.mark.slow
-def test_names_of_joints_become_indices():
-    scenario = ij.presets.ur5()
-    names = scenario.plant.joints
-    goal = ij.objectives.tracking(joints=[names[1], names[4]])
-    goal += ij.objectives.peak_torque_below([140, 27], joints=list(names[2:4]))
-    known = for_scenario(goal, scenario)
-    assert [quantity.joints for quantity in known.quantities] == [(1, 4), (2, 3)]
-    expected = f"peak torque of joints {names[2]}, {names[3]} < [140, 27] N m"
-    assert goal.requirements[0].name == expected
 
 
 def test_a_tuning_file_selects_joints_by_name_index_and_slice(tmp_path):

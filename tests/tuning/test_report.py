@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import iblf_jax as ij
-from iblf_jax import objectives, reports
+from iblf_jax import objectives
 from iblf_jax.cli.tune import _has_failed
 from iblf_jax.studies.statistics import probability
 from iblf_jax.tuning import confirmation
@@ -92,18 +91,6 @@ def test_the_perturbation_that_decides_is_found_with_its_side(paper, failing, si
     text = f"{failed.sum()} of 400 runs left their bounds; most influential: plant.mass[1], "
     assert str(found).startswith(text)
     assert f"rank statistic {influence.statistic:.3g}" in str(found)
-
-
-@pytest.mark.slow
-def test_noise_is_seldom_called_an_influence(paper):
-    """Failures without a cause: with a level of 5 %, 200 of them are explained 10 times at most on
-    average."""
-    failed = np.random.default_rng(3).uniform(size=(200, 200)) < 0.1
-    found = [explained(paper, drawn(NAMES, 200, seed), failed[seed]) for seed in range(200)]
-    assert 0 < sum(x.is_explained for x in found) <= 16
-    example = str(next(x for x in found if not x.is_explained))
-    assert "no single perturbation separates them: the nearest is" in example
-    assert "chance gives one as large with probability" in example
 
 
 def test_a_weak_influence_is_called_unclear(paper):
@@ -250,18 +237,6 @@ def test_a_held_torque_is_one_of_a_sampled_loop_without_a_lag(paper):
     assert not has_rate_of_held_torque(paper, rate)
 
 
-def test_a_search_that_is_stuck_names_the_step_only_if_half_of_it_differs():
-    def words(requirements=(), **check):
-        setup = SimpleNamespace(objective=SimpleNamespace(requirements=requirements))
-        result = SimpleNamespace(step_check=made_up_check(**check), setup=setup)
-        return TuneResult._no_optimum_in_words(result)
-
-    assert "dt" not in words()
-    assert words().startswith("WARNING: better gains may exist: the slope")
-    assert words(requirements=("a",)).startswith("WARNING: these gains keep the requirements in")
-    assert "the time step is too long; take a smaller dt" in words(objective=(1.0, 1.02))
-
-
 # ---------------------------------------------------------------------------------------- the order
 
 
@@ -377,23 +352,6 @@ def test_a_sampled_loop_that_is_unstable_in_some_runs_is_in_headline_and_text():
     assert f"-> 1.005; stable below 1; WARNING: with the tuned gains {words}" in str(unstable)
     assert unstable.headline == "bounds kept; the sampled loop is UNSTABLE in 3 of 100 runs"
     assert "sampling_radius" not in str(made_up_report(0, {}))
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore")  # of the unstable runs
-def test_the_largest_radius_of_the_fresh_runs_is_that_of_a_study_with_the_same_seed(paper):
-    """K2 of the first gains is stable at 2 ms, and that of the tuned ones is not."""
-    sampled = ij.with_parts(paper, sampling=ij.Sampling(2e-3))
-    slow = ij.with_parameters(sampled, {"controller.K2": 5.0})
-    gains = {"controller.K2": np.array([40.0, 40.0])}
-    draws = {"plant.mass": ij.factor(ij.uniform(0.8, 1.2))}
-    report = result_of(slow, gains, goal_of(50.0), perturbations=draws, runs=4).report
-    studies = [study_of_report(s, draws) for s in (slow, ij.with_parameters(slow, gains))]
-    radii = [np.max(study.metrics.sampling_radius) for study in studies]
-    np.testing.assert_allclose(report.sampling_radius, radii, rtol=1e-6)
-    flagged = [np.asarray(s.status) & int(ij.Status.SAMPLING_TOO_SLOW) != 0 for s in studies]
-    assert report.unstable == tuple(int(x.sum()) for x in flagged)
-    assert report.unstable[0] == 0 and report.unstable[1] > 0
 
 
 def test_violations_within_a_requirement_on_their_probability_are_no_failure():
@@ -535,30 +493,6 @@ def test_failed_fresh_runs_are_those_of_a_study_with_the_seed_of_the_report(pape
 
 
 @pytest.mark.slow
-def test_text_and_card_begin_with_what_failed(loose):
-    card = loose._repr_html_()
-    assert "Tuning: 1 of 2 requirements FAILED; 200 of 200 fresh runs keep the bounds" in card
-    assert reports.shown(loose).words[1].strip().startswith("bounds violated")
-    text = repr(loose)
-    assert text.index("200 fresh runs: bounds kept; 1 of 2") < text.index("controller.K2: ")
-    assert loose.report.to_dict()["failures"][0]["influence"]["path"] == "initial.q[1]"
-
-
-@pytest.mark.slow
-def test_a_violated_bound_is_in_every_presentation(paper):
-    weak = ij.with_parameters(paper, {"initial.dq": [10.0, 10.0]})
-    gains = {"controller.k1": np.full(2, 0.3), "controller.K2": np.full(2, 1.0)}
-    result = result_of(weak, gains, goal_of(12.0))
-    words = "WARNING: of 1 run of the tuning, leave their bounds or diverge: 1 at dt, 1 at dt / 2"
-    assert repr(result).splitlines()[1].strip() == words
-    assert words in str(result.report)
-    assert result.report.headline.startswith("bounds VIOLATED")
-    title = "Tuning: 2 of 2 requirements FAILED; the nominal run leaves its bounds"
-    assert title in result._repr_html_()
-    assert _has_failed(result.report)
-
-
-@pytest.mark.slow
 def test_runs_that_were_drawn_outside_their_bounds_are_counted(paper):
     """The upper bound is 0.1 rad above the start, which is drawn up to 0.12 rad away."""
     drawn_start = {"initial.q": ij.offset(ij.uniform([0.0, -0.12], [1e-6, 0.12]))}
@@ -570,19 +504,3 @@ def test_runs_that_were_drawn_outside_their_bounds_are_counted(paper):
     assert first.count == result.report.violation[1].count == study.violation_probability.count
     assert first.influence.path == "initial.q[1]" and first.influence.side == "larger"
     assert f"({first.started_outside} of them started outside" in str(result.report)
-
-
-@pytest.mark.slow
-def test_runs_that_differ_in_noise_only_are_fresh_too(paper):
-    sensor = ij.sensors.Encoder(velocity=ij.sensors.Measured(noise=0.05))
-    noisy = dataclasses.replace(paper, sampling=ij.Sampling(period=2e-3), sensor=sensor)
-    gains = {"controller.K2": np.array([4.0, 1.0])}
-    result = result_of(noisy, gains, goal_of(8.0), runs=4)
-    assert (result.step_check.runs, result.step_check.seed) == (4, 0)
-    report = result.report
-    assert (report.runs, report.seed) == (200, 7)
-    (found,) = report.failures
-    assert 0 < found.count < 200 and found.influence is None
-    assert "no perturbation differs between the runs" in str(report)
-    with pytest.raises(ValueError, match="fresh"):
-        result.check(seed=0)

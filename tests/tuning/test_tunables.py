@@ -108,19 +108,6 @@ def test_default_ranges_of_filters_keep_the_loop_stable(lab):
 
 
 @pytest.mark.slow
-def test_a_time_constant_has_a_lower_end_and_a_gain_an_upper_one(lab):
-    law = lab.controller
-    surface = ij.controllers.DynamicSurface(k1=law.k1, K2=law.K2, filter=0.01, weight=law.weight)
-    scenario = canonical(ij.with_parts(lab, controller=surface))
-    low, high, (below, _) = ends(scenario, "controller.filter")
-    assert below == ranges.BY_PERIOD
-    assert np.all((low < 0.01) & (high > 0.01))
-    assert not ranges.sampled_too_slowly(ij.with_parameters(scenario, {"controller.filter": low}))
-    below_it = ij.with_parameters(scenario, {"controller.filter": 0.9 * low})
-    assert ranges.sampled_too_slowly(below_it)
-
-
-@pytest.mark.slow
 def test_the_range_of_an_unstable_start_ends_close_to_it_and_says_so(lab):
     unstable = ij.with_parameters(lab, {"controller.K2": 20.0})
     assert ranges.sampled_too_slowly(unstable)
@@ -158,20 +145,6 @@ def test_a_delay_needs_a_queue_that_holds_its_commands(lab):
     at_once = canonical(ij.with_parts(lab, sampling=ij.Sampling(period=2e-3)))
     with pytest.raises(ValueError, match=r"Sampling.queue: got 0.*queue=1"):
         ends(at_once, "sampling.delay")
-
-
-@pytest.mark.slow
-def test_gains_of_all_levels_reach_what_the_step_follows():
-    drive = canonical(loops_of_plants.electric_drive())
-    low, high, (below, above) = ends(drive, "controller.k")
-    assert (below, above) == (ranges.BY_SIGN, ranges.BY_STEP)
-    np.testing.assert_array_equal(low, np.zeros_like(low))
-    gains = np.reshape(high, drive.controller.k.shape)
-    conditions = ranges.Conditions(drive, DT, "rk4")
-    assert not conditions.violated({"controller.k": gains})
-    assert conditions.violated({"controller.k": 1.05 * gains}) == ranges.BY_STEP
-    alone = ends(drive, "controller.k[0]")[1]
-    assert np.all(alone > gains[0])
 
 
 @pytest.mark.slow

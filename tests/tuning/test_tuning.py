@@ -17,8 +17,6 @@ import pytest
 
 import iblf_jax as ij
 from iblf_jax.core import checks
-from iblf_jax.engine.batch import Batch, carry_shapes
-from iblf_jax.engine.carry import Inputs
 from iblf_jax.engine.step_size import fastest_along
 from iblf_jax.files.tuning import load_tuning_file
 from iblf_jax.simulation.integrators import tableau
@@ -31,7 +29,6 @@ from iblf_jax.tuning import (
     TrustConstr,
     _tune,
     evaluation,
-    starts,
 )
 from iblf_jax.tuning.checkpoints import load_checkpoint, save_checkpoint
 from iblf_jax.tuning.conflicts import conflicts_in_words
@@ -42,7 +39,6 @@ from iblf_jax.tuning.quantities import Peak, Quantities, TimeIntegral
 from iblf_jax.tuning.ranges import BY_STEP, BY_THEOREM, STABILITY_FRACTION, TIMES, TOGETHER
 from iblf_jax.tuning.result import FEW_STARTS_NEAR, STUCK
 from iblf_jax.tuning.robust import Risk, combine
-from iblf_jax.tuning.rollouts import fold_of
 from iblf_jax.tuning.search import (
     REPAIR,
     SAME_OBJECTIVE,
@@ -54,14 +50,7 @@ from iblf_jax.tuning.search import (
 from iblf_jax.tuning.solvers import Constraints, SearchSpace, quadratic
 from iblf_jax.tuning.solvers.sqp import Subproblem, subproblems
 from iblf_jax.tuning.starts import (
-    FAR,
-    NEAR,
-    Screening,
-    distinct,
-    number_of_starts,
     ranked,
-    screened,
-    spread_points,
 )
 
 objectives = ij.objectives
@@ -126,23 +115,6 @@ def test_the_gauss_newton_matrix_is_that_of_the_signals(paper, nominal):
     candidates = nominal.candidates(z[None])._replace(weights=np.ones((1, 1)))
     found = evaluation.forward_derivatives(single, candidates).hessian[0] * only.terms[0].scale
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-9 * np.max(expected))
-
-
-@pytest.mark.slow
-def test_reverse_mode_remembers_few_states(paper):
-    """Temporary memory of the gradient by the scan grows like the cube root of the number of steps,
-    and stays below 2 sqrt(T) states.  (That of kernels: `tests/engine/test_adjoint.py`.)"""
-    sizes = {}
-    for steps in (500, 4000):
-        options = SHORT | {"duration": steps * 1e-3, "backend": "vmap"}
-        built = TuningProblem.build(paper, GAINS, objective(), **options)
-        program = evaluation.reverse_derivatives.lower(built, built.candidates(built.box.z[None]))
-        sizes[steps] = program.compile().memory_analysis().temp_size_in_bytes
-    folds = fold_of(built.objective, jnp.float64)
-    inputs = Inputs(canonical(paper), folds, built.dt, built.dt)
-    carried = jax.tree.leaves(carry_shapes(Batch.of(inputs, None), "rk4"))
-    state = sum(x.size * x.dtype.itemsize for x in carried)
-    assert sizes[4000] - sizes[500] < 2 * (np.sqrt(4000) - np.sqrt(500)) * state
 
 
 # ------------------------------------------------------------------------------------ quantities
@@ -432,23 +404,6 @@ def search_from(function, starts, selection=2, z=0.0, begin=None, **more):
     return Search(evaluator_of(function, begin, z), SQP(), begin, strategy)
 
 
-def test_points_are_spread_near_and_far_and_the_starts_differ():
-    box = Box(np.full(7, -0.6), np.full(7, -4.0), np.full(7, 1.0))
-    points = spread_points(box, 120, seed=0)
-    distance = np.max(np.abs(points - box.z), axis=1)
-    assert np.sum(distance <= NEAR) >= 40 and np.sum(distance <= FAR) >= 80
-    at_ends = np.mean((points[2::3] == -4.0) | (points[2::3] == 1.0))
-    assert 0.4 < at_ends < 0.6
-    assert np.all(points <= 1.0)
-    screening = ranked(points, valleys(points).value)
-    order = screening.order()
-    z = distinct(screening, [order], 5, box, lambda z: np.array_equal(z, points[order[0]]))
-    assert not np.any(np.all(z == points[order[0]], axis=1))  # the best one is refused
-    for i in range(5):
-        for j in range(i):
-            assert np.max(np.abs(z[i] - z[j])) >= 1.0
-
-
 def test_a_search_from_several_starts_goes_on_in_the_deeper_valley():
     search = search_from(valleys, rows(-1.6, -0.4, 0.5, 1.9), z=-0.6)
     assert search.run(60) == "converged"
@@ -457,24 +412,6 @@ def test_a_search_from_several_starts_goes_on_in_the_deeper_valley():
     assert search.state.retired.sum() >= 2 and search.state.phase == 0
     found = search.conditions()
     assert found.hold and np.max(np.abs(found.residuals)) < 1e-3
-
-
-def test_a_second_search_begins_at_the_best_gains_and_at_the_best_points_around_them():
-    more = {"begin": rows(0.5, 1.9, 1.9, 1.9), "second_points": 60, "second_starts": 3}
-    search = search_from(valleys, rows(0.5, 1.9), z=0.5, **more)
-    begun = []
-
-    def note(search):
-        if search.state.phase == SECOND_SEARCH:
-            begun.append((search.history["z"][-1], search.state.best_key.copy()))
-
-    assert search.run(60, note) == "converged"
-    assert search.state.plain_values == 2 + 60
-    z = begun[0][0]
-    np.testing.assert_allclose(z[0], np.ones(7), atol=1e-3)
-    distances = np.max(np.abs(z - z[0]), axis=1)
-    assert np.all(distances[1:] >= 1.0) and np.all(np.isfinite(begun[0][1]))
-    assert search.state.incumbent_key[1] == pytest.approx(DEEP)
 
 
 @pytest.mark.parametrize("deep", [[1.9], [1.9, 0.5]])
@@ -487,44 +424,6 @@ def test_a_second_search_follows_where_only_one_of_many_starts_came_near_the_bes
     assert (search.state.phase == SECOND_SEARCH) == search.reached_by_one_start
     second = search.reached_by_one_start * (len(starts) // 3)
     assert search.state.plain_values == len(starts) + second
-
-
-def test_starts_that_come_near_a_better_one_end_first_and_then_all_but_the_better_third():
-    starts = np.random.default_rng(0).uniform(-4.0, 4.0, (12, 7))
-    starts[1] = starts[0] + 0.1
-    search = search_from(valleys, starts, z=-0.6)
-    remaining, evaluations = [], []
-
-    def note(search):
-        remaining.append(int(np.sum(~search.state.retired)))
-        evaluations.append(search.state.evaluations)
-
-    search.run(60, note)
-    assert remaining[:3] == [12, 11, 11] and remaining[5] <= 4
-    assert evaluations[5] <= 2 * 12 + 4 * 11  # a start that is retired costs nothing
-
-
-def test_there_are_fewer_starts_where_each_takes_long():
-    runs = {1: 32, 16: 8, 64: 6}
-    assert {n: number_of_starts(32, n, SQP()) for n in runs} == runs
-    assert [number_of_starts(starts, 64, SQP()) for starts in (4, 96)] == [4, 19]
-    assert number_of_starts(32, 1, LBFGS()) == 6
-
-
-def test_starts_are_taken_from_rankings_with_several_weights_in_turn():
-    """The point with the lowest objective breaks the requirement and is far down with weight
-    200."""
-    points = np.array([[0.0], [2.0], [4.0], [6.0]])
-    excess = np.array([0.0, 0.0, 0.0, 0.05])
-    objective = np.array([1.0, 1.1, 1.2, 0.5])
-    screening = Screening(points, None, objective, excess)
-    box = Box(np.zeros(1), np.full(1, -8.0), np.full(1, 8.0))
-    orders = [screening.order(weight) for weight in (200.0, 1.0)]
-    assert orders[0].tolist() == [0, 1, 2, 3] and orders[1].tolist() == [3, 0, 1, 2]
-    z = distinct(screening, orders, 3, box, lambda z: False)
-    assert z.ravel().tolist() == [0.0, 6.0, 2.0]
-    z = distinct(screening, orders, 3, box, lambda z: z[0] == 6.0, others=np.array([[0.5]]))
-    assert z.ravel().tolist() == [2.0, 4.0]
 
 
 def test_requirements_that_no_gains_keep_are_named_alone_and_in_pairs(paper):
@@ -716,35 +615,15 @@ def cliff(z):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "solver", [SQP(1e-6), Adam(learning_rate=0.5)], ids=lambda solver: solver.name
+    "solver",
+    [SQP(1e-6), Adam(learning_rate=0.5), LBFGS(tolerance=1e-12)],
+    ids=lambda solver: solver.name,
 )
 def test_steps_that_are_not_finite_are_rejected(solver):
     space = SearchSpace(Box(np.zeros(1), np.array([-1.0]), np.array([3.0])), iterations=60)
     seen, _ = steps_of(solver, Evaluated(cliff, space), [0.0], 60)
     assert np.all(np.isfinite([z for z, _ in seen]))
     assert 0.9 < max(z[0] for z, value in seen if value.valid[0]) <= 1.0
-
-
-BOTTOM = np.array([0.4, -0.3])
-
-
-def bowl(z):
-    """A narrow bent valley with its bottom at `BOTTOM`, not finite where z0 > 1."""
-    a, b = (z - BOTTOM).T
-    bend = b - a**2
-    loss = np.where(z[:, 0] > 1, np.inf, a**2 + 30 * bend**2)
-    gradient = np.stack([2 * a - 120 * a * bend, 60 * bend], axis=1)
-    return found_at(z, loss, gradient, np.zeros((2, 2)))
-
-
-@pytest.mark.slow
-def test_lbfgs_finds_the_bottom_of_a_valley_beside_a_wall():
-    box = Box(np.array([-1.0, 2.0]), np.array([-3.0, -3.0]), np.array([3.0, 3.0]))
-    solver, evaluate = LBFGS(tolerance=1e-12), Evaluated(bowl, SearchSpace(box))
-    seen, state = steps_of(solver, evaluate, box.z, 40)
-    assert all(value.valid[0] for _, value in seen)
-    np.testing.assert_allclose(seen[-1][0], BOTTOM, atol=1e-6)
-    assert solver.converged(state)[0] and 10 < evaluate.evaluations < 400
 
 
 class Corner(Evaluated):
@@ -816,27 +695,6 @@ def test_a_checkpoint_that_cannot_be_written_leaves_the_one_before(tmp_path, mon
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("most", "group"), [(None, 16), (8, 8)])
-def test_only_active_starts_are_evaluated_in_groups_of_one_shape(nominal, most, group):
-    candidates = nominal.candidates(np.arange(20.0)[:, None] * np.ones(6))
-    evaluator = Evaluator(nominal, candidates, "forward", nominal.search_space(60), most)
-    shapes = set()
-
-    def derivatives(problem, candidates):
-        shapes.add(candidates.z.shape)
-        z = np.asarray(candidates.z)
-        return found_at(z, z[:, 0], z, np.eye(6))
-
-    evaluator.derivatives = derivatives
-    evaluator.active[[3, 7]] = False
-    found = evaluator(candidates.z).value
-    assert shapes == {(group, 6)} and evaluator.evaluations == 18
-    expected = np.where(evaluator.active, np.arange(20.0), np.inf)
-    np.testing.assert_array_equal(found.loss, expected)
-    np.testing.assert_array_equal(found.valid, evaluator.active)
-
-
-@pytest.mark.slow
 def test_a_start_too_stiff_for_the_step_is_brought_in_or_refused(paper, monkeypatch):
     stiff = ij.with_parameters(paper, {"controller.K2": 60.0})
     best = ij.tune(stiff, GAINS, objective(), effort=effort(2, values=0, starts=1), **SHORT)
@@ -845,23 +703,6 @@ def test_a_start_too_stiff_for_the_step_is_brought_in_or_refused(paper, monkeypa
     monkeypatch.setitem(evaluation.DERIVATIVES, "forward", None)
     with pytest.raises(ValueError, match=r"Take dt=\S+, not 0.001 s"):
         ij.tune(stiff, ["controller.k1"], objective(), effort=effort(2), **SHORT)
-
-
-@pytest.mark.slow
-def test_a_start_of_which_some_runs_are_too_stiff_says_how_many(nominal, monkeypatch):
-    """The nominal run may be fine where some perturbed ones are not: dry friction of a narrow width
-    is what no gain makes slower."""
-    candidate = jax.tree.map(lambda x: x[0], nominal.candidates(nominal.box.z[None]))
-    status = np.array([0, int(ij.Status.STEP_TOO_LARGE), 0, int(ij.Status.BOUND_VIOLATED)])
-    smooth = np.ones((4, len(nominal.objective.quantities) + 1))
-    smooth[2, 0] = np.nan
-    found = evaluation.value_of_start(nominal, candidate, smooth, smooth, status)
-    assert not found.valid and float(found.trusted) == 0.5
-    perturbed = dataclasses.replace(nominal, options=dataclasses.replace(nominal.options, runs=4))
-    seen = jax.tree.map(lambda x: np.asarray(x)[None], found)
-    monkeypatch.setattr(starts, "values", lambda problem, z: seen)
-    with pytest.raises(ValueError, match=r"only 2 of 4 runs can be integrated.*Take dt=\S+, not"):
-        screened(perturbed, 0, nominal.box.z[None])
 
 
 # ---------------------------------------------------------------------------------------- robust
@@ -911,14 +752,6 @@ def test_common_random_numbers(paper):
 
 
 # ---------------------------------------------------------------------------------- the options
-
-
-def test_solvers_fit_their_protocol():
-    members = [name for name in vars(ij.tuning.Solver) if not name.startswith("_")]
-    assert {"init", "step", "converged"} <= set(members)
-    for name, solver in ij.tuning.SOLVERS.items():
-        assert solver.name == name
-        assert [member for member in members if not hasattr(solver, member)] == []
 
 
 @dataclasses.dataclass(frozen=True)
@@ -1096,18 +929,6 @@ def test_an_objective_that_depends_on_the_step_everywhere_is_compared_as_it_is(c
     search.run(60)
     assert search.state.unresolved == 0 and search.state.largest_change > 1.0
     assert search.state.incumbent_key[1] == pytest.approx(DEEP)
-
-
-def test_starts_of_the_first_phase_do_not_confirm_a_better_objective_of_the_second():
-    search = fine_step_search(None)
-    search.run(60)
-    assert search.state.valleys[2] == 2 and not search.reached_by_one_start
-    deeper = np.array([0.0, 0.9 * DEEP])
-    search.state.phase = SECOND_SEARCH
-    search.state.best_key[1:] = np.inf
-    search.state.best_key[0] = search.state.incumbent_key = deeper
-    assert not search._next_phase("converged")
-    assert search.reached_by_one_start
 
 
 @pytest.mark.parametrize(("others", "stopped"), [(6, "converged"), (7, FEW_STARTS_NEAR)])

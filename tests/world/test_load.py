@@ -18,7 +18,6 @@ from arm_cases import ARMS, dynamics_of, without_constraints
 from by_numpy import computed
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from iblf_jax.robots import description
 from scipy.spatial.transform import Rotation
 
 import iblf_jax as ij
@@ -538,14 +537,6 @@ def test_mutated_files_load_or_are_refused(tmp_path_factory, data):
     path.write_bytes(data)
     with contextlib.suppress(ValueError):
         assert np.all(np.isfinite(np.asarray(ij.robots.load(path).mass)))
-
-
-def test_nothing_is_written_and_limits_are_stated(file, monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(ValueError, match="repeated name"):  # in MuJoCo's words
-        ij.robots.load(file(BAD_MJCF["repeated"][0]))
-    assert {p.name for p in tmp_path.iterdir()} == {"arm.urdf"}
-    assert description.MAX_BYTES < 1 << 30
 
 
 # ---------------------------------------------------------------------------------------- repair

@@ -13,13 +13,13 @@ from matplotlib.figure import Figure
 
 import iblf_jax as ij
 from iblf_jax import bounds, controllers, plotting, regions
-from iblf_jax.files.scenario import scenario_to_toml
 from iblf_jax.simulation import metrics
 
 RUN = {"duration": 1.5, "dt": 1e-3}
 WALL = regions.HalfSpace(normal=[-2.0, 0.2], offset=-0.46)
 BALL = regions.Sphere(centre=[0.40, 0.06], radius=0.1, point=1)
-SOFT = controllers.PDGravity(Kp=1.0, Kd=0.1)
+
+
 REACH = regions.Sphere(centre=[0.1, 0.1], radius=0.46, keep="inside")
 
 
@@ -218,9 +218,11 @@ def test_points_of_an_arm_are_mujocos_and_move_as_their_rates_say(rng, tmp_path)
     assert in_words(parts[1], robot) == "the origin of wrist"
 
 
-MODEL = """<mujoco><compiler angle="radian"/><worldbody><body><joint name="base" axis="0 0 1"/><geom size="0.1"/>
+MODEL = """<mujoco><compiler angle="radian"/><worldbody>
+<body><joint name="base" axis="0 0 1"/><geom size="0.1"/>
 <body pos="0.1 0 0.3"><joint name="elbow" axis="0 1 0"/><geom size="0.1" pos="0.1 0 0"/>
-<body pos="0.4 0 0.05"><joint name="wrist" axis="0 1 0.2"/><geom size="0.05" pos="0.1 0 0"/><site name="tip" pos="0.2 0 0.1"/>
+<body pos="0.4 0 0.05"><joint name="wrist" axis="0 1 0.2"/><geom size="0.05" pos="0.1 0 0"/>
+<site name="tip" pos="0.2 0 0.1"/>
 </body></body></body></worldbody></mujoco>"""
 
 
@@ -280,17 +282,6 @@ def test_starts_beyond_a_wall_are_told_from_violations():
     assert study.violation_probability.count >= np.sum(outside)
     with pytest.warns(ij.SimulationWarning, match="the tip was drawn .* m beyond one"):
         study.replay(int(np.flatnonzero(outside)[0]))
-
-
-@pytest.mark.slow
-def test_files_and_datasets_hold_them(alone):
-    scenario = filtered(stepping())
-    assert "[[regions]]" in scenario_to_toml(scenario)
-    assert "regions" not in scenario_to_toml(stepping(regions=()))
-    assert "radius = 0.1  # m" in scenario_to_toml(scenario)
-    assert {"regions[1].centre", "controller.b2"} <= {p.path for p in ij.parameters(scenario)}
-    data = alone.to_xarray()
-    assert data.region_margin.dims == ("time", "region") and data.region_margin.units == "m"
 
 
 @pytest.mark.slow

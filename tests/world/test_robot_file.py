@@ -12,8 +12,6 @@ from iblf_jax.controllers import Saturated
 
 import iblf_jax as ij
 from iblf_jax.files import scenario as scenario_file
-from iblf_jax.files.study import load_study_file
-from iblf_jax.files.tuning import load_tuning_file
 
 pytest.importorskip("mujoco")
 
@@ -26,7 +24,6 @@ frequency = 1.0
 phase = 1.5708
 """
 ROBOT = '[robot]\nfile = "ur5.urdf"\ntip = "tool0"\n'
-RUN = "\n[run]\nduration = 0.05\ndt = 1e-3\n"
 
 
 @pytest.fixture
@@ -110,18 +107,6 @@ def test_saved_it_needs_no_other_file(folder):
     assert jax.tree.structure(again) == jax.tree.structure(scenario)
     jax.tree.map(np.testing.assert_array_equal, again, scenario)
     assert "urdf" not in (folder / "saved.toml").read_text()
-
-
-def test_studies_and_tuning_read_it_too(folder):
-    mass, base = "plant.link[forearm_link].mass", ROBOT + REFERENCE + RUN
-    draws = f'[perturbations]\n"{mass}" = {{ factor = "uniform", low = 0.8, high = 1.2 }}\n'
-    path = written(folder, base + draws + "[study]\nruns = 4\n")
-    assert list(load_study_file(path, "study").perturbations) == [mass]
-    path = written(folder, base + f'[sweep]\n[grid]\n"{mass}" = [2.0, 3.0]\n')
-    assert list(load_study_file(path, "sweep").grid) == [mass]
-    tune = '[tune]\nparameters = ["controller.K2"]\n[[objective]]\nkind = "tracking"\n'
-    path = written(folder, base + tune)
-    assert load_tuning_file(path)["scenario"].n == 6
 
 
 @pytest.mark.parametrize(

@@ -141,15 +141,6 @@ def test_a_rate_that_is_varied_alone_changes_the_dwell_time():
     assert np.mean(np.asarray(found.sequence)[:, 0] == 1) == pytest.approx(0.9, abs=0.02)
 
 
-def test_the_code_of_a_path_does_not_grow_with_its_switches():
-    def size(switches):
-        scenario = canonical(scenario_of(markov(switches=switches)))
-        path = jax.make_jaxpr(lambda key: realised(scenario, key).plant.times)(jnp.zeros(4))
-        return len(str(path).splitlines())
-
-    assert size(2) == size(40)
-
-
 @pytest.mark.slow
 def test_every_run_of_a_study_has_a_path_of_its_own():
     scenario = scenario_of(markov(switches=2))

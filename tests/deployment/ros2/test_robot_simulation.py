@@ -4,7 +4,6 @@ does without efforts."""
 from __future__ import annotations
 
 import dataclasses
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +17,6 @@ from iblf_jax.simulation.scenario import canonical
 
 mujoco = pytest.importorskip("mujoco", reason='needs the extra "robots"')
 from iblf_jax.deployment.mujoco_plant import MujocoPlant
-from iblf_jax.deployment.ros2 import simulated_robot
 from iblf_jax.deployment.ros2.robot_motion import RobotMotion, recorded
 from iblf_jax.deployment.ros2.robot_simulation import RobotSimulation
 
@@ -184,18 +182,6 @@ def test_an_effort_within_a_period_acts_from_its_arrival_on():
     np.testing.assert_array_equal(motion.tau[after], [[-3.0, 1.0]] * after.sum())
 
 
-@pytest.mark.slow
-def test_a_payload_changes_the_motion_as_that_of_the_plant_does():
-    length = float(PAPER.plant.length[1])
-    loaded = robot(payload=ij.robots.Payload(mass=0.3, centre=[length, 0.0, 0.0]))
-    motion = closed_with_law(loaded, PAPER, periods=100)
-    heavy = ij.with_parameters(PAPER, {"plant.payload": 0.3})
-    run = ij.simulate(heavy, duration=0.2, dt=DT)
-    np.testing.assert_allclose(motion.q[motion.instant], run.q, atol=1e-7)
-    light = ij.simulate(PAPER, duration=0.2, dt=DT)
-    assert np.max(np.abs(np.asarray(light.q - run.q))) > 1e-3
-
-
 def test_a_payload_that_mujoco_does_not_have_is_refused():
     compiled = mujoco.MjModel.from_xml_path(str(ARM))
     for model, payload, words in (
@@ -205,37 +191,3 @@ def test_a_payload_that_mujoco_does_not_have_is_refused():
     ):
         with pytest.raises(ValueError, match=words):
             MujocoPlant(model, JOINTS, 2, {}, "RK4", payload)
-
-
-def test_the_clock_of_a_robot_goes_on_while_it_waits_for_the_law(monkeypatch):
-    """In lock step, with a law in the same process in place of ROS 2: it answers every state, the
-    first two with torques of zero, which do not release the brake."""
-    stamps, made = [], []
-
-    def publish(message):
-        stamp = message.header.stamp
-        stamps.append(stamp.sec + 1e-9 * stamp.nanosec)
-        made[0]._receive(SimpleNamespace(data=[0.1 * (len(stamps) > 2)] * 2))
-
-    node = SimpleNamespace(
-        create_publisher=lambda *_: SimpleNamespace(publish=publish),
-        create_subscription=lambda *_: SimpleNamespace(topic_name="efforts"),
-        count_publishers=lambda _: 1,
-    )
-    rclpy = SimpleNamespace(
-        context=SimpleNamespace(Context=object),
-        init=lambda **_: None,
-        create_node=lambda *_, **__: node,
-    )
-    state = lambda name: SimpleNamespace(header=SimpleNamespace(stamp=SimpleNamespace()))  # noqa: E731
-    messages = SimpleNamespace(JointState=state, Float64MultiArray=None)
-    monkeypatch.setattr(simulated_robot, "ros_packages", lambda: (rclpy, messages, messages))
-    executor = SimpleNamespace(add_node=lambda _: None, spin_once=lambda **_: None)
-    monkeypatch.setattr(simulated_robot, "_executor", lambda *_: executor)
-    monkeypatch.setattr(simulated_robot, "DISCOVERY_TIME", 0.0)
-    dropouts = simulated_robot.Dropouts(0.0, 0.0, seed=0)
-    made.append(simulated_robot.SimulatedRobot(robot(), JOINTS, dropouts, False, ()))
-    motion = made[0].run(5 * PERIOD)
-    np.testing.assert_allclose(stamps, PERIOD * np.arange(8), atol=1e-9)
-    assert motion.origin == pytest.approx(2 * PERIOD)
-    np.testing.assert_allclose(motion.state_t, PERIOD * np.arange(6), atol=1e-12)

@@ -323,7 +323,8 @@ def test_a_law_that_samples_with_the_states_has_no_clock_but_gaps_of_stamps():
     assert bench.supervisor.command(bench.now).mode is Mode.FAULT
 
 
-def test_a_burst_gives_one_sample_a_period():
+@pytest.mark.parametrize("factor", [1, 3, 10])
+def test_of_a_burst_or_of_faster_states_than_samples_one_a_period_is_answered(factor):
     """States that waited in a queue arrive together, and some twice."""
     bench = Bench().running()
     new = []
@@ -332,10 +333,6 @@ def test_a_burst_gives_one_sample_a_period():
     assert new == [True, False, False, False, True, False, True]
     assert bench.mode is Mode.RUNNING
     assert bench.supervisor.missed == 0
-
-
-@pytest.mark.parametrize("factor", [1, 2, 3, 4, 5, 10])
-def test_of_faster_states_than_samples_one_a_period_is_answered(factor):
     bench = Bench(arrival_timeout=0.5)
     stamps = [EPOCH + k * T // factor for k in range(10 * factor)]
     answered = [stamp for stamp in stamps if bench.state(stamp=stamp)]
@@ -343,25 +340,18 @@ def test_of_faster_states_than_samples_one_a_period_is_answered(factor):
     assert bench.supervisor.missed == 0
 
 
-def test_times_of_the_law_are_those_of_the_stamps():
-    bench = Bench().running()
-    for _ in range(3):
-        bench.period()
-    assert [t for t, _, _ in bench.law.calls] == pytest.approx([PERIOD * k for k in (1, 2, 3, 4)])
-
-
-def test_a_restarted_node_goes_on_with_the_reference():
+def test_times_of_the_law_are_those_of_the_stamps_after_a_restart_too():
+    """A reference that has not begun is refused."""
     first = Bench().running()
-    origin = first.supervisor.started_at
-    second = Bench(time_origin=origin)
+    for _ in range(3):
+        first.period()
+    assert [t for t, _, _ in first.law.calls] == pytest.approx([PERIOD * k for k in (1, 2, 3, 4)])
+    second = Bench(time_origin=first.supervisor.started_at)
     second.now = 700 * T
     second.period()
     assert second.start() == f"The law runs from t = {700 * PERIOD:g} s."
     second.period()
     assert second.law.calls[0][0] == pytest.approx(701 * PERIOD)
-
-
-def test_a_reference_that_has_not_begun_is_refused():
     bench = Bench(time_origin=EPOCH + 1000 * T)
     bench.period()
     started, message = bench.supervisor.start(bench.now, bench.clock)
@@ -392,7 +382,16 @@ def test_a_start_outside_of_the_bounds_is_refused_unless_it_is_allowed():
     assert bench.period(q=(0.0, 1.5, 0.0)).mode is Mode.RUNNING, "only the start is refused"
 
 
-def test_stop_while_waiting_cancels_the_automatic_start():
+def test_an_automatic_start_needs_no_service_and_does_not_leave_a_fault():
+    """It is cancelled by a stop while the node waits."""
+    bench = Bench(start_automatically=True)
+    assert bench.period().mode is Mode.RUNNING
+    assert bench.period(q=(math.nan,) * 3).mode is Mode.FAULT
+    for _ in range(5):
+        assert bench.period().mode is Mode.FAULT
+    bench.now += 3 * T
+    _, message = bench.supervisor.hold(bench.now, bench.clock)
+    assert "in fault (the position of shoulder is nan); no valid state has arrived for" in message
     bench = Bench(start_automatically=True)
     assert bench.command() is None
     assert "automatic start is cancelled" in bench.supervisor.stop()[1]
@@ -433,17 +432,6 @@ def test_a_new_start_does_not_repeat_torques_of_the_earlier_run():
     bench.command()
     assert len(bench.law.calls) == calls + 1
     assert bench.supervisor.repeated == 0
-
-
-def test_an_automatic_start_needs_no_service_and_does_not_leave_a_fault():
-    bench = Bench(start_automatically=True)
-    assert bench.period().mode is Mode.RUNNING
-    assert bench.period(q=(math.nan,) * 3).mode is Mode.FAULT
-    for _ in range(5):
-        assert bench.period().mode is Mode.FAULT
-    bench.now += 3 * T
-    _, message = bench.supervisor.hold(bench.now, bench.clock)
-    assert "in fault (the position of shoulder is nan); no valid state has arrived for" in message
 
 
 def test_a_torque_that_is_not_finite_is_a_fault():
