@@ -515,6 +515,18 @@ def test_f_is_constant_only_where_nothing_that_changes_is_left_in_it(changes, st
     assert not there.claims["torque"].steady
 
 
+@pytest.mark.slow
+def test_friction_of_one_robot_is_case_2():
+    scenario = one_joint(Growing(mass=[1.3], damping=0.5))
+    certificate = certify(scenario, **OWN)
+    assert certificate.holds
+    assert certificate.numbers["case"] == 2
+    # The same physics with a model that has none.
+    bare = certify(ij.with_parameters(scenario, {"model.damping": 0.0}), **OWN)
+    assert bare.numbers["F_d"] == pytest.approx(certificate.numbers["F_d"], rel=1e-9)
+    assert bare.holds
+
+
 # --- a law's own claim ----------------------------------------------------------------------------
 
 
@@ -630,6 +642,31 @@ def test_a_claim_that_is_too_strong_fails_and_says_when_first(own):
 
 
 @ij.component
+class WithEstimate(Passive):
+    """V + f_tilde . f_tilde / 2: with the momentum observer V' = -W - kf |f_tilde|^2 + r .
+    f_tilde + f_tilde . f' exactly."""
+
+    kf: ij.Leaf = ij.leaf("1/s", default=20.0)
+
+    def lyapunov(self, t, q, dq, f_tilde, context, state):
+        V = super().lyapunov(t, q, dq, f_tilde, context, state)
+        return V + 0.5 * f_tilde @ f_tilde
+
+    def decay(self, t, q, dq, f_tilde, context, state):
+        W = super().decay(t, q, dq, f_tilde, context, state)
+        return W + jnp.sum(self.kf * f_tilde**2)
+
+
+@pytest.mark.slow
+def test_an_own_V_with_the_error_of_the_estimate_in_it(paper):
+    law = WithEstimate(slope=2.0, K=5.0, kf=12.0)
+    scenario = dataclasses.replace(paper, controller=law, observer=ij.observers.Momentum(kf=12.0))
+    assert_equality(own_line(scenario))
+    too_fast = ij.with_parameters(scenario, {"controller.kf": 13.0})
+    assert own_line(too_fast).verdict == "fails"
+
+
+@ij.component
 class Adaptive(Passive):
     """V = r . M0 r / 2 + d . d / (2 gamma), joint by joint, with T = r f; it is given f itself, as
     it uses no estimate."""
@@ -723,6 +760,19 @@ def test_where_an_own_claim_is_not_made(own):
     assert "does not cover the SafetyFilter" in filtered.omitted
     sampled = certified(sampling=ij.Sampling(period=1e-3))
     assert sampled["inequality, own V"].verdict == "not applicable"
+
+
+@pytest.mark.slow
+def test_saturated_samples_are_left_out(corrected_run):
+    law = corrected_run.scenario.controller
+    limited = ij.controllers.Saturated(law=law, limit=[8.0, 3.0])
+    scenario = dataclasses.replace(corrected_run.scenario, controller=limited)
+    certificate = certify(scenario, duration=2.0, method="euler")
+    left_out = certificate.numbers["samples_left_out"]
+    assert 0 < left_out < 1000
+    assert certificate["inequality, case 2"].verdict == "holds"
+    assert f"{left_out} of 2001 samples are excluded" in certificate["inequality, case 2"].note
+    assert np.all(np.isnan(certificate.traces.envelope[certificate.traces.excluded]))
 
 
 def test_wrong_arguments_are_named(paper, short_run, own):

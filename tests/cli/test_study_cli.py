@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import signal
 import sys
@@ -114,6 +115,36 @@ def test_ctrl_c_from_outside(command, tmp_path, compiled):
     assert 0 < ij.load_sweep("s.zarr").attrs["computed_cases"] < 12000
     assert command(*words)[0] == 1
     assert ij.load_sweep("s.zarr").identical(cases.from_file(text))
+
+
+@pytest.mark.slow
+def test_ctrl_c_while_a_study_compiles(command, tmp_path):
+    """XLA goes on in a thread of its own, and would crash if JAX were taken down under it."""
+    code = """
+import os, signal, sys, threading, jax
+from iblf_jax import cli
+from iblf_jax.cli import _studies
+from iblf_jax.studies import monte_carlo
+
+def compile_for_long(*_, **__):
+    def f(x):
+        for i in range(2000):
+            x = jax.numpy.sin(x + i)
+        return x
+    lowered = jax.jit(f).lower(1.0)
+    threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)).start()
+    lowered.compile()
+
+monte_carlo.monte_carlo = compile_for_long
+sys.argv[1:] = ["montecarlo", "study.toml"]
+cli.entry()
+"""
+    # As users compile: at the tests' own settings it could be over before the signal comes.
+    process = cases.start_python(
+        tmp_path / "nothing_compiled", "-c", code, XLA_FLAGS=os.environ["TESTER_XLA_FLAGS"]
+    )
+    assert process.communicate(timeout=60) == ("", "iblf-jax: error: interrupted\n")
+    assert process.returncode == 130
 
 
 @pytest.mark.parametrize(

@@ -14,12 +14,21 @@ import numpy as np
 import pytest
 from claim_terms import terms_at
 from independent import Loop
+from members import two_barriers
 
 import iblf_jax as ij
 from iblf_jax import controllers
 from iblf_jax.control.controllers.saturated import AuxiliaryState
-from iblf_jax.simulation.closed_loop import LoopState, evaluate
+from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state
 from iblf_jax.simulation.scenario import canonical
+
+LAWS = {
+    "two_barriers": two_barriers(),
+    "dynamic_surface": controllers.DynamicSurface(k1=2.0, K2=20.0, filter=0.02),
+    "adaptive_network": controllers.AdaptiveNetwork(k1=2.0, K2=20.0, nodes=4),
+    "computed_torque": controllers.ComputedTorque(Kp=25.0, Kd=10.0),
+}
+"""Laws besides those of the independent programs; the last one does not take the shift."""
 
 PAPER = ij.presets.zhang_yan_2024(variant="corrected")
 LIMIT = np.array([9.0, 3.0])
@@ -137,6 +146,26 @@ def test_a_certificate_covers_the_limited_torque():
 
 def limited_by(limit, law):
     return controllers.Saturated(law, limit=limit, auxiliary=K)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", LAWS)
+def test_without_a_reached_limit_it_is_the_law_without_it(name):
+    part = {}
+    if name == "two_barriers":
+        speeds = ij.Bounds(ij.bounds.Constant(-9.0), ij.bounds.Constant(9.0))
+        part["bounds"] = (PAPER.bounds[0], speeds)
+    scenario = canonical(ij.with_parts(PAPER, controller=LAWS[name], **part))
+    limited = canonical(ij.with_parts(scenario, controller=limited_by(1e4, LAWS[name])))
+    field, t = jax.jit(evaluate), jnp.asarray(0.0)
+    rate, sample = field(scenario, t, initial_state(scenario))
+    limited_rate, limited_sample = field(limited, t, initial_state(limited))
+    np.testing.assert_allclose(limited_sample.tau, sample.tau, rtol=1e-13)
+    np.testing.assert_array_equal(limited_rate.controller.auxiliary, 0.0)
+    for one, same in zip(
+        jax.tree.leaves(rate.controller), jax.tree.leaves(limited_rate.controller.law), strict=True
+    ):
+        np.testing.assert_array_equal(one, same)
 
 
 @pytest.mark.slow

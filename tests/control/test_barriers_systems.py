@@ -89,6 +89,15 @@ def test_rate_of_V1_along_alpha_is_what_the_law_promises(name, bounds):
     np.testing.assert_allclose(rate, promised, rtol=1e-8, atol=1e-15)
 
 
+def test_state_rate_is_the_best_constant():
+    # Reference near the wall, position nearer: V1' / V1 comes as near to -k1 as one likes.
+    tube = simple_tube(1.0, 1e-5, dk_l=0.0, dk_u=0.0)
+    barrier, e = barriers.StateBarrier(), jnp.full(2, -1e-2)
+    ratio = barrier.slope(tube, e) * e / barrier.value(tube, e)
+    assert float(jnp.max(ratio)) < 1.02
+    assert float(jnp.min(ratio)) >= 1.0
+
+
 @pytest.mark.parametrize("name", sorted(set(BARRIERS) - {"quadratic"}))
 def test_xi_bound_holds_and_is_reached_on_the_worse_side(name):
     barrier = BARRIERS[name]

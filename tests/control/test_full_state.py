@@ -299,6 +299,36 @@ def test_derivatives_across_the_jumps_are_those_of_runs_in_pieces():
 
 
 @pytest.mark.slow
+def test_a_disturbance_and_the_command_jump_in_one_step():
+    """Joint 0 crosses e2 = 0 at 3.3 ms, in the step of 1 ms in which a disturbance appears:
+    derivatives by its time and by k1."""
+    time, size = 0.00366, (3.0, -1.0)
+    loop = FullLoop(q0=(0.62, 0.55), dq0=(-0.3, 0.2), K2=np.full(2, 12.0), kf=np.full(2, 100.0))
+    step = ij.disturbances.Step(size=list(size), time=time)
+    scenario = dataclasses.replace(
+        loop.scenario, disturbance=ij.disturbances.Sum((loop.scenario.disturbance, step))
+    )
+
+    def integrals(values):
+        changed = {
+            "disturbance.parts[1].time": values[0],
+            "controller.k[0]": jnp.full(2, values[1]),
+        }
+        metrics = ij.simulate(ij.with_parameters(scenario, changed), duration=0.03, dt=1e-3).metrics
+        return jnp.array([jnp.sum(metrics.ise), metrics.effort])
+
+    def true(time, k1):
+        run = Pieces(dataclasses.replace(loop, k1=np.full(2, k1)), 0.03, (time, size))
+        assert run.passed == [(0, True)]
+        return np.array([run.ise, run.effort])
+
+    by_time = (true(time + 2e-6, 2.0) - true(time - 2e-6, 2.0)) / 4e-6
+    by_k1 = (true(time, 2.002) - true(time, 1.998)) / 4e-3
+    found = jax.jacfwd(integrals)(jnp.array([time, 2.0]))
+    np.testing.assert_allclose(found, np.stack([by_time, by_k1], axis=1), rtol=0.02)
+
+
+@pytest.mark.slow
 def test_where_e2_slides_along_0_derivatives_are_those_of_the_sliding_motion():
     assert pieces(0.25, kf=20.0).passed == [(0, True), (1, None), (1, True)]
     true = slopes_in_pieces(0.25, kf=20.0)

@@ -205,3 +205,16 @@ def test_files_without_a_weight_have_the_papers_and_others_keep_theirs(tmp_path)
     (tmp_path / "old.toml").write_text(old)
     loaded = ij.load_scenario(tmp_path / "old.toml")
     np.testing.assert_array_equal(loaded.controller.weight, [1.0, 1.0])
+
+
+@pytest.mark.slow
+def test_the_derivative_by_the_weight_is_that_of_differences_also_at_one():
+    paper = ij.presets.zhang_yan_2024()
+
+    def end(w):
+        weighted = ij.with_parameters(paper, {"controller.weight": w})
+        return ij.simulate(weighted, duration=0.05, dt=1e-3).q[-1, 0]
+
+    for w in (1.0, 0.7):
+        difference = (end(w + 1e-4) - end(w - 1e-4)) / 2e-4
+        np.testing.assert_allclose(jax.grad(end)(w), difference, rtol=1e-5)

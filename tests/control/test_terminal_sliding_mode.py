@@ -13,6 +13,8 @@ from independent import Loop, sine
 import iblf_jax as ij
 from iblf_jax.core import notices
 from iblf_jax.core.status import Status
+from iblf_jax.engine.period import radius_at
+from iblf_jax.simulation.scenario import canonical
 
 ARM = Loop(mass=(1.2, 0.7), length=(0.4, 0.3), centre=(0.2, 0.16), inertia=(0.02, 0.01))
 LAW = {
@@ -103,3 +105,20 @@ def test_a_sampled_loop_is_assessed_with_the_slope_of_the_layer():
         reported.append(bool(int(run.status) & int(Status.SAMPLING_TOO_SLOW)))
     assert radii[0] < 1.0 < radii[1]
     assert reported == [False, True]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "wrapped",
+    [
+        lambda law: ij.controllers.Saturated(law, limit=1e-3),
+        lambda law: ij.controllers.Saturated(law, limit=1e-3, auxiliary=5.0, edge="smooth"),
+        lambda law: ij.controllers.SafetyFilter(law, limit=30.0),
+    ],
+    ids=["limit", "auxiliary state", "filter"],
+)
+def test_limits_of_laws_within_others_are_left_out_of_the_linearisation(wrapped):
+    """Wherever a limit is active the radius would be at least 1, that of an open loop."""
+    scenario = loop(SAMPLED, initial=START, sampling=ij.Sampling(period=1e-3))
+    scenario = canonical(ij.with_parts(scenario, controller=wrapped(scenario.controller)))
+    assert radius_at(scenario, 1e-3, np.array([0.01, 0.02])) < 1.0

@@ -105,6 +105,27 @@ def test_a_robot_with_motors_keeps_the_members_of_its_robot():
     np.testing.assert_array_equal(motors.limits.upper, arm.limits.upper)
 
 
+def chain(inertia):
+    return ij.robots.PlanarChain(mass=[1.3], length=[0.4], centre=[0.2], inertia=[inertia])
+
+
+@pytest.mark.slow
+def test_a_robot_with_the_inertia_of_the_motors_in_another_form_is_accepted():
+    """Such as the armature of an Arm, which is one robot less its motors here."""
+    scenario = on(
+        ij.plants.FlexibleJoint(chain(0.02), stiffness=3000.0, motor_inertia=0.03),
+        PD,
+        model=chain(0.05),
+        reference=ij.references.Sinusoid(offset=0.5, amplitude=0.1, frequency=1.0),
+        initial=ij.Initial(q=0.6),
+        bounds=ij.Bounds(lower=ij.bounds.Constant(0.1), upper=ij.bounds.Constant(0.9)),
+        disturbance=ij.disturbances.Nothing(),
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        canonical(scenario)
+
+
 def test_a_model_without_the_motors_says_so():
     with pytest.warns(UserWarning, match=r"contains 0% of that of the motors.*plant\.rigid\(\)"):
         canonical(on(FLEXIBLE, PD, model=ROBOT))

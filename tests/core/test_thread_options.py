@@ -100,6 +100,13 @@ def test_every_public_option_is_transferred_or_known():
     assert not transferred & NOT_TRANSFERRED
 
 
+@pytest.mark.slow
+def test_a_study_in_float32_is_in_float32_in_every_block():
+    with jax.enable_x64(False):
+        study = cases.study(runs=600)
+    assert next(iter(study.metrics.values())).dtype == np.float32
+
+
 class ForgetfulExecutor(ThreadPoolExecutor):
     """Runs each task in a thread that has none of the client's options, as a process has."""
 

@@ -221,6 +221,19 @@ def test_a_run_that_flies_away_is_told():
         ij.cosimulate(wild, spec_of(PAPER.plant), period=5e-3, throw=True, **TIMING)
 
 
+@pytest.mark.slow
+def test_records(tmp_path):
+    short = {"duration": 0.2, "dt": 1e-3, "period": 1e-3}
+    every = ij.cosimulate(DRIVEN, spec_of(PAPER.plant), **short)
+    some = ij.cosimulate(DRIVEN, spec_of(PAPER.plant), record_every=10, **short)
+    assert some.t.shape == (21,)
+    np.testing.assert_array_equal(some.q, every.q[::10])
+    np.testing.assert_array_equal(some.actuator_state, every.actuator_state[::10])
+    np.testing.assert_array_equal(some.metrics.rmse, every.metrics.rmse)
+    some.to_xarray()
+    ij.save_rollouts(some, tmp_path / "run.nc")
+
+
 def test_an_arm_without_shapes_is_drawn_as_its_skeleton():
     shapes = spec_of(PAPER.plant)
     bare = mujoco.MjModel.from_xml_path(str(ARMS / "iiwa14.urdf"))

@@ -435,6 +435,25 @@ def test_a_law_that_yields_no_numbers_is_refused(tmp_path, monkeypatch, path, si
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
+def test_a_parameter_of_ordinary_size_is_not_blamed(tmp_path, monkeypatch):
+    monkeypatch.setattr("iblf_jax.deployment.export.VECTORS_DURATION", 0.02)
+
+    class Broken(ij.presets.zhang_yan_2024().controller.__class__):
+        """A law that forgets a guard."""
+
+        def command(self, t, *more):
+            command, rate = super().command(t, *more)
+            return command._replace(tau=command.tau / jnp.where(t > 0.005, 0.0, 1.0)), rate
+
+    law = ij.presets.zhang_yan_2024().controller
+    broken = ij.component(Broken)(law.k1, law.K2, law.o)
+    scenario = ij.with_parts(ij.presets.zhang_yan_2024(), controller=broken)
+    words = r"scenario: got .*yields no numbers: the torque tau\[0\] is -?inf at t = 0\.006 s"
+    with pytest.raises(ValueError, match=words):
+        ij.export(scenario, tmp_path, period=2e-3)
+
+
 @pytest.mark.parametrize("is_float", [False, True])
 def test_every_number_is_a_literal_of_c(is_float):
     found = [number(x, is_float) for x in (np.nan, np.inf, -np.inf, 1e300, 0.1)]

@@ -10,6 +10,7 @@ from exported import Module, built_and_run, fmpy, run_fmu
 
 import iblf_jax as ij
 from iblf_jax.deployment import control_law
+from iblf_jax.deployment.signal_units import one_unit, per_time
 from iblf_jax.simulation.closed_loop import initial_state
 from iblf_jax.simulation.scenario import canonical
 
@@ -32,6 +33,12 @@ def test_the_c_of_a_law_gives_the_inputs_of_simulate(tmp_path, case, reference, 
     order = ij.plants.order_of(CASES[case]().model)
     assert ("*x_3" in header) == (order > 2)
     assert (f"*d{order}q_d" in header) == (order > 2 and reference == "given")
+
+
+@pytest.mark.slow
+def test_a_law_of_a_rigid_model_has_no_parameters_of_the_plant(tmp_path):
+    exported = ij.export(loops_of_plants.rigid_law(), tmp_path, period=PERIOD)
+    assert not [path for path in exported.parameters if path.startswith("plant")]
 
 
 @pytest.mark.slow
@@ -71,6 +78,14 @@ def test_a_closed_loop_in_webassembly_is_simulate(tmp_path):
     for name, expected in (("q", run.q), ("tau", run.tau), ("x_3", run.x[:, 2])):
         np.testing.assert_allclose(found[name], expected, atol=1e-10, err_msg=name)
     assert {x["name"]: x["unit"] for x in loop.table["records"]}["x_3"] == "A"
+
+
+def test_units_of_inputs_and_outputs():
+    assert [per_time("rad/s", k) for k in range(3)] == ["rad/s", "rad/s^2", "rad/s^3"]
+    assert per_time("A", 1) == "A/s"
+    assert per_time("N m/rad", 2) == "N m/(rad s^2)"
+    assert one_unit(("m", "m", "rad")) == "1"
+    assert one_unit(("m", "m")) == "m"
 
 
 def test_mujoco_refuses_what_is_no_robot_and_process_noise():

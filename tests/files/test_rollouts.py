@@ -14,7 +14,7 @@ import xarray
 from conftest import SHORT
 from loops_of_plants import rigid_law
 from made_up_runs import ALWAYS
-from plant_cases import pendulum
+from plant_cases import body, pendulum
 
 import iblf_jax as ij
 from iblf_jax.files import rollouts
@@ -246,6 +246,13 @@ def test_signals_of_levels_have_dimensions_and_units_also_in_a_file(levels_run, 
     assert np.array_equal(data.higher_level, [3])
     assert data.level.attrs["description"] == "level of the plant, from 1: angle, speed, current"
     assert data.joint.attrs["description"] == "component of a level, from 0: pendulum"
+
+
+@pytest.mark.slow
+def test_components_of_different_units():
+    data = ij.simulate(body(), duration=0.1, dt=1e-2).to_xarray()
+    assert data.q.attrs == {"units": "m, m, rad", "description": "pose"}
+    assert data.margin.attrs["units"] == "m, m, rad"
 
 
 @pytest.mark.slow

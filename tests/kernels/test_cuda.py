@@ -8,6 +8,7 @@ runs on a GPU what elsewhere runs on the CPU.
 
 from __future__ import annotations
 
+from functools import partial
 from types import SimpleNamespace
 
 import gpu_on_cpu
@@ -239,6 +240,26 @@ def test_auto_on_a_gpu_without_nvrtc_runs_on_vmap(monkeypatch):
     monkeypatch.setattr(nvrtc, "library", lambda: None)
     monkeypatch.setattr(gpu, "compiler", lambda: None)
     assert registry.default_backend() == ("gpu", None)
+
+
+@pytest.mark.slow
+@needs_a_cpu
+@needs_compiler
+def test_the_default_device_decides_on_a_machine_with_a_gpu(paper, monkeypatch):
+    """Where JAX computes on a GPU, a user may compute on the processor: runs and studies take its
+    backend and its devices."""
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    draw = partial(ij.monte_carlo, paper, {"plant.mass[1]": ij.value(ij.uniform(0.7, 0.9))})
+    executor = ij.studies.LocalExecutor(devices=jax.devices("cpu"))
+    words = r"platform that JAX computes on, gpu.*jax\.default_device"
+    with pytest.raises(ValueError, match=words):
+        draw(runs=3, duration=0.05, executor=executor)
+    monkeypatch.setattr(jax, "local_devices", lambda **_: pytest.fail("these would be GPUs"))
+    with jax.default_device(jax.devices("cpu")[0]):
+        assert registry.default_backend() == ("native", None)
+        assert ij.simulate(paper, duration=0.05, dt=1e-3).ok
+        study = draw(runs=600, duration=0.05, dt=1e-3)
+    assert study.backend == "native" and not study.status.any()
 
 
 @pytest.mark.parametrize(

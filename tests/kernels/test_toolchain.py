@@ -444,6 +444,20 @@ def test_who_waits_for_a_stopped_build_builds_it(slow_compiler):
     assert slow_compiler.read_text().split() == ["once"] * 2
 
 
+def test_a_stopped_compiler_is_asked_again_for_its_version(tmp_path, monkeypatch):
+    fake(tmp_path, monkeypatch, "echo fake 1.0")
+    command = toolchain.compiler()
+
+    def stopped(*arguments):
+        raise toolchain.StoppedError("the compiler was stopped")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(toolchain, "_run", stopped)
+        with pytest.raises(toolchain.StoppedError):
+            toolchain._version(command)
+    assert toolchain._version(command).line == "fake 1.0"
+
+
 FRESH = """
 import jax
 events = []

@@ -135,6 +135,21 @@ def test_a_limit_cycle_in_which_rounding_is_no_noise_is_covered():
         assert difference[1] > 4.0 * 2 * np.pi / 11409.0
 
 
+@pytest.mark.slow
+def test_a_loop_whose_codes_are_certain_has_the_error_of_the_open_loop():
+    """At an eighth of the step no code can differ, and the estimate falls with the fourth power."""
+    quantised = sampled(actuator=QUANTISER)
+    words = r"rounds a reading.*actuator\.step.*dt=0\.0002"
+    with pytest.warns(ij.SimulationWarning, match=words):
+        coarse = ij.simulate(quantised, duration=2.0, dt=2e-3)
+    fine = run(quantised, 2.0, 2.5e-4)
+    assert is_flagged(coarse) and not is_flagged(fine)
+    assert float(coarse.metrics[error_growth.BOUND]) > TOLERANCE
+    assert float(fine.metrics[error_growth.BOUND]) == 0.0
+    error = np.max(np.abs(fine.q[::8] - run(quantised, 2.0, 2e-3 / 32, 32).q))
+    assert error < float(np.max(fine.metrics.numerical_error)) < 200.0 * error
+
+
 def linearised(scenario):
     """A scenario, its start, the derivative there, what grows, and the size of the plant."""
     scenario = canonical(scenario)

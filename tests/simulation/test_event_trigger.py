@@ -145,6 +145,19 @@ def test_commands_are_held_within_the_threshold():
         assert np.all(np.abs(wanted - tau[k]) <= threshold)
 
 
+@pytest.mark.slow
+def test_the_derivative_of_a_held_command():
+    """Between the instants of events a run is smooth in a gain."""
+
+    def end(K2):
+        scenario = ij.with_parameters(TRIGGERED, {"controller.K2": K2})
+        return ij.simulate(scenario, duration=0.05, dt=1e-3).metrics.ise
+
+    K2, move = jnp.array([20.0, 20.0]), jnp.array([1e-6, 0.0])
+    differences = (end(K2 + move) - end(K2 - move)) / 2e-6
+    np.testing.assert_allclose(jax.jacfwd(end)(K2)[:, 0], differences, rtol=1e-4, atol=1e-10)
+
+
 def test_a_run_with_one_event_has_no_interval():
     first = jax.tree.map(lambda x: x[:1], samples(np.random.default_rng(0), 1))
     found = folded((Events(),), first)

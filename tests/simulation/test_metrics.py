@@ -148,6 +148,15 @@ def test_access_by_name_and_by_attribute(short_run):
         _ = metrics.nothing
 
 
+@pytest.mark.slow
+def test_the_effort_above_gravity_by_hand(rng):
+    some = samples(rng)
+    square = np.sum((np.asarray(some.tau) - np.asarray(some.gravity)) ** 2, axis=1)
+    expected = np.sqrt(np.sum(some.dt * square) / np.sum(some.dt))
+    found = folded((ij.metrics.AboveGravity(),), some)["effort_above_gravity"]
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
 # --- integrals are of second order -----------------------------------------------
 
 

@@ -19,6 +19,8 @@ from iblf_jax.simulation.levels import acceleration, motion, start_levels, torqu
 from iblf_jax.simulation.scenario import canonical
 from iblf_jax.tuning.objectives import fitted
 
+LIMITS = {"limit": 9e-5, "lower_limit": 6e-5}
+
 ROOT_OF_2G = 4.429  # [m^0.5/s]
 SHORT = {"duration": 40.0, "dt": 0.2}
 
@@ -94,6 +96,26 @@ def test_a_start_or_a_drift_that_does_not_fit_is_named_with_its_levels(case):
 
 def test_weights_of_a_root_have_the_unit_of_its_square():
     assert "1/m^2; 1/m " in repr(ij.parameters(tanks()))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["motor", "smooth"])
+def test_an_input_has_a_lower_limit_of_its_own(kind):
+    free = tanks()
+    command = np.asarray(ij.simulate(free, **SHORT).tau)
+    assert command.min() < LIMITS["lower_limit"] and command.max() > LIMITS["limit"]
+    law = ij.controllers.Saturated(free.controller, **LIMITS, edge="smooth")
+    parts = {"actuator": ij.actuators.Motor(**LIMITS)} if kind == "motor" else {"controller": law}
+    scenario = ij.with_parts(free, **parts)
+    run = ij.simulate(scenario, **SHORT)
+    assert LIMITS["lower_limit"] <= run.tau.min() < 1.02 * LIMITS["lower_limit"]
+    assert 0.98 * LIMITS["limit"] < run.tau.max() <= LIMITS["limit"]
+    assert Status(int(run.status)) & Status.TORQUE_SATURATED
+    study = ij.monte_carlo(
+        scenario, {"plant.a2": ij.factor(ij.uniform(1.0, 1.0001))}, runs=2, progress=False, **SHORT
+    )
+    np.testing.assert_allclose(study.metrics["rmse"][0], run.metrics.rmse, rtol=1e-2)
+    np.testing.assert_allclose(study.metrics["peak_torque"][0], np.max(run.tau), rtol=1e-3)
 
 
 def test_an_actuator_of_one_direction_is_checked_in_its_range():

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from loops_of_plants import flexible_joint
+from loops_of_plants import band, electric_drive, flexible_joint
 from plant_cases import body, pendulum
 
 import iblf_jax as ij
@@ -97,3 +97,16 @@ def test_margins_of_all_levels(pendulum_run):
     assert np.allclose(metrics.alpha_margin, np.min(3.0 - np.abs(alpha[:, 1]), axis=0))
     assert metrics.first_level_violation_time == np.inf
     assert metrics.first_level_violation_level == -1
+
+
+@pytest.mark.slow
+def test_the_input_above_gravity_is_that_of_the_plant():
+    """A motor-driven arm at rest takes the voltage that holds it, and nothing above."""
+    law = ij.controllers.BarrierBackstepping(k=(3.0, 20.0, 60.0))
+    at_rest = ij.references.Sinusoid(offset=0.5, amplitude=0.0)
+    parts = {"reference": at_rest, "bounds": band(-0.2, 1.2), "initial": ij.Initial(q=[0.5, 0.5])}
+    folds = (ij.metrics.AboveGravity(), ij.metrics.Torque())
+    scenario = electric_drive(controller=law, **parts)
+    metrics = ij.simulate(scenario, duration=0.1, dt=1e-3, metrics=folds).metrics
+    assert metrics.units["effort_above_gravity"] == "V"
+    assert float(metrics.effort_above_gravity) < 1e-9 * float(np.max(metrics.torque_rms))

@@ -134,6 +134,22 @@ def test_the_variance_of_a_mode_is_right_to_five_per_cent(method):
 
 
 @pytest.mark.slow
+def test_the_recommended_step_is_that_of_a_noisy_mode():
+    scenario = link(process_noise.Additive(0.7), stiffness=3.0, damping=2.0)
+    dt = ij.recommended_dt(scenario, duration=1.0, method="stochastic_heun")
+    run = ij.simulate(scenario, duration=0.1, dt=dt, method="stochastic_heun", backend="vmap")
+    assert 0.1 < dt * float(run.fastest_mode) <= NOISY_PHASES["stochastic_heun"]
+    coarse = 2.1 / float(run.fastest_mode)
+    with pytest.warns(ij.SimulationWarning, match=f"Take dt={dt:g}"):
+        run = ij.simulate(
+            scenario, duration=2 * coarse, dt=coarse, method="stochastic_heun", backend="vmap"
+        )
+    assert int(run.status) & int(ij.Status.STEP_TOO_LARGE)
+    with pytest.raises(ValueError, match="has process noise"):
+        ij.recommended_dt(scenario, duration=1.0)
+
+
+@pytest.mark.slow
 def test_a_divided_step_has_the_increment_of_the_step():
     scenario, dt = canonical(link(process_noise.Additive(1.0))), jnp.asarray(0.1)
     times = jnp.asarray([0.13, 0.16])
@@ -172,6 +188,14 @@ def make_study(runs=1500, **options):
         progress=False,
         **options,
     )
+
+
+@pytest.mark.slow
+def test_runs_do_not_depend_on_chunks_or_the_number_of_runs(study):
+    other = make_study(runs=300, executor=ij.studies.LocalExecutor(chunk=256))
+    for name in ("margin", "first_exit_time"):
+        np.testing.assert_array_equal(other.metrics[name], study.metrics[name][:300])
+    assert np.unique(study.metrics["margin"]).size == len(study)
 
 
 @pytest.mark.slow

@@ -430,6 +430,22 @@ def test_ranges_end_where_a_count_is_more_than_the_drive_gives():
     assert layout(canonical(hopeless), gains, 1e-3, "rk4")[1].reasons[0][1] == BY_PERIOD + TOGETHER
 
 
+@pytest.mark.slow
+def test_a_step_with_the_poles_has_no_bias():
+    """f_hat lags by the robot's motion over a period otherwise.  Its poles are in
+    `control/test_observers`."""
+    scenario = ij.with_parts(SLOW, observer=ij.observers.ExtendedState(l1=100.0, l2=6000.0))
+    exact, poles, euler = (
+        np.max(ij.simulate(loop, duration=0.3, dt=1e-3).metrics.estimate_rmse)
+        for loop in (
+            ij.with_parts(scenario, sampling=ij.Sampling(2e-3, observer=way))
+            for way in ("exact", "poles", "euler")
+        )
+    )
+    assert poles < 0.5 * exact
+    assert poles < 1.2 * euler
+
+
 @pytest.mark.parametrize(
     "velocity",
     [ij.sensors.FilteredDifference(cutoff=[300.0, 2000.0]), ij.sensors.Tracking(bandwidth=2000.0)],

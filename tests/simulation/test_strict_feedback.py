@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 
 import chain_cases
 import independent_chains as other
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 
 import iblf_jax as ij
-from iblf_jax import bounds, controllers
+from iblf_jax import bounds, controllers, plants
 
 DATA = np.load(other.FILE)
 STEPS = {"flexible": 2e-4, "surface": 5e-4}
@@ -121,3 +122,46 @@ def test_paths_of_earlier_versions_lead_to_the_bounds_of_levels():
         assert ij.paths.unit_at(preset, earlier) == ij.paths.unit_at(preset, path)
     with pytest.raises(ValueError, match=r"'bounds\.lower\.valu'.*Did you mean bounds\[0\]\.lower"):
         ij.with_parameters(preset, {"bounds.lower.valu": 1.0})
+
+
+@pytest.mark.slow
+def test_a_disturbance_of_the_first_level_of_a_robot():
+    """q' = x_2 + d_1, which no torque can compensate at once."""
+    drift = ij.disturbances.Levels((ij.disturbances.Sinusoids(amplitude=0.05, frequency=2.0),))
+    preset = ij.with_parts(ij.presets.zhang_yan_2024(), disturbance=drift)
+    run = ij.simulate(preset, duration=1.0, dt=1e-3)
+    rate = np.gradient(np.asarray(run.q), 1e-3, axis=0, edge_order=2)
+    expected = np.asarray(run.dq) + 0.05 * np.sin(2.0 * np.asarray(run.t))[:, None]
+    # behind the transient of the start, which differences do not resolve
+    np.testing.assert_allclose(rate[300:-2], expected[300:-2], atol=1e-5)
+
+
+@pytest.mark.slow
+def test_a_rigid_law_on_stiff_joints_tends_to_the_robot_with_motors():
+    """With first order in 1/K, with the inertia of the motors in the model."""
+    paper = ij.presets.zhang_yan_2024(variant="corrected")
+    law = controllers.Backstepping(k1=2.0, K2=[4.0, 0.6], o=0.1, variant="corrected")
+    observer = ij.observers.NoObserver()
+    on = partial(ij.with_parts, paper, controller=law, observer=observer)
+
+    def end(stiffness):
+        motors = {"motor_inertia": [0.1, 0.02], "motor_damping": [2.0, 0.5]}
+        plant = plants.FlexibleJoint(paper.plant, stiffness=stiffness or 1.0, **motors)
+        rigid = plant.rigid()
+        scenario = on(plant=plant if stiffness else rigid, model=rigid)
+        return ij.simulate(scenario, duration=0.4, dt=2e-4, record_every=20).q
+
+    errors = np.array([np.max(np.abs(end(K) - end(None))) for K in (2e3, 4e3, 8e3, 16e3)])
+    assert np.all(np.abs(np.log2(errors[:-1] / errors[1:]) - 1.0) < 0.15), errors
+    assert errors[-1] < 5e-4
+
+
+@pytest.mark.slow
+def test_a_law_of_order_two_is_a_law_of_robots():
+    law, quiet = controllers.BarrierBackstepping(k=(2.0, 20.0)), ij.disturbances.Nothing()
+    robot = ij.with_parts(ij.presets.zhang_yan_2024(), controller=law, disturbance=quiet)
+    chain = ij.with_parts(robot, robot=plants.Rigid(robot.plant))
+    first, second = (ij.simulate(x, duration=0.3, dt=1e-3) for x in (robot, chain))
+    np.testing.assert_allclose(first.q, second.q, atol=1e-12)
+    np.testing.assert_allclose(first.tau, second.tau, atol=1e-9)
+    assert first.ok

@@ -17,6 +17,8 @@ import study_cases as cases
 import iblf_jax as ij
 from iblf_jax.studies import store, workers
 
+SCENARIO = ij.presets.zhang_yan_2024()
+
 
 @pytest.fixture(scope="module")
 def table():
@@ -57,6 +59,15 @@ def test_a_store_is_bit_identical_whoever_writes_it(threads, table, writer, tmp_
     options = ij.studies.StoreOptions(tmp_path / "sweep.zarr", cases.UNIT, writer=writer)
     assert cases.table(store=options, executor=threads).identical(table)
     assert cases.table(store=options.path).identical(table)
+
+
+@pytest.mark.slow
+def test_sensitivity_is_bit_identical(threads):
+    options = {"points": 4} | cases.options()
+    here = ij.sensitivity(SCENARIO, cases.perturbations(), **options)
+    there = ij.sensitivity(SCENARIO, cases.perturbations(), executor=threads, **options)
+    np.testing.assert_array_equal(here.total_order, there.total_order)
+    assert here.runs == there.runs
 
 
 class KilledWorkerError(Exception):
@@ -139,6 +150,24 @@ def test_a_store_of_an_earlier_version_is_read():
     with np.load(folder / "sweep_d674b34.npz") as expected:
         assert cases.same(cases.arrays(found), dict(expected))
     assert found.attrs["computed_cases"] == 12
+
+
+@pytest.mark.slow
+def test_units_that_another_process_writes_are_skipped(table, tmp_path, monkeypatch):
+    """A second process works on the same store while this one computes."""
+    path, write, seen = tmp_path / "sweep.zarr", store.Store.write, []
+    options = ij.studies.StoreOptions(path, cases.UNIT, shared=True)
+
+    def write_all_at_first(self, unit, data):
+        write(self, unit, data)
+        seen.append(unit)
+        if len(seen) == 1:
+            cases.table(store=path, executor=ij.studies.LocalExecutor(chunk=1))
+
+    monkeypatch.setattr(store.Store, "write", write_all_at_first)
+    one_at_a_time = ij.studies.LocalExecutor(chunk=1)
+    assert cases.table(store=options, executor=one_at_a_time).identical(table)
+    assert len(seen) <= 12 + 2, "units that are written are not computed again"
 
 
 @pytest.mark.slow

@@ -415,6 +415,19 @@ def test_a_store_that_is_deleted_meanwhile_is_begun_anew(tmp_path, table, monkey
     assert cases.table(store=path).identical(table)
 
 
+def test_a_store_that_is_deleted_at_the_very_end_is_noticed(tmp_path, monkeypatch):
+    path, plain = tmp_path / "sweep.zarr", store.Store.write
+
+    def write(self, unit, data):
+        plain(self, unit, data)
+        if unit == 11:
+            shutil.rmtree(path)
+
+    monkeypatch.setattr(store.Store, "write", write)
+    with pytest.raises(store.StoreWriteError, match="was deleted"):
+        cases.table(store=path)
+
+
 @pytest.mark.parametrize("what", ["an array", "another store"])
 def test_a_store_that_is_changed_meanwhile_is_not_written_on(tmp_path, finished, monkeypatch, what):
     path = tmp_path / "new" / "sweep.zarr"

@@ -354,6 +354,23 @@ def test_a_sampled_loop_that_is_unstable_in_some_runs_is_in_headline_and_text():
     assert "sampling_radius" not in str(made_up_report(0, {}))
 
 
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")  # of the unstable runs
+def test_the_largest_radius_of_the_fresh_runs_is_that_of_a_study_with_the_same_seed(paper):
+    """K2 of the first gains is stable at 2 ms, and that of the tuned ones is not."""
+    sampled = ij.with_parts(paper, sampling=ij.Sampling(2e-3))
+    slow = ij.with_parameters(sampled, {"controller.K2": 5.0})
+    gains = {"controller.K2": np.array([40.0, 40.0])}
+    draws = {"plant.mass": ij.factor(ij.uniform(0.8, 1.2))}
+    report = result_of(slow, gains, goal_of(50.0), perturbations=draws, runs=4).report
+    studies = [study_of_report(s, draws) for s in (slow, ij.with_parameters(slow, gains))]
+    radii = [np.max(study.metrics.sampling_radius) for study in studies]
+    np.testing.assert_allclose(report.sampling_radius, radii, rtol=1e-6)
+    flagged = [np.asarray(s.status) & int(ij.Status.SAMPLING_TOO_SLOW) != 0 for s in studies]
+    assert report.unstable == tuple(int(x.sum()) for x in flagged)
+    assert report.unstable[0] == 0 and report.unstable[1] > 0
+
+
 def test_violations_within_a_requirement_on_their_probability_are_no_failure():
     report = made_up_report(1, {"violation probability < 0.05": "pass"})
     assert report.failed

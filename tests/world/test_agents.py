@@ -98,6 +98,29 @@ def test_agents_of_order_four_and_two_joints_follow_the_leader():
     assert stack.units == ("rad", "rad/s", "rad", "rad/s", "N m")
 
 
+@pytest.mark.slow
+def test_friction_of_the_agents_robots_acts_on_the_plant(rng):
+    """The friction of each agent enters its own acceleration, which no law knows."""
+    damping = [0.3, 0.5]
+    robots = [ij.robots.WithMotors(pendulum(i), inertia=0.0, damping=damping[i]) for i in (0, 1)]
+    adjacency = ((0, 0), (1, 0))
+    parts = {"bounds": TUBE, "controller": controllers.BarrierBackstepping(k=(2.0, 20.0))}
+
+    def acceleration(pair):
+        stack = plants.Agents(agents=pair, adjacency=adjacency, leader=(1, 0))
+        one = ij.Scenario(
+            plant=stack,
+            reference=stack.reference(MOTION),
+            initial=ij.Initial(q=[0.25, 0.05], dq=0.0),
+            **parts,
+        )
+        return ij.vector_field(one)(0.1, jnp.asarray([0.25, 0.05, 0.4, -0.6]))[2:]
+
+    difference = acceleration(robots) - acceleration([pendulum(0), pendulum(1)])
+    expected = -np.asarray(damping) * [0.4, -0.6] / other.M[:2]
+    np.testing.assert_allclose(difference, expected, rtol=1e-10)
+
+
 @pytest.mark.release
 @pytest.mark.parametrize("distributed", [False, True])
 def test_the_certificate_of_the_levels_holds(distributed):

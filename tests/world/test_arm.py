@@ -169,6 +169,16 @@ def test_a_load_that_is_picked_up_has_its_share_of_all_moments():
         np.testing.assert_allclose(found, share * held.moments(), rtol=1e-12, atol=1e-15)
 
 
+@pytest.mark.slow
+def test_the_model_does_not_know_when():
+    picked = two_link_in_space(carried=Payload(mass=1.2, start=1.0))
+    scenario = canonical(dataclasses.replace(scenario_with(picked), model=picked))
+    state = initial_state(scenario)
+    before, after = (evaluate(scenario, jnp.asarray(t), state)[1] for t in (0.5, 3.0))
+    np.testing.assert_allclose(after.gravity, before.gravity)
+    assert np.max(np.abs(after.disturbance - before.disturbance)) > 0.1, "what is picked up is in f"
+
+
 # ------------------------------------------------------------------------------ names and checks
 
 

@@ -176,6 +176,21 @@ def test_a_light_wrist_keeps_narrow_bounds_at_500_hz_and_did_not_with_the_papers
         assert float(run.metrics.sampling_radius) > 1.05
 
 
+@pytest.mark.slow
+def test_the_weight_makes_every_barrier_as_stiff_at_the_reference():
+    """ds/de1 at e1 = 0 is that of the barrier: 2/k^2 of the integral one, 1 of the tangent."""
+    for law, stiffness in (
+        ("integral", 2 / 0.3**2),
+        ("log", 1 / 0.3**2),
+        ("mapping", 1.0),
+        ("dynamic_surface", 2 / 0.3**2),
+    ):
+        scenario = arms.arm_scenario(arms.arm("ur5"), HOLD, law=law, bounds=narrow(0.3))
+        inertia = jnp.diagonal(scenario.model.mass_matrix(scenario.initial.q))
+        expected = np.minimum(1.0, inertia * 12.5**2 / stiffness)
+        np.testing.assert_allclose(get(scenario, "controller.weight"), expected, rtol=1e-9)
+
+
 SHORT_MOTION = references.WaypointSpline(
     times=(0.0, 0.1, 0.2), waypoints=np.asarray(MIDDLE) + np.array([[0.0], [0.5], [0.0]])
 )

@@ -80,6 +80,26 @@ def test_a_vessel_refuses_added_masses_of_the_wrong_sign_and_what_is_no_restorin
         dataclasses.replace(SHIP, restoring=3.0)
 
 
+@pytest.mark.slow
+def test_the_driven_pendulum_is_an_electric_drive_on_a_pendulum(rng):
+    """With M = L/Kt, H = R/Kt and the motor's torque Kt i as the third level."""
+    link = ij.robots.PlanarChain(mass=[0.9], length=[0.4], centre=[0.3], inertia=[0.02], g=9.81)
+    D = float(link.mass_matrix(jnp.zeros(1))[0, 0])
+    drive = plants.ElectricDrive(
+        link, torque_constant=0.8, inductance=0.02, resistance=4.0, back_emf=0.7
+    )
+    pendulum = plants.DrivenPendulum(
+        D=[D], B=[0.0], N=[0.9 * 0.3 * 9.81], M=[0.02 / 0.8], H=[4.0 / 0.8], Km=[0.7]
+    )
+    x, u = rng.normal(size=(3, 1)), rng.normal(size=1)
+    of_drive = plants.flow(drive, 0.0, jnp.asarray(x), u)
+    # The angle of the chain counts from the horizontal.
+    shifted = np.stack([x[0] + 0.5 * np.pi, x[1], 0.8 * x[2]])
+    of_pendulum = plants.flow(pendulum, 0.0, jnp.asarray(shifted), u)
+    np.testing.assert_allclose(of_pendulum[:2], of_drive[:2], rtol=1e-12)
+    np.testing.assert_allclose(of_pendulum[2], 0.8 * of_drive[2], rtol=1e-12)
+
+
 # ------------------------------------------------------------ driven pendulum
 
 

@@ -302,6 +302,18 @@ def test_the_parameter_file_holds_in_a_namespace_and_under_another_name(client, 
     np.testing.assert_array_equal(np.abs(client.efforts).max(axis=0), [5.0, 3.0])
 
 
+def test_without_states_the_policy_takes_over(client, nodes):
+    """The law may start outside of the bounds here."""
+    nodes.begin(on_fault="hold", start_automatically="true", start_outside_bounds="true")
+    client.connect()
+    client.reach("running", q=(5.0, INSIDE[1]))
+    client.wait(lambda: client.mode == "fault", "no fault")
+    count = len(client.efforts)
+    client.wait(lambda: len(client.efforts) > count, "no torques of the policy")
+    assert client.efforts[-1] != [0.0, 0.0]
+    assert "stale" in client.diagnostics["last_fault"]
+
+
 def test_the_trigger_state_with_default_timeouts_compares_stamps_and_then_arrivals(client, nodes):
     """Gaps of two periods between stamps are tolerated, three are not; nor is half a second without
     a state.  The torques of the policy are zero, and the law starts again after each fault.

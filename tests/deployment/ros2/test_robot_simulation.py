@@ -182,6 +182,18 @@ def test_an_effort_within_a_period_acts_from_its_arrival_on():
     np.testing.assert_array_equal(motion.tau[after], [[-3.0, 1.0]] * after.sum())
 
 
+@pytest.mark.slow
+def test_a_payload_changes_the_motion_as_that_of_the_plant_does():
+    length = float(PAPER.plant.length[1])
+    loaded = robot(payload=ij.robots.Payload(mass=0.3, centre=[length, 0.0, 0.0]))
+    motion = closed_with_law(loaded, PAPER, periods=100)
+    heavy = ij.with_parameters(PAPER, {"plant.payload": 0.3})
+    run = ij.simulate(heavy, duration=0.2, dt=DT)
+    np.testing.assert_allclose(motion.q[motion.instant], run.q, atol=1e-7)
+    light = ij.simulate(PAPER, duration=0.2, dt=DT)
+    assert np.max(np.abs(np.asarray(light.q - run.q))) > 1e-3
+
+
 def test_a_payload_that_mujoco_does_not_have_is_refused():
     compiled = mujoco.MjModel.from_xml_path(str(ARM))
     for model, payload, words in (
