@@ -25,10 +25,11 @@ import hashlib
 import importlib
 import operator
 import os
+import re
 import struct
 import sys
 import types
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -49,8 +50,8 @@ CLOCK = 1.0
 """Largest difference between the clocks of files and of this process [s]."""
 TRACED = ("core", "kernels", "world", "control", "simulation", "engine")
 """Folders with what every kept program is traced from."""
-STUDIES = ("studies",)
-"""Folders with what only functions in them are traced from."""
+FURTHER = (("studies",), ("studies", "tuning"))
+"""Groups of folders with what only programs that name something in them are traced from."""
 LIBRARIES = frozenset(("iblf_jax", "jax", "jaxlib", "numpy", *sys.stdlib_module_names))
 """Packages whose source the environment determines."""
 CACHED: Any = (MEMOISED_TYPE, type(jax.jit(abs)))
@@ -59,6 +60,8 @@ REPLACEMENTS = frozenset(("unittest",))
 """Modules of Python whose objects stand for something else."""
 BY_PICKLE = "__slotnames__"
 """Attribute that Python adds to a class when an object of it is copied."""
+NAMED = re.compile(r"\biblf_jax\.(\w+)")
+"""A folder of the package in the name of a class or a function."""
 OF_NAMED_TUPLES = "namedtuple_"
 """First letters of the module of the constructor that Python writes for a named tuple."""
 EXACT_TYPES = (bool, int, str, bytes, types.NoneType)
@@ -145,12 +148,13 @@ def _name_of(value: Any) -> str:
     return f"{module}.{name}"
 
 
-def environment(*functions: Callable) -> str:
+def environment(text: str = "") -> str:
     """The text of what decides, besides the arguments, what a program computes (head of this
     module).
 
     Args:
-      functions: what the program is traced from besides the functions of TRACED.
+      text: `text_of` what the program is traced from; the functions and classes that it names may
+        be outside of the folders TRACED.
 
     Raises:
       NoKeyError: something cannot be described, or a program must not be kept: the package was
@@ -169,7 +173,7 @@ def environment(*functions: Callable) -> str:
     parts = (
         (sys.version, jax.__version__, jaxlib.__version__, np.__version__),
         _source(),
-        *map(_state, _folders(functions)),
+        *map(_state, _folders(text)),
         tuple(sorted((k, x) for k, x in os.environ.items() if k.startswith(VARIABLES))),
         tuple((k, options[k]) for k in sorted(options) if not k.startswith(NOT_OF_PROGRAMS)),
         threads(),
@@ -208,14 +212,15 @@ def _digest_of_files() -> str:
     return found.hexdigest()
 
 
-def _folders(functions: Iterable[Callable]) -> list[tuple[str, ...]]:
-    """The groups of folders with the code that these functions run."""
-    places = {str(function.__module__).split(".")[1] for function in functions} - {*TRACED}
+def _folders(text: str) -> list[tuple[str, ...]]:
+    """The groups of folders with the code that the functions and classes of a text run."""
+    places = {*NAMED.findall(text)} - {*TRACED}
     if not places:
         return [TRACED]
-    if places <= {*STUDIES}:
-        return [TRACED, STUDIES]
-    raise NoKeyError(f"functions in {places}")
+    for group in FURTHER:
+        if places <= {*group}:
+            return [TRACED, group]
+    raise NoKeyError(f"code in {places}")
 
 
 def _state(folders: tuple[str, ...]) -> str:
@@ -250,7 +255,7 @@ class _State(NamedTuple):
         return _State(found.hexdigest(), values)
 
 
-@memoised(2)
+@memoised(3)
 def _first_state(folders: tuple[str, ...]) -> _State:
     """The state when this process first asks for it, with which later ones are compared."""
     return _State.of(_namespaces(folders))
@@ -274,7 +279,7 @@ def _namespaces(folders: tuple[str, ...]) -> dict[str, Mapping[str, Any]]:
     return found
 
 
-@memoised(2)
+@memoised(3)
 def _modules(folders: tuple[str, ...]) -> tuple[str, ...]:
     """The names of the modules in some folders, all of them loaded: what a process has loaded
     before must not matter.

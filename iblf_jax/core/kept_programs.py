@@ -19,8 +19,8 @@ import pickle
 import re
 import threading
 import time
-import types
 from collections.abc import Callable
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -33,6 +33,8 @@ from iblf_jax.kernels import ToolchainError, cache_path, cached_file, content_of
 
 T = TypeVar("T")
 
+_FORBIDDEN: ContextVar[set[str] | None] = ContextVar("iblf_jax_forbidden", default=None)
+"""Why the program that is traced now is not kept."""
 SUFFIX = ".program"
 CALLED = re.compile(r'custom_call @("[^"]*"|[^(\s]+)')
 """A call in StableHLO of a function that XLA knows by name."""
@@ -59,15 +61,24 @@ def key_of(*parts: Any) -> str | None:
     nothing is kept in this process.
 
     Args:
-      parts: the values; the functions among them are what a program is traced from.
+      parts: the values; the functions and classes among them are what a program is traced from.
     """
     if not keeps_programs():
         return None
     try:
-        functions = [part for part in parts if isinstance(part, types.FunctionType)]
-        return f"{text_of(parts)}\n{environment(*functions)}"
+        text = text_of(parts)
+        return f"{text}\n{environment(text)}"
     except NoKeyError:
         return None
+
+
+def forbid(reason: str) -> None:
+    """The program that is traced now, if any, is not kept, because its key does not decide what it
+    does: it falls back to what works in this process, or the trace warns.
+    """
+    reasons = _FORBIDDEN.get()
+    if reasons is not None:
+        reasons.add(reason)
 
 
 def read(key: str) -> Any:
@@ -188,8 +199,13 @@ class KeptProgram:
         if isinstance(entry, Entry):
             with contextlib.suppress(*UNREADABLE):
                 return entry.program(arguments)
-        lowered = self._function.lower(*args, **kwargs)
-        if key is None:
+        reasons: set[str] = set()
+        token = _FORBIDDEN.set(reasons)
+        try:
+            lowered = self._function.lower(*args, **kwargs)
+        finally:
+            _FORBIDDEN.reset(token)
+        if key is None or reasons:
             return lowered.compile()
         with without_cache():
             compiled = lowered.compile()

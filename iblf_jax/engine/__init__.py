@@ -14,6 +14,7 @@ import from here; `simulate`, `explain`, `recommended_period` and the step sizes
 their own.
 """
 
+from iblf_jax.engine.batch_in_parts import run_batch_in_parts as run_batch_in_parts
 from iblf_jax.engine.carry import Inputs as Inputs
 from iblf_jax.engine.carry import Step as Step
 from iblf_jax.engine.carry import StepOptions as StepOptions

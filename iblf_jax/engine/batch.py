@@ -243,7 +243,7 @@ def finalize(
 
     def outcome(inputs, carry, at_start, instants, modes):
         unresolved = at_start.unresolved
-        return outcome_of(inputs, request.method, carry, unresolved, instants, modes)
+        return outcome_of(inputs, request, carry, unresolved, instants, modes)
 
     # The two instants of a run are linearized as two runs, by the program of the start.
     per_run = [jnp.repeat(x, 2, axis=0) for x in batch.leaves.per_run]

@@ -268,6 +268,13 @@ def _weights(folds: tuple[Fold, ...], found: StepOutput) -> list[jax.Array]:
     return [outer.weight for outer in outers_of_step(folds, found)]
 
 
+def step_of_values(folds: tuple[Fold, ...], method: str) -> TimeStep:
+    """The step that makes the values of `run_by_columns`: it records the weights of the curvature
+    matrices, if there are any.
+    """
+    return TimeStep(method, _weights if count_curvatures(folds) else None)
+
+
 def run_by_columns(
     run_steps: Stepper, batch: Batch, directions: Directions, request: RunRequest
 ) -> Tangents:
@@ -284,11 +291,12 @@ def run_by_columns(
 
     units = np.eye(directions.tangents, dtype=batch.dtype)
     along = jax.vmap(lambda unit: jax.jvp(leaves_at, (zero,), (unit,))[1])(units)
-    weight_of, vector_of, every = None, None, None
+    vector_of, every = None, None
     if count_curvatures(inputs.folds):
-        weight_of, vector_of, every = _weights, outer_vectors, 1
+        vector_of, every = outer_vectors, 1
     request = request._replace(record_every=every)
-    outcome, weights = run_step(run_steps, batch, TimeStep(request.method, weight_of), request)
+    of_values = step_of_values(inputs.folds, request.method)
+    outcome, weights = run_step(run_steps, batch, of_values, request)
     step = TangentStep(TimeStep(request.method, vector_of), (places,))
     found, tangents = _stepped(run_steps, batch, step, [along], request)
     constant = {name: x for name, x in outcome.metrics.items() if name in ACCURACY}

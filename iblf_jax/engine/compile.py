@@ -76,6 +76,7 @@ OUT_OF_MEMORY = "RESOURCE_EXHAUSTED"
 
 
 def _warn_once(text: str) -> None:
+    kept_programs.forbid(text)
     if CACHE.mark(WARNINGS, text):
         notices.warn(text, BackendWarning)
 
@@ -120,6 +121,7 @@ def first_that_works(
             _warn_once(plan.unavailable_warning(name, error, following))
         except UnsupportedError as reason:
             mark(names)
+            kept_programs.forbid(str(reason))
             if execution.reports_unsupported:
                 _warn_once(plan.scan_warning(reason))
             break
@@ -272,7 +274,7 @@ def structural_part(request: RunRequest) -> RunRequest:
     """The request with only what its kernels depend on: whether there are at least FEW_STEPS steps,
     and whether anything is recorded.
     """
-    part = request._replace(steps=0)
+    part = request._replace(steps=0, assessed=True)
     if request.steps >= thresholds.FEW_STEPS:
         part = part._replace(steps=thresholds.FEW_STEPS)
     if request.record_every is not None:

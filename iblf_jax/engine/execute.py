@@ -30,7 +30,12 @@ from iblf_jax.engine.batch import (
     split,
 )
 from iblf_jax.engine.carry import Inputs
-from iblf_jax.engine.columns import numbers_of, outer_vectors, run_by_columns
+from iblf_jax.engine.columns import (
+    numbers_of,
+    outer_vectors,
+    run_by_columns,
+    step_of_values,
+)
 from iblf_jax.engine.compile import (
     building,
     compiled_plan,
@@ -175,6 +180,13 @@ class CompiledBatch(NamedTuple):
             return _run_by_scan(inputs, varied, request)
         return _run_by_executor(registry.EXECUTORS[self.backend], inputs, varied, request)
 
+    def stepper(self, inputs: Inputs, varied: Mapping[str, jax.Array]) -> tuple[Stepper, Batch]:
+        """What makes the steps of these runs, and the runs."""
+        if not self.execution.backends:
+            return scan_of(inputs), Batch.of(inputs, varied)
+        batch = Batch.of(inputs, varied, self.request.constants)
+        return kernel_stepper(registry.EXECUTORS[self.backend]), batch
+
     def positions(
         self,
         scenario: Scenario,
@@ -195,13 +207,7 @@ class CompiledBatch(NamedTuple):
         request = self.request._replace(record_every=record_every)
         inputs = inputs_of(scenario, (), dt, request)
         step = TimeStep(request.method, positions)
-
-        if self.execution.backends:
-            batch = Batch.of(inputs, varied, request.constants)
-            run_steps = kernel_stepper(registry.EXECUTORS[self.backend])
-        else:
-            batch = Batch.of(inputs, varied)
-            run_steps = scan_of(inputs)
+        run_steps, batch = self.stepper(inputs, varied)
         carry = carry_without_linearization(batch, request.method)
         return run_steps(step, batch, carry, request.instants, record_every)[1]
 
@@ -281,7 +287,8 @@ def _derivative_sizes(
 ) -> DerivativeSizes:
     """The sizes that decide how an executor computes tangents."""
     carry = carry_shapes(batch, request.method)
-    nodes = program_of(TimeStep(request.method), batch, carry).program.size
+    step = step_of_values(batch.leaves.first.folds, request.method)
+    nodes = program_of(step, batch, carry).program.size
 
     def count_kept_numbers() -> int:
         samples = request.instants * (batch.runs or 1)

@@ -13,6 +13,7 @@ from iblf_jax.core.status import Status, flag, has_flag
 from iblf_jax.engine.carry import Carry, Inputs
 from iblf_jax.engine.linearization import Linearization
 from iblf_jax.engine.metric_folds import finished
+from iblf_jax.engine.request import RunRequest
 from iblf_jax.simulation import error_estimate, error_growth, integrators, stability
 from iblf_jax.world import plants
 
@@ -28,7 +29,7 @@ class Outcome(NamedTuple):
 
 def outcome_of(
     inputs: Inputs,
-    method: str,
+    request: RunRequest,
     carry: Carry,
     unresolved: error_estimate.UnresolvedSignals,
     instants: Linearization,
@@ -38,7 +39,7 @@ def outcome_of(
 
     Args:
       inputs: of the run.
-      method: the integrator.
+      request: of the run.
       carry: after the last step.
       unresolved: the unresolved signals of the run, as accelerations.
       instants: linearizations at the start, at the instant nearest to a bound and at the end of the
@@ -46,6 +47,11 @@ def outcome_of(
       modes: `fastest_modes` of these, (3,) [1/s].
     """
     scenario = inputs.scenario
+    mode = jnp.max(jnp.where(jnp.isfinite(modes), modes, 0.0))
+    limit = integrators.tableau(request.method).stability
+    status = carry.status | flag(inputs.dt * mode > limit, Status.STEP_TOO_LARGE)
+    if not request.assessed:
+        return Outcome(None, finished(inputs.folds, carry.accumulators), status, mode)
     accuracy = error_estimate.with_unresolved(carry.accuracy, unresolved)
     sampled: _Sampled | None = None
     rounding: dict[str, jax.Array] = {}
@@ -54,9 +60,6 @@ def outcome_of(
     if not is_absent(accuracy.error_growth):
         bounds = _bounds_of_growth(inputs, carry, sampled)
         accuracy, rounding = error_growth.with_growth(accuracy, bounds, unresolved.width)
-    mode = jnp.max(jnp.where(jnp.isfinite(modes), modes, 0.0))
-    limit = integrators.tableau(method).stability
-    status = carry.status | flag(inputs.dt * mode > limit, Status.STEP_TOO_LARGE)
     # A column is at least as long as the mode that it alone would make.
     steepest = jnp.sum(jnp.abs(instants.jacobian[:, 0]), axis=-2)
     steep = stability.has_infinite_derivative(

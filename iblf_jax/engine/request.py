@@ -27,6 +27,10 @@ class RunRequest(NamedTuple):
     """The numbers of the scenario that are compiled in; None for none."""
     backend: str = "auto"
     """"auto", "vmap" (the scan) or the name of an executor."""
+    assessed: bool = True
+    """Whether the outcome has the accuracy of the run, the radius of its sampled loop, and the
+    flags that follow from them.  Searches read metrics and `status.UNTRUSTED` only.  They do
+    without: of a sampled arm it is most of what is compiled and computed after the last step."""
 
     @property
     def instants(self) -> int:

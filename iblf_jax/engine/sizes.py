@@ -30,10 +30,10 @@ STEPS_PER_UNIT = 2e8
 """Steps of all runs in a unit of a sweep's store, which take seconds to a minute."""
 MIN_UNITS = 16
 """Smallest number of units of a large sweep."""
-MIN_RUNS_PER_BATCH = 256
-"""Smallest number of runs in a batch of a tuning without derivatives.  A call takes 1 ms and its
-runs: 1,024 points of 500 steps of two links take 34 ms of processor time in batches of 256, 146 in
-batches of 16.  A kernel does not compute the copies that fill up a batch."""
+MIN_RUNS_PER_BATCH = 64
+"""Smallest number of runs in a batch of a tuning without derivatives.  A kernel does not compute
+the copies that fill up a batch, but what precedes and follows the steps is computed for all of
+them: the assessment of a run of a sampled arm takes 20 ms of processor time."""
 MIN_RUNS_WITH_DERIVATIVES = 16
 """The same with derivatives; as many as the vectors of a processor hold."""
 MAX_STEPS_IN_SEARCH_SHAPE = 10_000_000

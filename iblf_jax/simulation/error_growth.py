@@ -547,7 +547,8 @@ def _inputs(
     scenario: Scenario, growth: ErrorGrowth, state: LoopState, derivative: jax.Array, size: int
 ) -> tuple[jax.Array, jax.Array]:
     """The effects G of the deviations of dead zone, backlash and event trigger, (m, n), and of
-    those of rounding, (m, c), each times its largest value; `size` is m.
+    those of rounding, (m, c), each times its largest value; `size` is m.  What a loop does not have
+    has no columns: their sums of powers would take most of the time.
     """
     sampling = checks.given(scenario.sampling)
     n = scenario.n
@@ -566,8 +567,10 @@ def _inputs(
     if step_of_torque is not None:
         inputs.append(direct * step_of_torque)
     if _rounds_readings(scenario):
-        step = _resolution(scenario, state.x)
-        for rows, of_level in zip(_rows_of_levels(state), step, strict=True):
+        levels = list(zip(_rows_of_levels(state), _resolution(scenario, state.x), strict=True))
+        if jnp.ndim(scenario.sensor.resolution) < 2:
+            levels = levels[:1]  # only the positions are rounded
+        for rows, of_level in levels:
             law = derivative[plant : plant + n, rows]
             by_law = columns(matmul_in_order(by_torque, law), derivative[plant + n :, rows])
             if sampling.queue:
@@ -577,7 +580,10 @@ def _inputs(
                 by_law = jnp.concatenate([jnp.zeros_like(by_law[:plant]), *waiting])
             inputs.append(by_law * of_level)
     none = jnp.zeros((size, 1), derivative.dtype)
-    return direct * width, jnp.concatenate(inputs or [none], axis=1)
+    others = none[:, :0]
+    if width is not None:
+        others = direct * width
+    return others, jnp.concatenate(inputs or [none], axis=1)
 
 
 def with_growth(
@@ -620,13 +626,17 @@ def errors_by_step(metrics: Mapping[Any, Any]) -> jax.Array:
     return jnp.where(bounds > TOLERANCE, jnp.where(rest > TOLERANCE, rest, 0.0), errors)
 
 
-def _torque_widths(scenario: Scenario, growth: ErrorGrowth) -> tuple[jax.Array, Any]:
+def _torque_widths(scenario: Scenario, growth: ErrorGrowth) -> tuple[jax.Array | None, Any]:
     """Largest difference of two deviations of the torque from that of the smooth loop, (n,)
-    [N m], less that of rounding, and that of rounding; None for a torque that is not rounded.
+    [N m], less that of rounding, and that of rounding; None for a torque that does not deviate, and
+    for one that is not rounded.
     """
     sampling = checks.given(scenario.sampling)
     width = jnp.zeros((scenario.n,), growth.largest.dtype)
     deviation, step = scenario.actuator.deviation, scenario.actuator.resolution
+    is_smooth = deviation is None and scenario.actuator.smooth is scenario.actuator
+    if is_smooth and step is None and sampling.trigger is None:
+        return None, None
     if deviation is not None:
         width = width + deviation
     elif scenario.actuator.smooth is not scenario.actuator:

@@ -171,6 +171,7 @@ def tune(
         scenario,
         parameters,
         objective,
+        screens=options.effort.values > 0,
         duration=duration,
         dt=dt,
         method=method,

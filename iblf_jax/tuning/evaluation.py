@@ -211,19 +211,20 @@ def objective_at_quarter_step(problem: TuningProblem, z: np.ndarray) -> np.ndarr
 
     def of_rows(rows: np.ndarray) -> jax.Array:
         candidates = fine.candidates(z[rows])
-        return _accurate_objective(fine, candidates, fine.rollouts(candidates))
+        found = fine.rollouts(candidates, assessed=True)
+        return _accurate_objective(fine, candidates, found)
 
     # Many points follow one another, so that one program serves them all.
     return in_groups(of_rows, len(z), fine.points_together(2))
 
 
-@programs.jit
+@programs.jit(kept=True)
 def _values(problem: TuningProblem, candidates: Candidate, found: Rollouts) -> Value:
     by_start = _by_start((found.smooth, found.exact, found.status), candidates)
     return jax.vmap(partial(value_of_start, problem))(candidates, *by_start)
 
 
-@programs.jit
+@programs.jit(kept=True)
 def _accurate_objective(
     problem: TuningProblem, candidates: Candidate, found: Rollouts
 ) -> jax.Array:
@@ -232,7 +233,7 @@ def _accurate_objective(
     return jnp.where(value.valid & ~jnp.any(is_inaccurate, axis=1), value.objective, jnp.nan)
 
 
-@programs.jit
+@programs.jit(kept=True)
 def forward_derivatives(problem: TuningProblem, candidates: Candidate) -> Derivatives:
     """The problem with gradient (S, p), Gauss-Newton matrix (S, p, p) and the pieces of the
     requirements, by forward mode.
@@ -246,7 +247,7 @@ def forward_derivatives(problem: TuningProblem, candidates: Candidate) -> Deriva
         _jacobians(problem, candidates),
         _fold(problem),
         problem.dt,
-        problem.request,
+        problem.request._replace(assessed=False),
         uniform=[path for path in tied if not _overlaps(problem, path, perturbed)],
     )
     by_start = _by_start((found.outcome, found.tangents, found.products), candidates)
@@ -268,7 +269,7 @@ def _overlaps(problem: TuningProblem, path: str, others: list[str]) -> bool:
     return any(paths_overlap(problem.scenario, path, other) for other in others)
 
 
-@programs.jit
+@programs.jit(kept=True)
 def reverse_derivatives(problem: TuningProblem, candidates: Candidate) -> Derivatives:
     """The problem with gradient (S, p), by reverse mode; its matrix is zero."""
     tuned = [block.path for block in problem.blocks]
@@ -291,7 +292,7 @@ def reverse_derivatives(problem: TuningProblem, candidates: Candidate) -> Deriva
         ["tuning_smooth"],
         _fold(problem),
         problem.dt,
-        problem.request,
+        problem.request._replace(assessed=False),
     )
     numbers = outcome.metrics["tuning_smooth"], outcome.metrics["tuning_exact"], outcome.status
     smooth, exact, status = _by_start(numbers, candidates)

@@ -50,7 +50,7 @@ NO_LEVEL = 1e6
 
 STATIC = (
     *("blocks", "targets", "request", "allowed", "piece_counts"),
-    *("on_front", "requirements_in_loss"),
+    *("on_front", "requirements_in_loss", "screens"),
 )
 TRACED = ("cases", "objective", "dt", "box", "options")
 
@@ -101,6 +101,8 @@ class TuningProblem:
     """Whether the terms are objectives of a front, with weights and levels of each start."""
     requirements_in_loss: bool = False
     """Whether the loss is the augmented Lagrangian, for solvers without constraints."""
+    screens: bool = False
+    """Whether many points will be evaluated without derivatives."""
 
     @staticmethod
     def build(
@@ -109,6 +111,7 @@ class TuningProblem:
         objective: object,
         *,
         on_front: bool = False,
+        screens: bool = False,
         **options: Any,
     ) -> TuningProblem:
         """Checks the arguments of `tune` and puts them together; scales and limits that are not
@@ -117,6 +120,7 @@ class TuningProblem:
         Args:
           scenario, parameters, objective: as `tune`.
           on_front: whether the terms are objectives of a front.
+          screens: whether many points will be evaluated without derivatives.
           options: of the runs, the fields of `TuningRunOptions`.
 
         Raises:
@@ -150,6 +154,7 @@ class TuningProblem:
             allowed=tuple(float(r.allowed) for r in goal.requirements),
             piece_counts=piece_counts(scaled, scenario, run.duration),
             on_front=on_front,
+            screens=screens,
         )
         if is_complete(goal):
             return problem
@@ -237,17 +242,20 @@ class TuningProblem:
         """Path -> values of the leaves in all runs of all starts, (S * B, ...)."""
         return of_runs(self.leaves, candidates)
 
-    def rollouts(self, candidates: Candidate) -> Rollouts:
-        """All runs of all starts, without derivatives, (S * B, ...)."""
+    def rollouts(self, candidates: Candidate, *, assessed: bool = False) -> Rollouts:
+        """All runs of all starts, without derivatives, (S * B, ...); with the error of each run if
+        they are `RunRequest.assessed`.
+        """
         varied = _leaves_of_runs(self, candidates)
-        return rollouts(self.scenario, varied, self.objective, self.dt, request=self.request)
+        request = self.request._replace(assessed=assessed)
+        return rollouts(self.scenario, varied, self.objective, self.dt, request=request)
 
     def points_together(self, points: int) -> int:
         """How many of some points are evaluated without derivatives in one batch.
 
         Where many points will be evaluated later, one point is evaluated by their program.
         """
-        many = points > 1 or self.runs > 1 or self.multimodal or self.on_front
+        many = points > 1 or self.screens or self.runs > 1 or self.multimodal or self.on_front
         return points_per_batch(self.runs) if many else 1
 
     def exact_at_start(self) -> np.ndarray:
@@ -290,7 +298,7 @@ class TuningProblem:
         )
 
 
-_leaves_of_runs = programs.jit(TuningProblem.leaves_of_runs)
+_leaves_of_runs = programs.jit(TuningProblem.leaves_of_runs, kept=True)
 
 
 def of_runs(function: Callable[[jax.Array, jax.Array], object], candidates: Candidate) -> Any:

@@ -420,7 +420,7 @@ def drive_exceeded(scenario: Scenario) -> str:
     return ""
 
 
-@programs.jit(options=programs.SHORTEST_TO_COMPILE)
+@programs.jit(options=programs.SHORTEST_TO_COMPILE, kept=True)
 def _command_steps(scenario: Scenario, times: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Steps of the command by one count of each joint, or of each level and component of a sensor
     of levels (T + 1, m, n), and the standard deviation by the noise (T + 1, n), [N m].

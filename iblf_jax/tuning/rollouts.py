@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import programs
-from iblf_jax.engine import RunRequest, run_batch
+from iblf_jax.engine import RunRequest, run_batch_in_parts
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
 from iblf_jax.simulation.error_growth import errors_by_step
 from iblf_jax.simulation.metrics import Torque
@@ -82,7 +82,7 @@ def draw_run(
     return replaced_leaves(cases.scenario, point, drawn) | noise, admissible
 
 
-@programs.jit(static_argnames=("targets", "nominal"))
+@programs.jit(static_argnames=("targets", "nominal"), kept=True)
 def draw_runs(
     cases: UncertainScenario,
     points: dict[str, jax.Array],
@@ -113,7 +113,6 @@ class Rollouts(NamedTuple):
     """Spectral radius of the one-period map, (R,); NaN for a continuous law."""
 
 
-@programs.jit(static_argnames="request")
 def rollouts(
     scenario: Scenario,
     varied: dict[str, jax.Array],
@@ -122,17 +121,19 @@ def rollouts(
     *,
     request: RunRequest,
 ) -> Rollouts:
-    """Runs a batch.
+    """Runs a batch; call it outside of `jit`.
 
     Args:
-      scenario, varied, dt, request: as `runs.run_batch`.
+      scenario, varied, dt, request: as `run_batch_in_parts`; errors and radii are NaN where the
+        request is not `assessed`.
       objective: complete.
     """
     folds = (*fold_of(objective, dt.dtype, request.steps * dt), Torque())
-    outcome = run_batch(scenario, varied, folds, dt, request)
+    outcome = run_batch_in_parts(scenario, varied, folds, dt, request)
     smooth, exact, peak_torque = (
         outcome.metrics[name] for name in ("tuning_smooth", "tuning_exact", "peak_torque")
     )
-    error = errors_by_step(outcome.metrics)
-    radius = outcome.metrics.get(RADIUS, jnp.full_like(error, jnp.nan))
+    unknown = np.full(len(smooth), np.nan, dt.dtype)
+    error = errors_by_step(outcome.metrics) if request.assessed else unknown
+    radius = outcome.metrics.get(RADIUS, unknown)
     return Rollouts(smooth, exact, peak_torque, error, outcome.status, outcome.fastest_mode, radius)

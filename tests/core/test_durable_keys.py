@@ -19,6 +19,8 @@ from iblf_jax.kernels import Known
 from iblf_jax.simulation import stability
 from iblf_jax.simulation.scenario import canonical
 from iblf_jax.studies import blocks, designs, draws
+from iblf_jax.tuning import quantities
+from iblf_jax.tuning.quantities import TimeIntegral
 
 DIFFERENT = (
     *(None, (), [], ((),), "None", "()"),
@@ -116,7 +118,7 @@ def test_code_of_the_package_that_was_replaced(monkeypatch, place):
 
 
 def test_code_of_studies_counts_for_functions_in_that_folder(monkeypatch):
-    traced, other = blocks.result_shapes, canonical
+    traced, other = text_of(blocks.result_shapes), text_of(canonical)
     before = environment(other), environment(traced)
     assert before[0] == environment() != before[1]
     monkeypatch.setattr(designs, "MAX_RUNS", 2 * designs.MAX_RUNS)
@@ -127,8 +129,8 @@ def test_code_of_studies_counts_for_functions_in_that_folder(monkeypatch):
         environment(traced)
     monkeypatch.undo()
     assert (environment(other), environment(traced)) == before
-    with pytest.raises(NoKeyError, match="tuning"):
-        environment(ij.tune)
+    with pytest.raises(NoKeyError, match="certificates"):
+        environment(text_of(ij.certify))
 
 
 def test_options_of_jax_and_of_xla(monkeypatch):
@@ -154,3 +156,18 @@ def test_a_file_of_the_package_that_is_newer_than_the_process(monkeypatch):
     with pytest.raises(NoKeyError, match="changed"):
         environment()
     assert newest < time.time()
+
+
+def test_code_of_tuning_counts_for_what_names_a_class_of_it(monkeypatch):
+    """The structure of a metric, for example, which a function of the engine takes."""
+    texts = [text_of((canonical, canonical)), text_of((canonical, TimeIntegral))]
+    before = [environment(text) for text in texts]
+    assert before[0] == environment() != before[1]
+    monkeypatch.setattr(quantities, "EDGE_WIDTH", 2.0 * quantities.EDGE_WIDTH)
+    assert environment(texts[0]) == before[0]
+    assert environment(texts[1]) != before[1]
+    monkeypatch.undo()
+    monkeypatch.setattr(TimeIntegral, "update", lambda *args: None)
+    assert environment(texts[0]) == before[0]
+    with pytest.raises(NoKeyError):
+        environment(texts[1])

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import pickle
 import subprocess
 import sys
 
+import jax
+import numpy as np
 import pytest
 
 from iblf_jax.core import kept_programs
@@ -165,3 +168,52 @@ def test_a_damaged_value_is_not_read(folder):
         assert kept_programs.read("one") is None
     kept_programs.keep("one", (1, 2.0))
     assert kept_programs.read("one") == (1, 2.0)
+
+
+TUNE = """
+goal = ij.objectives.tracking(scale=1.0) + 0.3 * ij.objectives.effort(scale=1.0)
+sampled = ij.with_parts(paper, sampling=ij.Sampling(period=2e-3))
+effort = ij.tuning.Effort(values=4, starts=2, iterations=2)
+cases = [
+    (sampled, "controller.K2"),
+    (ij.with_parameters(sampled, {"controller.k1": 3.0}), "controller.K2"),
+    (sampled, "controller.K2[0]"),
+]
+def tuned(case):
+    scenario, path = case
+    options = {"duration": 0.04, "dt": 2e-3, "effort": effort, "progress": False}
+    best = ij.tune(scenario, [path], goal, **options)
+    return digest((best.values, best.objective, best.report.peak_torque))
+names = {"forward_derivatives", "_initialize", "_all_steps", "_finalize"}
+printed(cases, tuned, names)
+"""
+"""The second case has other numbers, and the third one tunes another part of the leaf."""
+
+
+@pytest.mark.slow
+def test_a_tuning_reads_its_programs(tmp_path):
+    expected, traced = printed(TUNE, tmp_path, **NOTHING_KEPT)
+    assert len(set(expected)) == 3
+    everything = ["_all_steps", "_finalize", "_initialize", "forward_derivatives"]
+    assert traced[:2] == [everything, []]
+    assert "forward_derivatives" in traced[2]
+    assert printed(TUNE, tmp_path, **KEPT) == (expected, traced)
+    assert printed(TUNE, tmp_path, **KEPT) == (expected, [[]] * 3)
+
+
+def test_a_program_that_falls_back_is_not_kept(folder, monkeypatch):
+    monkeypatch.setattr(kept_programs, "key_of", str)
+    monkeypatch.setattr(kept_programs, "without_cache", contextlib.nullcontext)
+    kept_programs.forbid("nothing is traced")
+
+    def doubled(is_broken):
+        def function(x):
+            if is_broken:
+                kept_programs.forbid("the compiler does not work here")
+            return 2.0 * x
+
+        compiled = kept_programs.KeptProgram(jax.jit(function), ("one",), (), ())
+        return compiled(np.ones(2, np.float32)).tolist()
+
+    assert doubled(is_broken=True) == [2.0, 2.0] and not list(folder.glob("*.program"))
+    assert doubled(is_broken=False) == [2.0, 2.0] and len(list(folder.glob("*.program"))) == 1
