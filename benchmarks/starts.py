@@ -112,6 +112,17 @@ def sampled_computed_torque() -> Problem:
     return Problem(scenario, ["controller.Kp", "controller.Kd", "observer.kf"], 0.85)
 
 
+def sampled_with_rate_limit() -> Problem:
+    """Drives whose torque has a largest rate, and a sampled law."""
+    scenario = ij.with_parts(
+        two_links("log"),
+        actuator=actuators.Motor(bandwidth=150.0, rate_limit=600.0),
+        sampling=ij.Sampling(period=2e-3),
+    )
+    gains = ["controller.k1", "controller.K2", ij.tunable("observer.kf", tied=True)]
+    return Problem(scenario, gains, 0.9)
+
+
 def far_start() -> Problem:
     """The first gain is a factor of 150 below that of the preset."""
     start = two_links("log")
@@ -240,6 +251,8 @@ PROBLEMS: dict[str, Callable[[], Problem]] = {
         ["controller.k1", "controller.K2", "observer.kf"],
         0.9,
     ),
+    # Written after the points at the ends of the ranges and before it was measured on them.
+    "motor with rate limit, sampled (5)": sampled_with_rate_limit,
 }
 """Name with the number of gains -> problem."""
 

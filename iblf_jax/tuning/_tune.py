@@ -50,12 +50,14 @@ from iblf_jax.tuning.search import (
     REPAIR_STARTS,
     SAME_OBJECTIVE,
     SECOND_SEARCH,
+    STARTS_AT_ENDS,
     Search,
     Strategy,
 )
 from iblf_jax.tuning.solvers import Solver
 from iblf_jax.tuning.solvers.sqp import SQP
 from iblf_jax.tuning.starts import (
+    FEW_STARTS,
     MAX_SCREENED_RUNS,
     WEIGHTS,
     Screening,
@@ -222,7 +224,10 @@ def search_of(
         z = _chosen_starts(problem, screening, starts)
         second_starts = min(effort.second_starts, starts)
         second_points = count // 3 if second_starts else 0
-        strategy = Strategy(screening, effort.selection, len(z), second_points, second_starts)
+        at_ends = STARTS_AT_ENDS if count and len(z) > FEW_STARTS else 0
+        strategy = Strategy(
+            screening, effort.selection, len(z), second_points, second_starts, at_ends
+        )
     else:
         z = starting_points(problem.box, starts, seed)
         z = usable_starts(problem, seed, z, values(problem, problem.box.z[None]))
@@ -388,9 +393,14 @@ def _tried(search: Search) -> tuple[str, ...]:
             f" up to {REPAIR_STARTS} points, {how}: {least:.3g}"
         )
     elif phase == SECOND_SEARCH:
-        text = "a second search followed, from the best gains"
+        places = []
         if search.strategy.second_points or search.reached_by_one_start:
-            text += " and the best points around them"
+            places.append("the best points near them")
+        if search.strategy.starts_at_ends:
+            places.append("points with one or two of them at an end of their range")
+        text = "a second search followed, around the best gains"
+        if places:
+            text += f", from {' and '.join(places)}"
         lines.append(text)
     return tuple(lines)
 

@@ -92,7 +92,9 @@ class Effort:
     All starts take `selection` steps, those that have not come near a better one take as many
     again, and so once more, the better third of these takes as many again, and so on until the best
     one is left.  Until then a search takes at most 565 evaluations with derivatives with the
-    defaults: five steps each of 32, 32, 32, 11, 4 and 2 starts.
+    defaults: five steps each of 32, 32, 32, 11, 4 and 2 starts.  With more than six starts a second
+    search follows from up to four points at which one or two of the best gains are at an end of
+    their range, chosen from a third as many points.
 
     Args:
       values: number of points that are evaluated without derivatives to find the starts.  With many
@@ -104,10 +106,10 @@ class Effort:
         evaluates every start that is still active.
       selection: number of steps after which starts near better ones end, and from the third time
         on all but the better third.
-      second_starts: number of starts of a second search around the best gains of the first one,
-        chosen from a third as many points; if not given, 12 where only one of more than six starts
-        came within 0.5 % of the best objective.  In problems of many gains the best optimum is
-        often near a good one.
+      second_starts: number of further starts of the second search around the best gains of the
+        first one, chosen from a third as many points; if not given, 12 where only one of more than
+        six starts came within 0.5 % of the best objective.  In problems of many gains the best
+        optimum is often near a good one.
     """
 
     values: int = 1024

@@ -43,6 +43,11 @@ Phases.  A search with a `Strategy` has up to three phases:
    converged, or after REPAIR_STEPS steps.
 3. SECOND_SEARCH, if phase 2 found a feasible point, or if phase 1 found one but did not converge.
    It begins at the incumbent and at the best screened point that is far from all earlier starts.
+   With `Strategy.starts_at_ends` it also begins at the best points that differ from the incumbent
+   in one gain or two, which are at an end of their range, and these also follow a phase 1 that has
+   converged.  The best optimum often has some gains at an end: on a problem of two links, whose
+   best one has four, most starts of some seeds ended in another valley 4.5 % above it, from which
+   the best of such points by the weight 1 led there.
    With `Strategy.second_points` it always follows a feasible point, and begins at the best of so
    many further points instead, which are spread around the incumbent as those of phase 1 around the
    scenario's gains: the best optimum is often near a good one.  Where only one of many starts came
@@ -95,6 +100,7 @@ from iblf_jax.tuning.starts import (
     Screening,
     distinct,
     is_near,
+    points_at_ends,
     ranked,
     spread_points,
 )
@@ -147,6 +153,8 @@ CONFIRMING_SHARE = 1 / 3
 """Smallest share of the starts that come within SAME_OBJECTIVE of the best objective for which the
 search has converged.  Of one tuning of two links, eight of 32 starts ended in a valley 4.5 % above
 the best."""
+STARTS_AT_ENDS = 4
+"""Number of starts of the second search that have one or two gains at an end of their range."""
 STARTS_IF_SINGLE = 12
 """Number of starts of the second search where no other start confirms the best objective."""
 STEP_FACTOR = 4.0
@@ -172,6 +180,9 @@ class Strategy(NamedTuple):
     second_starts: int = 0
     """Number of starts of this phase besides the best gains.  If it is 0, the phase follows only
     where the first one did not converge."""
+    starts_at_ends: int = 0
+    """Number of starts of this phase with one or two gains at an end of their range and all others
+    as the best ones.  If it is not 0, the phase always follows."""
     at_quarter_step: Callable[[np.ndarray], np.ndarray] | None = None
     """The objective at a quarter of the time step at points z, (N, p), as
     `objective_at_quarter_step`.
@@ -475,18 +486,54 @@ class Search:
             is_explored = bool(np.any((distance <= SAME_VALLEY) & ~state.retired))
             is_last = self.strategy.second_starts == 0 and not self.reached_by_one_start
             if is_last and stopped == "converged" and is_explored and self.conditions().hold:
-                return False
+                return self._begin_at_ends()
         points, starts = self.strategy.second_points, self.strategy.second_starts
         has_ended = state.phase == OPTIMISE and stopped != "iterations used up"
         if not points and has_ended and self.reached_by_one_start:
             points = len(self.strategy.screening.points) // 3
             starts = min(STARTS_IF_SINGLE, len(state.finished) - 1)
-        self._begin_phase(SECOND_SEARCH, self._second_starts(points, starts))
+        at_ends = self._starts_at_ends()
+        further = self._second_starts(points, starts)
+        z = np.concatenate([state.incumbent_z[None], at_ends, further])[: len(state.finished)]
+        self._begin_phase(SECOND_SEARCH, z)
         return True
 
+    def _begin_at_ends(self) -> bool:
+        """Begins a second search around an optimum from points at the ends of the ranges; returns
+        whether there are such points.  The start that converged there only takes part in the
+        selections, so that starts that come near it end.
+        """
+        state = self.state
+        s = self._converged_near_incumbent()[0]
+        optimum = state.incumbent_z  # one of the points may become the incumbent
+        key = state.incumbent_key
+        z = self._starts_at_ends()
+        if not len(z):
+            return False
+        self._begin_phase(SECOND_SEARCH, z[: len(state.finished) - 1], converged=s)
+        state.best_z[s] = optimum
+        state.best_key[s] = key
+        return True
+
+    def _starts_at_ends(self) -> np.ndarray:
+        """The best points that differ from the incumbent in one gain or two, which are at an end of
+        their range, (k, p) with k at most `Strategy.starts_at_ends`.
+        """
+        assert self.strategy is not None
+        problem = self.evaluate.problem
+        best = self.state.incumbent_z
+        if not self.strategy.starts_at_ends:
+            return np.empty((0, len(best)))
+        most = len(self.strategy.screening.points) // 3
+        points = points_at_ends(problem.box, best, most, int(problem.options.seed))
+        screening = ranked(points, self.evaluate.values(points))
+        orders = [screening.order(weight) for weight in WEIGHTS]
+        count, refused = self.strategy.starts_at_ends, problem.sampled_too_slowly
+        return distinct(screening, orders, count, problem.box, refused, best[None])
+
     def _second_starts(self, count_of_points: int, count: int) -> np.ndarray:
-        """The incumbent, and the best of so many points around it that differ; without such points,
-        the best screened point that is far from all earlier starts, (k, p).
+        """The best of so many points around the incumbent that differ; without such points, the
+        best screened point that is far from all earlier starts, (k, p).
         """
         assert self.strategy is not None
         problem = self.evaluate.problem
@@ -504,8 +551,7 @@ class Search:
             count = min(2, len(self.state.finished)) - 1
             explored = np.concatenate([best, self.history["z"][0], self.state.best_z])
         refused = problem.sampled_too_slowly
-        further = distinct(screening, orders, count, problem.box, refused, explored)
-        return np.concatenate([self.state.incumbent_z[None], further])
+        return distinct(screening, orders, count, problem.box, refused, explored)
 
     def conditions(self) -> Conditions:
         """The optimality conditions at the incumbent, which is evaluated once more; determined once
@@ -632,13 +678,17 @@ class Search:
         self.history["evaluations"][-1] = np.array(self.state.evaluations)
         return found
 
-    def _begin_phase(self, phase: int, z: np.ndarray) -> None:
+    def _begin_phase(self, phase: int, z: np.ndarray, converged: int | None = None) -> None:
         """Begins a phase with the first k starts at the points z, (k, p), k <= S; the other starts
-        are retired.
+        are retired.  A start that has converged may be excluded: it takes no steps, but is not
+        retired.
         """
         state = self.state
         self.retire(slice(None))
-        for s, start in enumerate(z):
+        if converged is not None:
+            state.retired[converged] = False
+        free = [s for s in range(len(state.finished)) if s != converged]
+        for s, start in zip(free, z, strict=False):
             self.solver.restart(self._space(phase), state.solver, s, start)
             state.finished[s] = False
             state.retired[s] = False

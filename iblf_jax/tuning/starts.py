@@ -118,6 +118,32 @@ def spread_points(box: Box, count: int, seed: int) -> np.ndarray:
     return low + unit * (high - low)
 
 
+def points_at_ends(box: Box, z: np.ndarray, most: int, seed: int) -> np.ndarray:
+    """Points that differ from z, (p,), in one coordinate or two, which are at an end of their
+    range, (N, p); so many of them at most, which are drawn where there are more.
+
+    The range of a coordinate ends UNLIMITED from z where it is infinite.
+    """
+    ends = np.stack(
+        [
+            np.where(np.isfinite(box.low), box.low, z - UNLIMITED),
+            np.where(np.isfinite(box.high), box.high, z + UNLIMITED),
+        ]
+    )
+    size = len(z)
+    moves = list(itertools.product(range(size), range(2)))  # a coordinate and its end
+    pairs = [x for x in itertools.combinations(moves, 2) if x[0][0] != x[1][0]]
+    changes = [(move,) for move in moves] + pairs
+    if len(changes) > most:
+        drawn = np.random.default_rng([seed, 6]).choice(len(changes), most, replace=False)
+        changes = [changes[i] for i in np.sort(drawn)]
+    points = np.tile(z, (len(changes), 1))
+    for point, change in zip(points, changes, strict=True):
+        for i, end in change:
+            point[i] = ends[end, i]
+    return points
+
+
 def distinct(
     screening: Screening,
     orders: Sequence[np.ndarray],

@@ -50,6 +50,8 @@ from iblf_jax.tuning.search import (
 from iblf_jax.tuning.solvers import Constraints, SearchSpace, quadratic
 from iblf_jax.tuning.solvers.sqp import Subproblem, subproblems
 from iblf_jax.tuning.starts import (
+    UNLIMITED,
+    points_at_ends,
     ranked,
 )
 
@@ -951,3 +953,38 @@ def test_a_sliding_mode_that_chatters_at_the_time_step_is_found_at_a_quarter_of_
     assert np.all(full.valid)
     assert fine[0] == pytest.approx(full.objective[0], rel=SAME_OBJECTIVE)
     assert not abs(fine[1] - full.objective[1]) <= SAME_OBJECTIVE * full.objective[1]
+
+
+def test_points_at_ends_differ_in_one_gain_or_two():
+    box = Box(np.zeros(3), np.array([-1.0, -2.0, -np.inf]), np.array([1.0, 2.0, 3.0]))
+    z = np.array([0.5, 0.0, 0.2])
+    points = points_at_ends(box, z, 100, seed=0)
+    assert len(points) == len(np.unique(points, axis=0)) == 6 + 12
+    moved = points != z
+    assert sorted(np.sum(moved, axis=1).tolist()) == 6 * [1] + 12 * [2]
+    ends = np.stack([box.low, box.high])
+    ends[0, 2] = z[2] - UNLIMITED
+    assert np.all(np.any(points == ends[:, None], axis=0)[moved])
+    fewer = points_at_ends(box, z, 5, seed=0)
+    assert len(fewer) == 5 and all(np.any(np.all(points == x, axis=1)) for x in fewer)
+
+
+def test_a_search_that_converged_goes_on_from_the_ends_of_the_ranges():
+    """All starts end in the broad valley; with both gains at their upper ends the deep one is
+    nearer.  The start that converged takes no further steps."""
+    box = Box(np.zeros(2), np.full(2, -1.5), np.full(2, 1.5))
+    begin = np.array([[-0.9, -1.0], [-1.1, -0.9], [-0.5, -0.8]])
+    evaluate = Evaluated(valleys, SearchSpace(box, Constraints.of((1,), (0.0,), 1)), len(begin))
+    screening = ranked(np.tile(begin, (9, 1)), valleys(np.tile(begin, (9, 1))).value)
+    search = Search(evaluate, SQP(), begin, Strategy(screening, 2, len(begin), starts_at_ends=2))
+    begun = []
+
+    def note(search):
+        if search.state.phase == SECOND_SEARCH:
+            begun.append((search.history["z"][-1], search.state.best_key[:, 1].copy()))
+
+    search.run(60, note)
+    z, keys = begun[0]
+    assert np.any(np.all(z == 1.5, axis=1)) and np.min(keys) == pytest.approx(LOW)
+    assert search.state.incumbent_key[1] == pytest.approx(DEEP)
+    assert search.conditions().hold and search.state.valleys[2] == 1

@@ -25,6 +25,8 @@ MAX_ITERATIONS = 60
 """Iterations; about fifteen are needed."""
 PRECISION = 1e-11
 """Of all conditions, relative to the numbers of the programme."""
+DUAL_FACTOR = 10.0
+"""The residual of H x + c + A^T y = 0 may be larger than the others by this factor."""
 
 
 class Programmes(NamedTuple):
@@ -54,7 +56,12 @@ class Solutions(NamedTuple):
 
 
 def solve(programmes: Programmes) -> Solutions:
-    """The solution of each programme."""
+    """The solution of each programme.
+
+    Rounding may prevent the factorisation of a matrix before all conditions hold to PRECISION, and
+    the last iterates may be worse than earlier ones.  The result is therefore the iterate with the
+    smallest residual of the conditions.
+    """
     H, c, A, b = programmes
     size = np.maximum(np.abs(c).max(axis=1), np.abs(H).max(axis=(1, 2)))
     scale = np.maximum(size, 1e-300)
@@ -63,28 +70,30 @@ def solve(programmes: Programmes) -> Solutions:
     c = c / scale[:, None]
     found_x = np.zeros_like(c)
     found_y = np.zeros_like(b)
+    least = np.full(len(c), np.inf)
     unsolved = np.arange(len(c))
     x = found_x.copy()
     s = np.maximum(b, 1.0)
     y = np.ones_like(b)
-    limit = PRECISION * (1.0 + np.max(np.abs(b), axis=1))
+    size = 1.0 + np.max(np.abs(b), axis=1)
     for _ in range(MAX_ITERATIONS):
         At = np.swapaxes(A, 1, 2)
         dual = _times(H, x) + c + _times(At, y)
         primal = _times(A, x) + s - b
         gap = np.maximum(np.sum(s * y, axis=1) / b.shape[1], 1e-300)
-        ended = (gap < PRECISION) & (np.max(np.abs(dual), axis=1) < 10 * PRECISION)
-        ended &= np.max(np.abs(primal), axis=1) < limit
+        residual = np.maximum(gap, np.max(np.abs(dual), axis=1) / DUAL_FACTOR)
+        residual = np.maximum(residual, np.max(np.abs(primal), axis=1) / size)
+        better = residual < least[unsolved]
+        found_x[unsolved[better]] = x[better]
+        found_y[unsolved[better]] = y[better]
+        least[unsolved[better]] = residual[better]
         factor = _cholesky(H + (At * (y / s)[:, None, :]) @ A)
-        ended |= ~np.all(np.isfinite(factor), axis=(1, 2))
+        ended = (residual < PRECISION) | ~np.all(np.isfinite(factor), axis=(1, 2))
+        if np.all(ended):
+            break
         if np.any(ended):
-            found_x[unsolved[ended]] = x[ended]
-            found_y[unsolved[ended]] = y[ended]
-            if np.all(ended):
-                unsolved = unsolved[:0]
-                break
-            everything = (unsolved, H, c, A, b, limit, x, s, y, At, dual, primal, gap, factor)
-            unsolved, H, c, A, b, limit, x, s, y, At, dual, primal, gap, factor = (
+            everything = (unsolved, H, c, A, b, size, x, s, y, At, dual, primal, gap, factor)
+            unsolved, H, c, A, b, size, x, s, y, At, dual, primal, gap, factor = (
                 array[~ended] for array in everything
             )
         # The inverse of a triangular matrix is as precise as a solution with it.
@@ -104,8 +113,6 @@ def solve(programmes: Programmes) -> Solutions:
         x = x + length * dx
         s = s + length * ds
         y = y + length * dy
-    found_x[unsolved] = x[: len(unsolved)]
-    found_y[unsolved] = y[: len(unsolved)]
     return Solutions(found_x, scale[:, None] * found_y)
 
 
