@@ -13,8 +13,11 @@ import zipfile
 
 import jax
 import jax.numpy as jnp
+import members
 import numpy as np
 import pytest
+from made_up_runs import made_up
+from PIL import Image
 from proof_cases import pendulum
 
 import iblf_jax as ij
@@ -106,6 +109,17 @@ def test_mujoco_ends_where_the_run_does():
     here = ij.simulate(sampled, duration=0.05, dt=PERIOD / 5)
     for name in ("q", "dq", "tau"):
         np.testing.assert_allclose(getattr(there, name)[-1], getattr(here, name)[-1], rtol=1e-6)
+
+
+def test_an_arm_in_space_moves_in_an_animation(tmp_path):
+    run = made_up(members.ROBOTS["arm"], duration=0.05)
+    path = ij.plotting.animate(run, tmp_path / "arm.gif")
+    with Image.open(path) as film:
+        frames = [np.asarray(film.convert("L"), int)]
+        film.seek(film.n_frames - 1)
+        frames.append(np.asarray(film.convert("L"), int))
+    assert film.n_frames > 1 and np.any(frames[0] != frames[1])
+    assert np.ptp(frames[0]) > 100
 
 
 def test_an_fmu_has_its_inputs_outputs_and_gains(tmp_path):
