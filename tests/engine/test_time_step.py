@@ -132,7 +132,8 @@ QUICK = (
     *("barrier_backstepping_compensated", "barrier_backstepping_matrices", "dynamic_surface"),
     *("adaptive_network", "surface_barrier", "terminal_sliding_mode", "pd_gravity"),
     *("reference_governor", "saturated_auxiliary", "event_compensated"),
-    *("electric_drive", "flexible_joint", "strict_feedback"),
+    *("adaptive_rbf_fuzzy", "computed_torque", "safety_filter", "saturated", "saturated_smooth"),
+    *("electric_drive", "flexible_joint", "strict_feedback", "strict_feedback_diagonal"),
 )
 """Loops of the default tests."""
 
