@@ -47,6 +47,20 @@ def test_the_energy_of_the_compensated_law_of_robots_decays_as_with_exact_deriva
         np.testing.assert_allclose(dV, -decay, rtol=1e-9)
 
 
+@pytest.mark.slow
+def test_certificates_claim_nothing_about_other_forms_and_matrices():
+    scenario = ij.presets.motor_driven_pendulum()
+    changed = dataclasses.replace(scenario.controller, filter=0.02, filter_form="compensated")
+    text = str(ij.certify(ij.with_parts(scenario, controller=changed), duration=0.01, dt=1e-3))
+    assert 'the law has filters of the form "compensated"' in text
+    scenario = ij.presets.vessel()
+    law = of_levels(gain_matrices=np.stack([np.eye(3), K2]))
+    changed = ij.with_parts(scenario, controller=law, bounds=(scenario.bounds[0], None))
+    cert = ij.certify(changed, duration=0.01, dt=1e-3)
+    assert "the law has matrices as gains or weights" in str(cert)
+    assert cert.headline != "holds"
+
+
 # --- matrices -------------------------------------------------------------------------------------
 
 K1 = np.array([[0.5, 0.1, 0.0], [-0.1, 0.4, 0.05], [0.0, 0.05, 0.6]])
