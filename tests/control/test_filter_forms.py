@@ -48,15 +48,11 @@ def test_the_energy_of_the_compensated_law_of_robots_decays_as_with_exact_deriva
 
 
 @pytest.mark.slow
-def test_the_certificate_claims_nothing_about_other_forms():
+def test_certificates_claim_nothing_about_other_forms_and_matrices():
     scenario = ij.presets.motor_driven_pendulum()
     changed = dataclasses.replace(scenario.controller, filter=0.02, filter_form="compensated")
     text = str(ij.certify(ij.with_parts(scenario, controller=changed), duration=0.01, dt=1e-3))
     assert 'the law has filters of the form "compensated"' in text
-
-
-@pytest.mark.slow
-def test_the_certificate_of_a_vessel_claims_nothing_about_matrices():
     scenario = ij.presets.vessel()
     law = of_levels(gain_matrices=np.stack([np.eye(3), K2]))
     changed = ij.with_parts(scenario, controller=law, bounds=(scenario.bounds[0], None))

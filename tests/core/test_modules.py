@@ -198,6 +198,17 @@ def test_stores_describe_modules_without_addresses(scenario):
         assert "0x" not in text and "leaky_relu" in text and "0.3" in text
 
 
+def test_tables_show_a_large_module_as_one_row(paper):
+    deep = eqx.nn.MLP(4, 2, 16, 7, key=jax.random.key(0))
+    table = ij.parameters(ij.with_parts(paper, disturbance=Learned(deep)))
+    rows = [row for row in repr(table).splitlines() if "disturbance" in row]
+    numbers = sum(x.size for x in jax.tree.leaves(eqx.filter(deep, eqx.is_array)))
+    assert len(rows) == 1 and f"16 arrays, {numbers} numbers" in rows[0]
+    assert sum("disturbance" in p.path for p in table) == 16
+    small = repr(ij.parameters(Learned(mlp(width=16))))
+    assert "64 numbers from" in small
+
+
 class Unregistered:
     """A network that JAX does not know."""
 

@@ -52,7 +52,7 @@ FURTHER_FORMS = ("barrier_backstepping_matrices", "dynamic_surface_compensated")
 """Members whose parameters or state have another form than those of the first of their class."""
 LAWS = [x for x in members.LAWS if x not in members.further(members.LAWS)]
 OBSERVERS = [x for x in members.OBSERVERS if x not in members.further(members.OBSERVERS)]
-CASES = [*zip((*LAWS, *FURTHER_FORMS), itertools.cycle(OBSERVERS), strict=False)]
+CASES = [*zip((*LAWS, *FURTHER_FORMS), itertools.cycle(OBSERVERS[::-1]), strict=False)]
 """Pairs of every class of law, the further forms and every class of observer; that every member
 becomes a program is tested in `kernels`."""
 

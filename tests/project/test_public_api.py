@@ -257,11 +257,8 @@ def test_an_unknown_keyword_is_refused_with_the_known_ones(call, name, known):
         call(**{name: 1})
 
 
-def test_version_is_the_packages():
+def test_the_version_is_the_packages_and_an_unknown_name_is_an_attribute_error():
     assert ij.__version__ == importlib.metadata.version("iblf_jax")
-
-
-def test_an_unknown_name_is_an_attribute_error():
     with pytest.raises(AttributeError, match="nothing_of_the_kind"):
         _ = ij.nothing_of_the_kind
 

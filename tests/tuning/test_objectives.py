@@ -343,12 +343,6 @@ def test_joints_that_the_robot_does_not_have(goal, message, paper):
         ij.tune(paper, ["controller.k1"], goal(ij.objectives), **TUNING)
 
 
-def test_the_name_of_a_requirement_calls_a_slice_joints():
-    below = ij.objectives.error_below
-    assert "of joints 0:2 <" in below(0.1, joints=slice(0, 2)).name
-    assert "of joint 1 <" in below(0.1, joints=1).name
-
-
 def test_a_tuning_file_selects_joints_by_name_index_and_slice(tmp_path):
     def quantity(words):
         return loaded(tmp_path, words, kind="tracking").quantities[-1]

@@ -58,15 +58,12 @@ def test_balance_is_gravity_and_leaves_the_state(law, package):
     assert law.step(0.0, q, dq)[0] == first
 
 
-def test_a_state_that_is_not_finite_is_reported(law):
+def test_a_state_that_is_not_finite_or_outside_of_the_bounds_is_reported(law):
     assert law.init([0.5, 0.5], [0.0, 0.0])
     assert law.step(0.0, [float("nan"), 0.5], [0.0, 0.0])[1] == NOT_FINITE
     assert law.step(0.0, [0.5, 0.5], [0.0, float("inf")])[1] == NOT_FINITE
     assert law.init([float("inf"), 0.5], [0.0, 0.0]) is False
     assert law.balance([float("nan"), 0.5]) == [0.0, 0.0]
-
-
-def test_a_position_outside_of_the_bounds_is_reported(law):
     lower, _ = law.bounds(0.0)
     q = [lower[0] - 0.1, 0.5]
     law.init(q, [0.0, 0.0])
