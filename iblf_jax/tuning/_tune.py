@@ -224,7 +224,10 @@ def search_of(
         z = _chosen_starts(problem, screening, starts)
         second_starts = min(effort.second_starts, starts)
         second_points = count // 3 if second_starts else 0
-        at_ends = STARTS_AT_ENDS if count and len(z) > FEW_STARTS else 0
+        at_ends = 0
+        # Other solvers are for many numbers, of which there are too many pairs.
+        if isinstance(solver, SQP) and count and len(z) > FEW_STARTS:
+            at_ends = STARTS_AT_ENDS
         strategy = Strategy(
             screening, effort.selection, len(z), second_points, second_starts, at_ends
         )

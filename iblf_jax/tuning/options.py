@@ -92,9 +92,9 @@ class Effort:
     All starts take `selection` steps, those that have not come near a better one take as many
     again, and so once more, the better third of these takes as many again, and so on until the best
     one is left.  Until then a search takes at most 565 evaluations with derivatives with the
-    defaults: five steps each of 32, 32, 32, 11, 4 and 2 starts.  With more than six starts a second
-    search follows from up to four points at which one or two of the best gains are at an end of
-    their range, chosen from a third as many points.
+    defaults: five steps each of 32, 32, 32, 11, 4 and 2 starts.  With more than six starts of SQP a
+    second search follows from up to four points at which one or two of the best gains are at an end
+    of their range, chosen from a third as many points.
 
     Args:
       values: number of points that are evaluated without derivatives to find the starts.  With many
