@@ -10,6 +10,7 @@ from __future__ import annotations
 import functools
 import re
 import zipfile
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -88,6 +89,13 @@ def test_the_worst_mass_is_no_better_than_a_random_one():
     assert worst.margin == pytest.approx(float(np.min(run.metrics["margin"])), rel=1e-9)
 
 
+def test_a_run_of_a_study_has_the_mode_of_its_replay():
+    study = ij.monte_carlo(LOOP, MASS, runs=3, seed=1, progress=False, **RUN)
+    modes = [float(study.replay(i).fastest_mode) for i in range(3)]
+    np.testing.assert_allclose(study.fastest_mode, modes, rtol=1e-9)
+    assert np.ptp(modes) > 0.0
+
+
 def test_a_motion_that_excites_a_mass_stays_inside_the_bounds():
     motion = ij.excitation(LOOP, ["plant.mass"], duration=1.0, waypoints=4, iterations=1)
     q = jax.vmap(motion.position)(np.linspace(0.0, 1.0, 21))
@@ -132,18 +140,27 @@ def test_an_fmu_has_its_inputs_outputs_and_gains(tmp_path):
         assert text.count(f'causality="{causality}"') >= least
 
 
-def drift(t, x):
-    return jnp.stack([0.0 * x[0], -0.3 * x[1] - 2.0 * jnp.sin(x[0])])
+@ij.component
+class Lever(ij.plants.Plant):
+    """x1' = x2,   J x2' = u - b x2 - 2 sin x1."""
 
+    J: Any = ij.leaf("1", sign="positive")
+    b: Any = ij.leaf("1", sign="nonnegative")
+    n: ClassVar[int] = 1
+    order: ClassVar[int] = 2
 
-def gain(t, x):
-    return jnp.ones_like(x)
+    def drift(self, t, x):
+        return jnp.stack([0.0 * x[0], -(self.b * x[1] + 2.0 * jnp.sin(x[0])) / self.J])
+
+    def gain(self, t, x):
+        return jnp.stack([jnp.ones_like(x[0]), jnp.ones_like(x[0]) / self.J])
 
 
 def test_few_boxes_decide_nothing():
     """Of a plant in strict-feedback form, whose bound is short."""
     scenario = ij.Scenario(
-        plant=ij.plants.StrictFeedback(drift=drift, gain=gain, n=1, order=2),
+        plant=Lever(J=1.2, b=0.3),
+        model=Lever(J=1.2, b=0.25),
         reference=ij.references.Sinusoid(offset=0.1, amplitude=0.4, frequency=1.0),
         bounds=tuple(
             ij.Bounds(lower=ij.bounds.Constant(-x), upper=ij.bounds.Constant(x)) for x in (0.8, 2.5)
@@ -154,8 +171,9 @@ def test_few_boxes_decide_nothing():
         observer=ij.observers.LevelObserver(gain=(0.0, 40.0)),
         initial=ij.Initial(x=[[0.1], [0.0]]),
     )
+    parameters = {"plant.J": ij.factor(ij.interval(0.99, 1.01))}
     proof = ij.prove(
-        scenario, level=0.3, parameters={}, weight=8.0, max_boxes=50, runs=1, progress=False
+        scenario, level=0.3, parameters=parameters, weight=8.0, max_boxes=50, runs=1, progress=False
     )
     assert proof.verdict is Verdict.UNDECIDED
     assert 0 < proof.boxes < 60
