@@ -382,17 +382,6 @@ def test_a_start_outside_of_the_bounds_is_refused_unless_it_is_allowed():
     assert bench.period(q=(0.0, 1.5, 0.0)).mode is Mode.RUNNING, "only the start is refused"
 
 
-def test_stop_while_waiting_cancels_the_automatic_start():
-    bench = Bench(start_automatically=True)
-    assert bench.command() is None
-    assert "automatic start is cancelled" in bench.supervisor.stop()[1]
-    for _ in range(3):
-        assert bench.period().mode is Mode.STOPPED
-    assert bench.law.inits == []
-    bench.start()
-    assert bench.period().mode is Mode.RUNNING
-
-
 def test_an_automatic_start_needs_no_service_and_does_not_leave_a_fault():
     """It is cancelled by a stop while the node waits."""
     bench = Bench(start_automatically=True)
