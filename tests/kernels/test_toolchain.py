@@ -374,7 +374,15 @@ def wait_for_compiler(calls):
 def has_ended(pid: Path) -> bool:
     """Whether the process whose number is in a file ends."""
     state = Path(f"/proc/{pid.read_text().strip()}/stat")
-    return until(lambda: not state.exists() or "Z" in state.read_text().rpartition(")")[2])
+
+    def ended():
+        try:
+            text = state.read_text()
+        except (FileNotFoundError, ProcessLookupError):
+            return True
+        return "Z" in text.rpartition(")")[2]
+
+    return until(ended)
 
 
 @pytest.fixture
@@ -533,6 +541,7 @@ def without_home(_, patch):
 UNUSABLE = {
     "a file in its place": lambda base, _: (base.mkdir(), (base / "iblf_jax").write_text("")),
     "a link in its place": lambda base, _: (base.mkdir(), (base / "iblf_jax").symlink_to(base)),
+    "under a file": lambda base, _: base.write_text(""),
     "in /proc": lambda _, patch: patch.setenv("XDG_CACHE_HOME", "/proc/self/nothing"),
     "no home": without_home,
     "a name too long": lambda base, patch: patch.setenv("XDG_CACHE_HOME", f"{base}/{'x' * 300}"),
@@ -619,6 +628,15 @@ def test_the_flags_follow_the_kind_of_compiler(text):
     assert ("-fslp-vectorize" in flags) == (kind == "clang")
 
 
+@pytest.mark.parametrize(
+    ("machine", "kind", "flag"),
+    [("arm64", "clang", "-mcpu"), ("aarch64", "gcc", "-march"), ("x86_64", "clang", "-march")],
+)
+def test_the_flag_of_the_processor(monkeypatch, machine, kind, flag):
+    monkeypatch.setattr(toolchain.platform, "machine", lambda: machine)
+    assert f"{flag}=native" in toolchain.flags_of(kind)
+
+
 @needs_compiler
 def test_a_compiler_is_identified_once(cache, tmp_path, monkeypatch):
     """Not at the import; again where another program has taken its place."""
@@ -659,15 +677,19 @@ def test_ziglang_where_the_system_has_no_compiler(cache, tmp_path, monkeypatch):
 
 COMPILERS = {
     "says no version": (compiles('"$REAL" "$@"', ":"), "prints nothing"),
+    "says empty lines": (compiles('"$REAL" "$@"', "echo; echo"), "prints nothing"),
     "says bytes": (compiles('"$REAL" "$@"', r"printf '\377\376\200'"), "no text"),
     "fails with bytes": (compiles(r"printf 'error: \377\376\n' >&2; exit 1"), "failed: error"),
     "is killed": (compiles("kill -9 $$"), "signal 9"),
     "makes nothing": (compiles("exit 0"), "left no file"),
+    "makes an empty file": (compiles(': > "$out"'), "left no file"),
     "makes a pipe": (compiles('mkfifo "$out"'), "left no file"),
+    "makes text": (compiles('echo hello > "$out"'), "does not load"),
     "lacks the symbol": (
         compiles('echo "int x;" | "$REAL" -x c++ -shared -fPIC - -o "$out"'),
         "undefined symbol",
     ),
+    "says very much": (compiles("yes error >&2; exit 1"), "failed: error"),
     "hangs": (compiles("sleep 100"), "longer than 0.5 s"),
     "hangs in a child": (compiles("sleep 100 | cat"), "longer than 0.5 s"),
     "hangs at its version": (compiles("exit 0", "sleep 100"), "longer than 0.5 s"),
