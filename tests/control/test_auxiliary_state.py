@@ -22,6 +22,11 @@ from iblf_jax.control.controllers.saturated import AuxiliaryState
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state
 from iblf_jax.simulation.scenario import canonical
 
+PAPER = ij.presets.zhang_yan_2024(variant="corrected")
+LIMIT = np.array([9.0, 3.0])
+K = 6.0
+SATURATED = controllers.Saturated(PAPER.controller, limit=LIMIT, auxiliary=K)
+LIMITED = ij.with_parts(PAPER, controller=SATURATED)
 LAWS = {
     "two_barriers": two_barriers(),
     "dynamic_surface": controllers.DynamicSurface(k1=2.0, K2=20.0, filter=0.02),
@@ -29,12 +34,6 @@ LAWS = {
     "computed_torque": controllers.ComputedTorque(Kp=25.0, Kd=10.0),
 }
 """Laws besides those of the independent programs; the last one does not take the shift."""
-
-PAPER = ij.presets.zhang_yan_2024(variant="corrected")
-LIMIT = np.array([9.0, 3.0])
-K = 6.0
-SATURATED = controllers.Saturated(PAPER.controller, limit=LIMIT, auxiliary=K)
-LIMITED = ij.with_parts(PAPER, controller=SATURATED)
 
 
 def with_numbers(scenario, limit, k, **gains):

@@ -31,10 +31,14 @@ DIFFERENTIATED_BY_CI = {"law", "plant", "observer"}
 """Families whose derivatives are not in the default run: they take about half of a check."""
 
 
-def cases(family: str):
+def of_default_run(family: str) -> list[str]:
     instances = FAMILIES[family][0]
-    for name in instances:
-        is_later = name in further(instances) or name in LONG or family in DIFFERENTIATED_BY_CI
+    return [name for name in instances if name not in further(instances) | LONG]
+
+
+def cases(family: str):
+    for name in FAMILIES[family][0]:
+        is_later = name not in of_default_run(family) or family in DIFFERENTIATED_BY_CI
         mark = pytest.mark.release if name in BEFORE_A_RELEASE else pytest.mark.slow
         yield pytest.param(family, name, marks=[mark] if is_later else [])
 
@@ -49,12 +53,7 @@ def test_member_fits_its_contract(family, name):
 
 @pytest.mark.parametrize(
     ("family", "name"),
-    [
-        (family, name)
-        for family in sorted(DIFFERENTIATED_BY_CI)
-        for name in FAMILIES[family][0]
-        if name not in further(FAMILIES[family][0]) | LONG
-    ],
+    [(family, name) for family in sorted(DIFFERENTIATED_BY_CI) for name in of_default_run(family)],
 )
 def test_member_fits_its_contract_apart_from_derivatives(family, name, monkeypatch):
     monkeypatch.setattr(_contract, "_derivatives", lambda *_: None)

@@ -148,6 +148,9 @@ def test_access_by_name_and_by_attribute(short_run):
         _ = metrics.nothing
 
 
+# --- integrals are of second order -----------------------------------------------
+
+
 @pytest.mark.slow
 def test_the_effort_above_gravity_by_hand(rng):
     some = samples(rng)
@@ -155,9 +158,6 @@ def test_the_effort_above_gravity_by_hand(rng):
     expected = np.sqrt(np.sum(some.dt * square) / np.sum(some.dt))
     found = folded((ij.metrics.AboveGravity(),), some)["effort_above_gravity"]
     np.testing.assert_allclose(found, expected, rtol=1e-12)
-
-
-# --- integrals are of second order -----------------------------------------------
 
 
 SLOW = ij.with_parameters(

@@ -80,6 +80,9 @@ def test_a_vessel_refuses_added_masses_of_the_wrong_sign_and_what_is_no_restorin
         dataclasses.replace(SHIP, restoring=3.0)
 
 
+# ------------------------------------------------------------ driven pendulum
+
+
 @pytest.mark.slow
 def test_the_driven_pendulum_is_an_electric_drive_on_a_pendulum(rng):
     """With M = L/Kt, H = R/Kt and the motor's torque Kt i as the third level."""
@@ -98,9 +101,6 @@ def test_the_driven_pendulum_is_an_electric_drive_on_a_pendulum(rng):
     of_pendulum = plants.flow(pendulum, 0.0, jnp.asarray(shifted), u)
     np.testing.assert_allclose(of_pendulum[:2], of_drive[:2], rtol=1e-12)
     np.testing.assert_allclose(of_pendulum[2], 0.8 * of_drive[2], rtol=1e-12)
-
-
-# ------------------------------------------------------------ driven pendulum
 
 
 # ------------------------------------------------------------ a user's class
