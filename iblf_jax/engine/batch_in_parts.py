@@ -64,11 +64,12 @@ def run_batch_in_parts(
     def run(batch: CompiledBatch) -> Outcome:
         if not batch.execution.backends:
             return _in_one_program(arguments, batch=batch)
-        assessed = batch._replace(request=request._replace(assessed=True))
+        # A part has what it does not depend on at one value, so that all requests share it.
         of_start = batch._replace(request=request._replace(steps=0, assessed=True))
+        of_steps = batch._replace(request=request._replace(assessed=True))
         of_end = batch._replace(request=request._replace(steps=0))
         carry, at_start = _initialize(arguments, batch=of_start)
-        carry = _all_steps(arguments, carry, batch=assessed)
+        carry = _all_steps(arguments, carry, batch=of_steps)
         return _finalize(arguments, carry, at_start, batch=of_end)
 
     return compiled.first_that_works(run)

@@ -632,18 +632,17 @@ def _torque_widths(scenario: Scenario, growth: ErrorGrowth) -> tuple[jax.Array |
     for one that is not rounded.
     """
     sampling = checks.given(scenario.sampling)
-    width = jnp.zeros((scenario.n,), growth.largest.dtype)
     deviation, step = scenario.actuator.deviation, scenario.actuator.resolution
-    is_smooth = deviation is None and scenario.actuator.smooth is scenario.actuator
-    if is_smooth and step is None and sampling.trigger is None:
-        return None, None
+    terms: list[Any] = []
     if deviation is not None:
-        width = width + deviation
+        terms.append(deviation)
     elif scenario.actuator.smooth is not scenario.actuator:
-        width = width + jnp.inf
+        terms.append(jnp.inf)
     if step is not None:
-        width = width - step
+        terms.append(-step)
     if sampling.trigger is not None:
         trigger = sampling.trigger
-        width = width + 2.0 * (trigger.relative * growth.peak + trigger.absolute)
-    return width, step
+        terms.append(2.0 * (trigger.relative * growth.peak + trigger.absolute))
+    if not terms:
+        return None, step
+    return sum(terms, jnp.zeros((scenario.n,), growth.largest.dtype)), step

@@ -247,7 +247,7 @@ def forward_derivatives(problem: TuningProblem, candidates: Candidate) -> Deriva
         _jacobians(problem, candidates),
         _fold(problem),
         problem.dt,
-        problem.request._replace(assessed=False),
+        problem.request,
         uniform=[path for path in tied if not _overlaps(problem, path, perturbed)],
     )
     by_start = _by_start((found.outcome, found.tangents, found.products), candidates)
@@ -292,7 +292,7 @@ def reverse_derivatives(problem: TuningProblem, candidates: Candidate) -> Deriva
         ["tuning_smooth"],
         _fold(problem),
         problem.dt,
-        problem.request._replace(assessed=False),
+        problem.request,
     )
     numbers = outcome.metrics["tuning_smooth"], outcome.metrics["tuning_exact"], outcome.status
     smooth, exact, status = _by_start(numbers, candidates)

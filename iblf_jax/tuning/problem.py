@@ -92,7 +92,8 @@ class TuningProblem:
     targets: tuple[Target, ...]
     """The perturbed leaves."""
     request: RunRequest
-    """What the engine runs: number of steps, integrator, executor."""
+    """What the engine runs: number of steps, integrator, executor; without the assessment of the
+    runs, which a search does not read."""
     allowed: tuple[float, ...]
     """Share of the runs that may violate each requirement."""
     piece_counts: tuple[int, ...]
@@ -150,7 +151,7 @@ class TuningProblem:
             ),
             blocks=blocks,
             targets=targets,
-            request=run.request(scenario),
+            request=run.request(scenario)._replace(assessed=False),
             allowed=tuple(float(r.allowed) for r in goal.requirements),
             piece_counts=piece_counts(scaled, scenario, run.duration),
             on_front=on_front,

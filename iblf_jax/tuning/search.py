@@ -526,10 +526,7 @@ class Search:
             return np.empty((0, len(best)))
         most = len(self.strategy.screening.points) // 3
         points = points_at_ends(problem.box, best, most, int(problem.options.seed))
-        screening = ranked(points, self.evaluate.values(points))
-        orders = [screening.order(weight) for weight in WEIGHTS]
-        count, refused = self.strategy.starts_at_ends, problem.sampled_too_slowly
-        return distinct(screening, orders, count, problem.box, refused, best[None])
+        return self._best_of(points, self.strategy.starts_at_ends)
 
     def _second_starts(self, count_of_points: int, count: int) -> np.ndarray:
         """The best of so many points around the incumbent that differ; without such points, the
@@ -541,15 +538,21 @@ class Search:
         if count_of_points:
             box = dataclasses.replace(problem.box, z=best[0])
             seed = int(problem.options.seed) + SECOND_SEED_OFFSET
-            points = spread_points(box, count_of_points, seed)
-            screening = ranked(points, self.evaluate.values(points))
-            orders = [screening.order(weight) for weight in WEIGHTS]
-            explored = best
-        else:
-            screening = self.strategy.screening
-            orders = [screening.order()]
-            count = min(2, len(self.state.finished)) - 1
-            explored = np.concatenate([best, self.history["z"][0], self.state.best_z])
+            return self._best_of(spread_points(box, count_of_points, seed), count)
+        screening = self.strategy.screening
+        count = min(2, len(self.state.finished)) - 1
+        explored = np.concatenate([best, self.history["z"][0], self.state.best_z])
+        refused = problem.sampled_too_slowly
+        return distinct(screening, [screening.order()], count, problem.box, refused, explored)
+
+    def _best_of(self, points: np.ndarray, count: int) -> np.ndarray:
+        """The best of some points, (N, p), by each of the rankings in turn, that differ from one
+        another and from the incumbent, (k, p) with k at most `count`.
+        """
+        problem = self.evaluate.problem
+        explored = self.state.incumbent_z[None]  # one of the points may become the incumbent
+        screening = ranked(points, self.evaluate.values(points))
+        orders = [screening.order(weight) for weight in WEIGHTS]
         refused = problem.sampled_too_slowly
         return distinct(screening, orders, count, problem.box, refused, explored)
 

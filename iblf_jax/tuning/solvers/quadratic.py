@@ -75,14 +75,14 @@ def solve(programmes: Programmes) -> Solutions:
     x = found_x.copy()
     s = np.maximum(b, 1.0)
     y = np.ones_like(b)
-    size = 1.0 + np.max(np.abs(b), axis=1)
+    extent = 1.0 + np.max(np.abs(b), axis=1)
     for _ in range(MAX_ITERATIONS):
         At = np.swapaxes(A, 1, 2)
         dual = _times(H, x) + c + _times(At, y)
         primal = _times(A, x) + s - b
         gap = np.maximum(np.sum(s * y, axis=1) / b.shape[1], 1e-300)
         residual = np.maximum(gap, np.max(np.abs(dual), axis=1) / DUAL_FACTOR)
-        residual = np.maximum(residual, np.max(np.abs(primal), axis=1) / size)
+        residual = np.maximum(residual, np.max(np.abs(primal), axis=1) / extent)
         better = residual < least[unsolved]
         found_x[unsolved[better]] = x[better]
         found_y[unsolved[better]] = y[better]
@@ -92,8 +92,8 @@ def solve(programmes: Programmes) -> Solutions:
         if np.all(ended):
             break
         if np.any(ended):
-            everything = (unsolved, H, c, A, b, size, x, s, y, At, dual, primal, gap, factor)
-            unsolved, H, c, A, b, size, x, s, y, At, dual, primal, gap, factor = (
+            everything = (unsolved, H, c, A, b, extent, x, s, y, At, dual, primal, gap, factor)
+            unsolved, H, c, A, b, extent, x, s, y, At, dual, primal, gap, factor = (
                 array[~ended] for array in everything
             )
         # The inverse of a triangular matrix is as precise as a solution with it.
