@@ -302,13 +302,13 @@ def rows_of(scenario, dtype: str, loop: str, method: str) -> list[Row]:
             Row("native", on("native"), 2e6, batches=(1, 64, 4096)),
         ]
     rows = [
-        Row("vmap", on("vmap"), 2e6, batches=(1, 64, 4096)),
+        Row("vmap", on("vmap"), 4e5, batches=(1, 64, 4096)),
         Row("native", on("native"), 1e8),
         Row("native, one thread", on("native"), 1e8, threads=1, batches=LARGE[1:]),
     ]
     if loop != "paper":
         return rows
-    first = [Row("textbook", lambda v, dt, steps: textbook(v, dt, steps=steps), 1e6, most=16_384)]
+    first = [Row("textbook", lambda v, dt, steps: textbook(v, dt, steps=steps), 4e5, most=16_384)]
     if importlib.util.find_spec("diffrax"):
         first.append(
             Row(

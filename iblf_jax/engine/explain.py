@@ -24,7 +24,7 @@ from iblf_jax.engine.registry import EXECUTORS, Executor, default_backend
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.structural_constants import constants_of
 from iblf_jax.engine.time_step import TimeStep
-from iblf_jax.kernels import OPERATIONS, PER_RUN, SHARED, TIME, Program, written_out
+from iblf_jax.kernels import OPERATIONS, PER_RUN, SHARED, TIME, Program, vector_bytes, written_out
 from iblf_jax.simulation.metrics import as_folds
 from iblf_jax.simulation.noise import NOISE_NAME, check_method, has_noise
 from iblf_jax.simulation.paths import get
@@ -52,7 +52,7 @@ class Explanation(Result):
     """Vector instructions for a step of a register full of runs, a product and the sum that it goes
     into counted as one."""
     width: int
-    """Runs in a register of 64 bytes."""
+    """Runs in a register of this machine's processor."""
     limit: float
     """Estimated limit of this machine's processor [steps/s]: two vector instructions a cycle on
     every core."""
@@ -120,7 +120,7 @@ def explain(
         constants=constants_of(scenario),
     )
     program = written_out(program_of(TimeStep(method), one, carry_shapes(one, method)).program)
-    width = 64 // np.dtype(dtype).itemsize
+    width = vector_bytes() // np.dtype(dtype).itemsize
     slots = instructions(program, width)
     counts = {NAMES[c]: counter for c, counter in program.counts().items()}
     name, reason = default_backend()

@@ -81,6 +81,7 @@ from iblf_jax.kernels.enclosure import pointer as pointer
 from iblf_jax.kernels.folder import cpuinfo as cpuinfo
 from iblf_jax.kernels.folder import directory as directory
 from iblf_jax.kernels.folder import processor as processor
+from iblf_jax.kernels.folder import vector_bytes as vector_bytes
 from iblf_jax.kernels.interval_primitives import hull as hull
 from iblf_jax.kernels.interval_primitives import lower as lower
 from iblf_jax.kernels.interval_primitives import meet as meet

@@ -46,6 +46,14 @@ def processor() -> str:
     )
 
 
+def vector_bytes() -> int:
+    """Bytes of the registers that kernels use on this processor, as `c/vector.h` chooses them."""
+    flags = {word for line in cpuinfo() if line.startswith("flags") for word in line.split()}
+    if "avx512f" in flags:
+        return 64
+    return 32 if "avx" in flags else 16
+
+
 def cpuinfo() -> list[str]:
     """Lines of /proc/cpuinfo; empty where there is none."""
     try:

@@ -15,7 +15,7 @@ import scipy.special
 from test_cpu import needs_compiler
 
 from iblf_jax.engine import native
-from iblf_jax.kernels import emit_c, toolchain
+from iblf_jax.kernels import emit_c, toolchain, vector_bytes
 from iblf_jax.kernels.identities import fold
 from iblf_jax.kernels.operations import OPERATIONS
 from iblf_jax.kernels.packed import Packed
@@ -58,6 +58,7 @@ def kernel(dtype, flags=()):
         f" long n) {{ for (long i = 0; i < n; i += W) store(y + i, f_{name}(load(x + i))); }}\n"
         for name in FUNCTIONS
     )
+    entries += 'extern "C" __attribute__((visibility("default"))) int width() { return W; }\n'
     source = (
         f"#define DOUBLE {int(dtype == np.float64)}\n"
         + emit_c.header("vector.h")
@@ -95,6 +96,7 @@ def exactly(f, x):
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_native_functions(dtype):
     library, edges = kernel(dtype), np.asarray(EDGES, np.float64).astype(dtype)
+    assert library.width() == vector_bytes() // np.dtype(dtype).itemsize
     rounding = {"rtol": 4 * np.finfo(dtype).eps, "atol": np.finfo(dtype).tiny}
     for name, (f, points, limit) in FUNCTIONS.items():
         x = points.astype(dtype)
