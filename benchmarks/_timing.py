@@ -171,12 +171,21 @@ def report(
             "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip()
         )
     if json_path:
-        table = [dict(zip(columns, row, strict=True)) for row in rows]
-        words = [
-            word
-            for word in sys.argv[1:]
-            if word not in ("--json", json_path, f"--json={json_path}")
-        ]
-        command = shlex.join(["python", f"benchmarks/{Path(sys.argv[0]).name}", *words])
-        found = {"title": title, "command": command, "machine": machine(), "rows": table, **further}
-        Path(json_path).write_text(json.dumps(found, indent=1) + "\n")
+        write_results(title, columns, rows, json_path, further)
+
+
+def write_results(
+    title: str,
+    columns: Sequence[str],
+    rows: Sequence[Sequence[Any]],
+    json_path: str,
+    further: Mapping[str, Any] = MappingProxyType({}),
+) -> None:
+    """Writes a table as JSON; a long program does so after each of its parts."""
+    table = [dict(zip(columns, row, strict=True)) for row in rows]
+    words = [
+        word for word in sys.argv[1:] if word not in ("--json", json_path, f"--json={json_path}")
+    ]
+    command = shlex.join(["python", f"benchmarks/{Path(sys.argv[0]).name}", *words])
+    found = {"title": title, "command": command, "machine": machine(), "rows": table, **further}
+    Path(json_path).write_text(json.dumps(found, indent=1) + "\n")

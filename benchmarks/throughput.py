@@ -36,7 +36,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _timing import compile_seconds, in_turn, report
+from _timing import compile_seconds, in_turn, report, write_results
 
 import iblf_jax as ij
 from iblf_jax import kernels
@@ -602,6 +602,28 @@ def gradients(quick: bool) -> list[list]:
     return result
 
 
+def by_scipy() -> list[list]:
+    """One run by SciPy's LSODA."""
+    jax.config.update("jax_enable_x64", True)
+    speed = 10_000 / with_scipy(10_000)
+    return [["paper", "float64", 1, "SciPy LSODA", 10_000, 0.0, speed, speed, math.nan, math.nan]]
+
+
+COLUMNS = (
+    "loop",
+    "type",
+    "runs",
+    "row",
+    "steps",
+    "compile s",
+    "steps/s",
+    "steps/s per core",
+    "x textbook",
+    "of limit",
+    "in values",
+)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -613,41 +635,23 @@ def main() -> None:
     parser.add_argument("--loops", default="paper,chain,arm")
     options = parser.parse_args()
     batches = [2] if options.quick else [int(x) for x in options.batches.split(",")]
-    rows = []
-    if not options.quick:
-        jax.config.update("jax_enable_x64", True)
-        rows = [
-            [
-                "paper",
-                "float64",
-                1,
-                "SciPy LSODA",
-                10_000,
-                0.0,
-                *[1e4 / with_scipy(10_000)] * 2,
-                math.nan,
-                math.nan,
-            ]
-        ]
-    for loop in ["paper"] if options.quick else options.loops.split(","):
-        for dtype in ["float32"] if options.quick else options.dtypes.split(","):
-            rows += table(dtype, batches, loop, options.quick)
-    rows += flat(options.quick) + calls(options.quick) + sampled(options.quick)
-    rows = [[*row, math.nan] for row in rows] + gradients(options.quick)
-    columns = [
-        "loop",
-        "type",
-        "runs",
-        "row",
-        "steps",
-        "compile s",
-        "steps/s",
-        "steps/s per core",
-        "x textbook",
-        "of limit",
-        "in values",
+    quick = options.quick
+    loops = ["paper"] if quick else options.loops.split(",")
+    dtypes = ["float32"] if quick else options.dtypes.split(",")
+    parts = [
+        partial(table, dtype, batches, loop, quick)
+        for loop, dtype in itertools.product(loops, dtypes)
     ]
-    report(f"Throughput, {method_for(options.quick)} at 1 ms", columns, rows, options.json)
+    parts += [partial(part, quick) for part in (flat, calls, sampled, gradients)]
+    if not quick:
+        parts.insert(0, by_scipy)
+    title = f"Throughput, {method_for(quick)} at 1 ms"
+    rows: list[list] = []
+    for part in parts:
+        rows += [[*row, math.nan][: len(COLUMNS)] for row in part()]
+        if options.json:  # all parts take half an hour
+            write_results(title, COLUMNS, rows, options.json)
+    report(title, COLUMNS, rows, options.json)
 
 
 if __name__ == "__main__":
