@@ -1,7 +1,4 @@
-"""The auxiliary state of a limited torque, against the independent programs, its Lyapunov rate and
-its limits."""
-
-from __future__ import annotations
+"""The auxiliary state of a limited torque: independent programs, Lyapunov rate and limits."""
 
 import dataclasses
 
@@ -25,8 +22,9 @@ from iblf_jax.simulation.scenario import canonical
 PAPER = ij.presets.zhang_yan_2024(variant="corrected")
 LIMIT = np.array([9.0, 3.0])
 K = 6.0
-SATURATED = controllers.Saturated(PAPER.controller, limit=LIMIT, auxiliary=K)
-LIMITED = ij.with_parts(PAPER, controller=SATURATED)
+LIMITED = ij.with_parts(
+    PAPER, controller=controllers.Saturated(PAPER.controller, limit=LIMIT, auxiliary=K)
+)
 LAWS = {
     "two_barriers": two_barriers(),
     "dynamic_surface": controllers.DynamicSurface(k1=2.0, K2=20.0, filter=0.02),
@@ -42,14 +40,6 @@ def with_numbers(scenario, limit, k, **gains):
     return canonical(ij.with_parts(scenario, controller=law))
 
 
-def near(rng, tube):
-    """A random position inside the tube of an instant."""
-    return tube.lower + rng.uniform(0.1, 0.9, 2) * (tube.upper - tube.lower)
-
-
-# --- the independent programs ---------------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_the_vector_field_of_an_arm_is_that_of_the_independent_program(rng):
     field = jax.jit(evaluate)
@@ -59,17 +49,18 @@ def test_the_vector_field_of_an_arm_is_that_of_the_independent_program(rng):
         t = rng.uniform(0, 10)
         scenario = with_numbers(LIMITED, limit, k, **numbers)
         scenario = ij.with_parameters(scenario, {"observer.kf": kf})
-        q = near(rng, scenario.context.tube(jnp.asarray(t)))
+        tube = scenario.context.tube(jnp.asarray(t))
+        q = tube.lower + rng.uniform(0.1, 0.9, 2) * (tube.upper - tube.lower)
         dq, eta, aux = rng.normal(size=(3, 2))
         state = LoopState(np.stack([q, dq]), AuxiliaryState((), aux), eta)
         rate, sample = field(scenario, t, jax.tree.map(jnp.asarray, state))
         loop = Loop(corrected=True, kf=kf, **numbers)
         y = np.concatenate([q, dq, eta, aux])
         expected, signals = other.limited_arm(loop, limit, k, t, y)
-        found = [rate.q, rate.dq, rate.observer, rate.controller.auxiliary]
+        found = [rate.q, rate.dq, rate.observer, rate.controller.auxiliary, sample.tau]
         size = np.max(np.abs(expected))
+        expected = np.concatenate([expected, signals["tau"]])
         np.testing.assert_allclose(np.concatenate(found), expected, rtol=1e-12, atol=1e-12 * size)
-        np.testing.assert_allclose(sample.tau, signals["tau"], rtol=1e-12, atol=1e-12 * size)
         np.testing.assert_allclose(sample.V, signals["V"], rtol=1e-12)
 
 
@@ -94,22 +85,17 @@ def random_points(case, rng, count):
 def test_the_input_of_a_chain_is_that_of_the_independent_program(coupled, rng):
     case = chains.CASES["coupled"]
     field = jax.jit(evaluate)
-    estimate = np.zeros((case.order, case.n))
+    nothing = [[0.0] * case.n] * case.order
     for t, x, aux in random_points(case, rng, 20):
         limit, k = rng.uniform(0.1, 20), rng.uniform(1, 30)
         scenario = with_numbers(coupled, limit, k)
         state = LoopState(np.asarray(x), AuxiliaryState((), aux), ())
         rate, sample = field(scenario, t, jax.tree.map(jnp.asarray, state))
-        found = other.limited_chain(case, limit, k, t, x, estimate.tolist(), aux)
-        _, applied, aux_rate, control = found
+        _, applied, aux_rate, control = other.limited_chain(case, limit, k, t, x, nothing, aux)
         np.testing.assert_allclose(sample.tau, applied, rtol=1e-12, atol=1e-12)
-        size = np.max(np.abs(aux_rate))
-        found_rate = rate.controller.auxiliary
-        np.testing.assert_allclose(found_rate, aux_rate, rtol=1e-11, atol=1e-12 * size)
+        found, size = rate.controller.auxiliary, np.max(np.abs(aux_rate))
+        np.testing.assert_allclose(found, aux_rate, rtol=1e-11, atol=1e-12 * size)
         np.testing.assert_allclose(sample.V, control.V, rtol=1e-11)
-
-
-# --- the Lyapunov rate ----------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -120,8 +106,8 @@ def test_the_rate_of_V_of_a_chain_with_bounds_of_every_level(coupled, rng):
         state = LoopState(np.asarray(x), AuxiliaryState((), aux), ())
         proof = terms(coupled, jnp.asarray(t), jax.tree.map(jnp.asarray, state))
         claim = proof.claims["levels"]
-        left = proof.dV + claim.dissipation - claim.disturbance_gain
         assert not proof.excluded
+        left = proof.dV + claim.dissipation - claim.disturbance_gain
         np.testing.assert_allclose(left, 0.0, atol=1e-12 * proof.size)
 
 
@@ -134,13 +120,9 @@ def test_a_certificate_covers_the_limited_torque():
     assert np.all(share > 0.004)
     np.testing.assert_allclose(run.metrics.saturated_share, share, atol=1e-3)
     assert line.verdict == "holds"
-    largest = float(np.max(np.abs(run.auxiliary)))
-    assert f"max |lambda| = {largest:.4g}" in line.note
-    expected = np.max(np.abs(run.auxiliary), axis=0)
-    np.testing.assert_array_equal(run.metrics.largest_auxiliary, expected)
-
-
-# --- limits ---------------------------------------------------------------------------------------
+    largest = np.max(np.abs(run.auxiliary), axis=0)
+    assert f"max |lambda| = {float(np.max(largest)):.4g}" in line.note
+    np.testing.assert_array_equal(run.metrics.largest_auxiliary, largest)
 
 
 def limited_by(limit, law):
@@ -150,21 +132,16 @@ def limited_by(limit, law):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", LAWS)
 def test_without_a_reached_limit_it_is_the_law_without_it(name):
-    part = {}
-    if name == "two_barriers":
-        speeds = ij.Bounds(ij.bounds.Constant(-9.0), ij.bounds.Constant(9.0))
-        part["bounds"] = (PAPER.bounds[0], speeds)
-    scenario = canonical(ij.with_parts(PAPER, controller=LAWS[name], **part))
+    speeds = ij.Bounds(ij.bounds.Constant(-9.0), ij.bounds.Constant(9.0))
+    levels = PAPER.bounds[0], speeds if name == "two_barriers" else None
+    scenario = canonical(ij.with_parts(PAPER, controller=LAWS[name], bounds=levels))
     limited = canonical(ij.with_parts(scenario, controller=limited_by(1e4, LAWS[name])))
     field, t = jax.jit(evaluate), jnp.asarray(0.0)
     rate, sample = field(scenario, t, initial_state(scenario))
     limited_rate, limited_sample = field(limited, t, initial_state(limited))
     np.testing.assert_allclose(limited_sample.tau, sample.tau, rtol=1e-13)
     np.testing.assert_array_equal(limited_rate.controller.auxiliary, 0.0)
-    for one, same in zip(
-        jax.tree.leaves(rate.controller), jax.tree.leaves(limited_rate.controller.law), strict=True
-    ):
-        np.testing.assert_array_equal(one, same)
+    jax.tree.map(np.testing.assert_array_equal, rate.controller, limited_rate.controller.law)
 
 
 @pytest.mark.slow

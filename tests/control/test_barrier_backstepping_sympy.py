@@ -1,12 +1,7 @@
 """`BarrierBackstepping` against a derivation by SymPy: a scalar plant of order 3, with
-`TransformedError` and time-varying bounds on every level.
-
-Each level of (S.2) is written once, as the formulas of the barrier, and its total derivatives are
-formed by the chain rule over the symbols of time, of the states and of what the level takes from
-the level below.
-"""
-
-from __future__ import annotations
+`TransformedError` and time-varying bounds on every level.  Each level of (S.2) is written once, and
+its total derivatives are formed by the chain rule over the symbols of time, of the states and of
+what the level takes from the level below."""
 
 import functools
 import itertools
@@ -46,7 +41,6 @@ def derivatives(side, t, count):
 
 
 def sides(i):
-    """The numbers of the lower and of the upper bound of row i."""
     return zip(OFFSETS[i], AMPLITUDES[i], FREQUENCIES[i], strict=True)
 
 
@@ -88,9 +82,8 @@ def total_derivative(expression, i, inputs):
 
 @functools.cache
 def derived_level(i):
-    """The function of x, the error and the `Inputs` that gives, for alpha_i and w_i s_i, the values
-    and their derivatives.
-    """
+    """The function of x, the error and the `Inputs` that gives alpha_i and w_i s_i with their
+    derivatives."""
     terms = ORDER - i
     inputs = Inputs(*(sp.symbols(f"{name}0:{terms + 1}") for name in Inputs._fields))
     curves = [mapped_level(i, inputs)]
@@ -116,19 +109,13 @@ def scenario():
         drift, gain = drift_and_gain(x[:, 0], jnp.cos, jnp.sin, jnp.exp)
         return jnp.stack(drift)[:, None], jnp.stack(gain)[:, None]
 
-    levels = []
-    for i in range(ORDER):
-        lower, upper = (bounds.Sinusoid(*side) for side in sides(i))
-        levels.append(ij.Bounds(lower=lower, upper=upper))
+    functions = (lambda t, x: rows(t, x)[0]), (lambda t, x: rows(t, x)[1])
+    mappings = (barriers.TransformedError(),) * ORDER
     return ij.Scenario(
-        plant=plants.StrictFeedback(
-            lambda t, x: rows(t, x)[0], lambda t, x: rows(t, x)[1], n=1, order=ORDER
-        ),
+        plant=plants.StrictFeedback(*functions, n=1, order=ORDER),
         reference=references.Sinusoid(offset=0.0, amplitude=0.5),
-        bounds=levels,
-        controller=controllers.BarrierBackstepping(
-            k=K, barriers=(barriers.TransformedError(),) * ORDER, c=C, weights=WEIGHTS
-        ),
+        bounds=[ij.Bounds(*(bounds.Sinusoid(*side) for side in sides(i))) for i in range(ORDER)],
+        controller=controllers.BarrierBackstepping(k=K, barriers=mappings, c=C, weights=WEIGHTS),
         initial=ij.Initial(x=[[0.1], [0.0], [0.0]]),
     )
 

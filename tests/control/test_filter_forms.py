@@ -1,6 +1,4 @@
-"""Filters, matrices and nonlinear damping of backstepping laws: beside the published equations in
-NumPy, and the claims about V'.
-"""
+"""Filters, matrices and damping of backstepping laws beside the published equations."""
 
 import dataclasses
 
@@ -9,17 +7,63 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from independent import Loop
+from refused import refused
 
 import iblf_jax as ij
 from iblf_jax import barriers, bounds, controllers, plants, references
 from iblf_jax.control.controllers import LawContext
+from iblf_jax.simulation.closed_loop import LoopState, initial_state, rate
 from iblf_jax.world.robots import momentum
 
 K = np.array([2.0, 5.0, 9.0])
 MU = np.array([0.05, 0.03])
-
-
+K1 = np.array([[0.5, 0.1, 0.0], [-0.1, 0.4, 0.05], [0.0, 0.05, 0.6]])
+K2 = np.array([[9.0, 1.0, 0.0], [0.5, 12.0, 2.0], [0.0, -1.0, 5.0]])
 WIDE = bounds.Bounds(bounds.Constant(-2.0), bounds.Constant(3.0))
+
+
+@dataclasses.dataclass
+class FilteredLoop(Loop):
+    """The independent loop with alpha filtered; its state is (q, q', eta, beta)."""
+
+    mu: np.ndarray = dataclasses.field(default_factory=lambda: np.full(2, 0.02))
+
+    def filtered(self, t, x):
+        q, v, eta, beta = np.split(x, 4)
+        M, C, G, dM = self.arm(q)
+        e1, k, alpha, _ = self.virtual(t, q, v)
+        dbeta, f_hat = (alpha - beta) / self.mu, eta + self.kf * (M @ v)
+        slope = 2 * e1 / (k**2 - e1**2)
+        tau = C(v) @ beta + G + M @ dbeta - f_hat - self.K2 * (v - beta) - slope
+        deta = -self.kf * (f_hat + tau - C(v) @ v - G + dM * v[1] @ v)
+        acceleration = self.acceleration(q, v, tau + self.disturbance(t, q, v))
+        return np.concatenate([v, acceleration, deta, dbeta])
+
+
+@pytest.mark.slow
+def test_a_dynamic_surface_law_and_its_start_are_those_of_an_independent_program(rng):
+    field = jax.jit(rate)
+    for _ in range(10):
+        ranges = {"k1": (1, 3), "K2": (10, 25), "o": (0.05, 0.3), "mu": (0.01, 0.05)}
+        draws = {name: rng.uniform(*ends, 2) for name, ends in ranges.items()}
+        lower = (rng.uniform(0.1, 0.2, 2), 0.14, 1.0, (np.pi / 2, 0.0))
+        loop = FilteredLoop(**draws, q0=tuple(rng.uniform(0.4, 0.8, 2)), lower=lower)
+        scenario = ij.with_parts(
+            ij.presets.zhang_yan_2024(variant="corrected"),
+            controller=controllers.DynamicSurface(loop.k1, loop.K2, filter=loop.mu, o=loop.o),
+            bounds=bounds.Bounds(bounds.Sinusoid(*loop.lower), bounds.Sinusoid(*loop.upper)),
+            initial=ij.Initial(loop.q0),
+        )
+        start = loop.virtual(0.0, np.array(loop.q0), np.zeros(2)).alpha
+        np.testing.assert_allclose(initial_state(scenario).controller, start, rtol=1e-12)
+        t, q = rng.uniform(0.0, 5.0), rng.uniform(0.45, 0.55, 2)
+        dq, eta, beta = rng.normal(size=(3, 2))
+        state = LoopState(jnp.stack([q, dq]), jnp.asarray(beta), jnp.asarray(eta))
+        found = field(scenario, jnp.asarray(t), state)
+        expected = loop.filtered(t, np.concatenate([q, dq, eta, beta]))
+        rates = np.concatenate([found.q, found.dq, found.observer, found.controller])
+        np.testing.assert_allclose(rates, expected, atol=1e-12 * np.max(np.abs(expected)))
 
 
 @pytest.mark.slow
@@ -29,10 +73,13 @@ def test_the_energy_of_the_compensated_law_of_robots_decays_as_with_exact_deriva
     found = controllers.DynamicSurface(
         k1=2.0, K2=20.0, filter=0.05, barrier=barrier, filter_form="compensated"
     )
-    given, arm, zero = scenario.context, plants.as_plant(scenario.model), jnp.zeros(2)
+    arm = plants.as_plant(scenario.model)
+
+    def commanded(t, x, state):
+        return found.command(t, x[0], x[1], jnp.zeros(2), scenario.context, state)
 
     def energy(t, x, state):
-        command = found.command(t, x[0], x[1], zero, given, state)[0]
+        command = commanded(t, x, state)[0]
         e2 = x[1] - command.alpha
         return jnp.sum(command.V1) + 0.5 * jnp.sum(e2 * momentum(scenario.model, x[0], e2))
 
@@ -40,7 +87,7 @@ def test_the_energy_of_the_compensated_law_of_robots_decays_as_with_exact_deriva
         t = jnp.asarray(rng.uniform(0.0, 3.0))
         x = jnp.asarray(rng.normal(scale=0.1, size=(2, 2))) + 0.4
         state = jnp.asarray(rng.normal(scale=0.1, size=(2, 2)))
-        command, rates = found.command(t, x[0], x[1], zero, given, state)
+        command, rates = commanded(t, x, state)
         dx = plants.flow(arm, t, x, command.tau)
         dV = jax.jvp(energy, (t, x, state), (jnp.ones_like(t), dx, rates))[1]
         decay = 4.0 * jnp.sum(command.V1) + 20.0 * jnp.sum((x[1] - command.alpha) ** 2)
@@ -59,12 +106,6 @@ def test_certificates_claim_nothing_about_other_forms_and_matrices():
     cert = ij.certify(changed, duration=0.01, dt=1e-3)
     assert "the law has matrices as gains or weights" in str(cert)
     assert cert.headline != "holds"
-
-
-# --- matrices -------------------------------------------------------------------------------------
-
-K1 = np.array([[0.5, 0.1, 0.0], [-0.1, 0.4, 0.05], [0.0, 0.05, 0.6]])
-K2 = np.array([[9.0, 1.0, 0.0], [0.5, 12.0, 2.0], [0.0, -1.0, 5.0]])
 
 
 @pytest.mark.slow
@@ -88,7 +129,6 @@ def test_the_force_of_a_vessel_is_the_published_one(rng):
         ready = found.with_defaults(given, x)
         np.testing.assert_array_equal(ready.weights, 1.0)
         command, _ = ready.command(jnp.asarray(t), x, jnp.zeros((2, 3)), given, ())
-
         wave, amplitude = np.array([0.3, 0.2, 0.5]), np.array([1.0, 0.5, 0.4])
         z1 = eta - np.array([0.1, 0.2, 0.3]) - amplitude * np.sin(wave * t)
         velocity = amplitude * wave * np.cos(wave * t)
@@ -127,13 +167,11 @@ def test_filters_matrices_weights_and_damping_are_those_of_the_equations(form, r
     )
     given = LawContext(plant, references.Sinusoid([0.2, 0.1], 0.4, 1.3), (WIDE, None, None))
     t, x, beta = rng.uniform(0.0, 3.0), rng.normal(size=(3, 2)), rng.normal(size=(2, 2))
-    xi = np.zeros((3, 2))
-    state = beta
-    if form == "compensated":
-        xi[:2] = rng.normal(size=(2, 2))
-        state = np.concatenate([beta, xi[:2]])
-    zero = jnp.zeros((3, 2))
-    command, rates = found.command(jnp.asarray(t), jnp.asarray(x), zero, given, state)
+    xi, compensates = np.zeros((3, 2)), form == "compensated"
+    xi[:2] = rng.normal(size=(2, 2)) * compensates
+    state = np.concatenate([beta, xi[:2]]) if compensates else beta
+    numbers = jnp.asarray(t), jnp.asarray(x), jnp.zeros((3, 2))
+    command, rates = found.command(*numbers, given, state)
 
     centre = np.array([0.2, 0.1]) + 0.4 * np.sin(1.3 * t)
     rate = np.full(2, 0.4 * 1.3 * np.cos(1.3 * t))
@@ -153,8 +191,7 @@ def test_filters_matrices_weights_and_damping_are_those_of_the_equations(form, r
         of_xi.append(gain[i] * (beta[i] - alpha + xi[i + 1]) - K[i] * xi[i])
         below = gain[i] * w[i] * s
     np.testing.assert_allclose(command.tau, alpha, rtol=1e-11)
-    if form == "compensated":
-        expected += of_xi
+    expected += of_xi * compensates
     np.testing.assert_allclose(rates, expected, rtol=1e-11, atol=1e-12)
 
 
@@ -164,35 +201,25 @@ def of_levels(**fields):
 
 
 def with_a_wrong_regressor():
-    wrong = {"damping": 1.0, "regressor": lambda t, x: x}
+    wrong = controllers.BarrierBackstepping(k=K, damping=1.0, regressor=lambda t, x: x)
     reference = references.Sinusoid(offset=0.2, amplitude=0.4)
-    given = LawContext(chain_cases.pendulum(), reference, (WIDE, None, None))
-    controllers.BarrierBackstepping(k=K, **wrong).check_start(given)
+    wrong.check_start(LawContext(chain_cases.pendulum(), reference, (WIDE, None, None)))
 
 
-@pytest.mark.parametrize(
-    ("make", "words"),
-    [
-        (
-            lambda: of_levels(gain_matrices=[K1, K2]),
-            r"matrices\[0\].*unit matrix.*TransformedError",
-        ),
-        (lambda: of_levels(weight_matrices=[np.eye(3), K2]), r"weight_matrices\[1\].*symmetric"),
-        (lambda: of_levels(gain_matrices=[np.eye(3), -K2]), r"matrices\[1\].*eigenvalue -12.2"),
-        (lambda: of_levels(weight_matrices=np.eye(3)), r"weight_matrices.*shape \(2, n, n\)"),
-        (lambda: of_levels(filter_form="derivative"), r"BarrierBackstepping\.filter.*filter=0\.01"),
-        (
-            lambda: controllers.DynamicSurface(k1=1.0, K2=1.0, filter=0.1, filter_form="lag"),
-            r"DynamicSurface\.filter_form.*surface",
-        ),
-        (lambda: of_levels(damping=1.0), r"regressor.*phi"),
-        (lambda: of_levels(regressor=phi), "damping"),
-        (with_a_wrong_regressor, r"controller\.regressor.*\(3, 1, m\)"),
-    ],
+test_what_does_not_fit_is_refused = refused(
+    (lambda: of_levels(gain_matrices=[K1, K2]), r"matrices\[0\].*unit matrix.*TransformedError"),
+    (lambda: of_levels(weight_matrices=[np.eye(3), K2]), r"weight_matrices\[1\].*symmetric"),
+    (lambda: of_levels(gain_matrices=[np.eye(3), -K2]), r"matrices\[1\].*eigenvalue -12.2"),
+    (lambda: of_levels(weight_matrices=np.eye(3)), r"weight_matrices.*shape \(2, n, n\)"),
+    (lambda: of_levels(filter_form="derivative"), r"BarrierBackstepping\.filter.*filter=0\.01"),
+    (
+        lambda: controllers.DynamicSurface(k1=1.0, K2=1.0, filter=0.1, filter_form="lag"),
+        r"DynamicSurface\.filter_form.*surface",
+    ),
+    (lambda: of_levels(damping=1.0), r"regressor.*phi"),
+    (lambda: of_levels(regressor=phi), "damping"),
+    (with_a_wrong_regressor, r"controller\.regressor.*\(3, 1, m\)"),
 )
-def test_what_does_not_fit_is_refused(make, words):
-    with pytest.raises(ValueError, match=words):
-        make()
 
 
 def phi(t, x):

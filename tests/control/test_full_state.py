@@ -1,5 +1,4 @@
-"""`BarrierBackstepping` on a robot with bounds on positions and velocities: its formulas beside
-independent ones, the inequality (F.2) and the claim (F.3)."""
+"""`BarrierBackstepping` with bounds on velocities: formulas, jumps, (F.2) and the claim (F.3)."""
 
 import dataclasses
 from functools import partial
@@ -32,11 +31,8 @@ class FullLoop(Loop):
     """A constant torque that the law does not know."""
 
     def full(self, t, x, above=None):
-        """The rate of (q, q', eta), the torque, V1 + phi of each joint, and e2.
-
-        `above`: on which side of e2 = 0 the torque is evaluated, joint by joint; the state's own if
-          not given.
-        """
+        """The rate of (q, q', eta), the torque, V1 + phi of each joint, and e2; `above`: the side
+        of e2 = 0 of the torque, joint by joint, if it is not the state's own."""
         q, v, eta = x[:2], x[2:4], x[4:]
         M, C, G, dM = self.arm(q)
         e1, k, alpha, dalpha = self.virtual(t, q, v)
@@ -56,7 +52,6 @@ class FullLoop(Loop):
 
     @classmethod
     def random(cls, rng, **given):
-        """Gains and bounds at random, around the paper's."""
         ranges = {"k1": (1, 3), "K2": (8, 25), "c": (0.3, 2), "o": (0.05, 0.3)}
         gains = {name: rng.uniform(*ends, 2) for name, ends in ranges.items()}
         sizes = -rng.uniform(1.5, 2.0, 2), rng.uniform(-0.1, 0.1, 2)
@@ -68,12 +63,9 @@ class FullLoop(Loop):
 
     @property
     def scenario(self):
-        """The same in the package."""
-        both = barriers.Integral(), barriers.Integral()
-        law = two_barriers(self.k1, self.K2, self.c, *both, o=(self.o, self.o))
         return dataclasses.replace(
             ij.presets.zhang_yan_2024(variant="corrected"),
-            controller=law,
+            controller=two_barriers(self.k1, self.K2, self.c, o=(self.o, self.o)),
             observer=ij.observers.Momentum(kf=self.kf),
             bounds=(
                 bounds.Bounds(bounds.Sinusoid(*self.lower), bounds.Sinusoid(*self.upper)),
@@ -131,7 +123,6 @@ def test_the_torque_is_the_independent_one_at_random_gains_bounds_and_states(rng
 
 
 FAMILY = {name: cls() for name, cls in barriers.MEMBERS.items()}
-WALLS = [name for name in FAMILY if name != "quadratic"]
 
 
 @pytest.mark.slow
@@ -179,10 +170,9 @@ def test_rate_gain_and_envelope_of_the_certificate():
 
 class Pieces:
     """The independent loop from event to event of e2_i = 0: each joint above 0, below it, or (None)
-    sliding along it."""
+    sliding along it; `push`: time and size of a torque that appears during the run."""
 
     def __init__(self, loop, duration, push=None):
-        """`push`: time and size of a torque that appears during the run."""
         self.loop, self.passed = loop, []
         time, size = push or (duration, (0.0, 0.0))
         t, x = 0.0, np.concatenate([loop.q0, loop.dq0, np.zeros(4)])
@@ -204,12 +194,10 @@ class Pieces:
         return self.loop.full(t, x[:6], np.zeros(2, bool))[3]
 
     def approach(self, t, x, rate, h=1e-6):
-        """Rate of e2 along a rate of the state."""
         return (self.e2(t + h, x + h * rate) - self.e2(t - h, x - h * rate)) / (2 * h)
 
     def rate(self, t, x, mode):
-        """The rate in a mode, and of a sliding joint how much of the rate is that from above
-        (Filippov)."""
+        """The rate in a mode, and of a sliding joint the share of that from above (Filippov)."""
         above = np.array([side is True for side in mode])
         below = self.at(t, x, above)
         if None not in mode:
@@ -262,8 +250,7 @@ def pieces(duration, **gains):
 
 
 def slopes_in_pieces(duration, **gains):
-    """Central differences of runs in pieces by k1, K2, c and kf; of |e1|^2's integral, |tau|^2's,
-    and q at the end."""
+    """Differences of runs in pieces by k1, K2, c and kf; of |e1|^2's integral, |tau|^2's, and q."""
     found = []
     for name, x in (GAINS | gains).items():
         ends = [pieces(duration, **gains | {name: x + h}) for h in (1e-3 * x, -1e-3 * x)]
@@ -274,7 +261,6 @@ def slopes_in_pieces(duration, **gains):
 
 
 def outcome_by(duration, dt):
-    """The same numbers of the package's run as a function of the gains."""
     scenario = FullLoop(q0=(0.62, 0.55), dq0=(-0.3, 0.2)).scenario
 
     def outcome(gains):
@@ -300,21 +286,17 @@ def test_derivatives_across_the_jumps_are_those_of_runs_in_pieces():
 
 @pytest.mark.slow
 def test_a_disturbance_and_the_command_jump_in_one_step():
-    """Joint 0 crosses e2 = 0 at 3.3 ms, in the step of 1 ms in which a disturbance appears:
-    derivatives by its time and by k1."""
+    """Joint 0 crosses e2 = 0 at 3.3 ms, in the step of 1 ms in which a disturbance appears."""
     time, size = 0.00366, (3.0, -1.0)
     loop = FullLoop(q0=(0.62, 0.55), dq0=(-0.3, 0.2), K2=np.full(2, 12.0), kf=np.full(2, 100.0))
-    step = ij.disturbances.Step(size=list(size), time=time)
-    scenario = dataclasses.replace(
-        loop.scenario, disturbance=ij.disturbances.Sum((loop.scenario.disturbance, step))
-    )
+    scenario, step = loop.scenario, ij.disturbances.Step(size=list(size), time=time)
+    both = ij.disturbances.Sum((scenario.disturbance, step))
+    scenario = ij.with_parts(scenario, disturbance=both)
 
     def integrals(values):
-        changed = {
-            "disturbance.parts[1].time": values[0],
-            "controller.k[0]": jnp.full(2, values[1]),
-        }
-        metrics = ij.simulate(ij.with_parameters(scenario, changed), duration=0.03, dt=1e-3).metrics
+        k1 = {"controller.k[0]": jnp.full(2, values[1])}
+        changed = ij.with_parameters(scenario, {"disturbance.parts[1].time": values[0]} | k1)
+        metrics = ij.simulate(changed, duration=0.03, dt=1e-3).metrics
         return jnp.array([jnp.sum(metrics.ise), metrics.effort])
 
     def true(time, k1):
@@ -337,7 +319,7 @@ def test_where_e2_slides_along_0_derivatives_are_those_of_the_sliding_motion():
     np.testing.assert_allclose(found[1], true[1], rtol=0.1)
 
 
-@pytest.mark.parametrize("name", WALLS)
+@pytest.mark.parametrize("name", sorted(FAMILY.keys() - {"quadratic"}))
 def test_a_barrier_states_whether_its_ratio_jumps(name):
     tube = bounds.Tube(
         jnp.zeros(1), jnp.zeros(1), -jnp.ones(1), 2.0 * jnp.ones(1), jnp.zeros(1), jnp.zeros(1)
@@ -346,8 +328,7 @@ def test_a_barrier_states_whether_its_ratio_jumps(name):
     assert bool(abs(left - right)[0] > 1e-6) == FAMILY[name].ratio_jumps
     law = two_barriers(second=FAMILY[name])
     scenario = ij.with_parts(ij.presets.zhang_yan_2024_full_state(), controller=law)
-    wrapped = controllers.Saturated(law=law, limit=50.0)
-    for each in (law, wrapped):
-        x = jnp.stack([scenario.initial.q, scenario.initial.dq])
+    x = jnp.stack([scenario.initial.q, scenario.initial.dq])
+    for each in (law, controllers.Saturated(law=law, limit=50.0)):
         found = each.switching(jnp.zeros(()), x, jnp.zeros(2), scenario.context, ())
         assert (found is not None) == FAMILY[name].ratio_jumps

@@ -1,5 +1,4 @@
-"""The laws beside the paper's: what each does, what saturation leaves of the claims, and paths
-through a wrapper."""
+"""The laws beside the paper's: what each does, its weight, and paths through a wrapper."""
 
 import dataclasses
 
@@ -8,9 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from independent import Loop, sine
+from refused import assert_refused, refused
 
 import iblf_jax as ij
-from iblf_jax import controllers
+from iblf_jax import barriers, bounds, controllers
 from iblf_jax.core.pytree import rewrapped, unwrapped
 
 PD = controllers.PDGravity(Kp=1.0, Kd=1.0)
@@ -22,23 +22,19 @@ def test_linear_laws_are_those_of_the_equations(rng):
     arm, context = Loop(), ij.presets.zhang_yan_2024().context
     Kp, Kd = np.array([25.0, 16.0]), np.array([10.0, 7.0])
     laws = controllers.PDGravity(Kp, Kd), controllers.ComputedTorque(Kp, Kd)
+
+    @jax.jit
+    def commands(*arguments):
+        return jnp.stack([law.command(*arguments, context, ())[0].tau for law in laws])
+
     for _ in range(10):
         t, q, (dq, f_hat) = rng.uniform(0.0, 5.0), rng.uniform(0.3, 0.7, 2), rng.normal(size=(2, 2))
         q_d, dq_d, ddq_d = sine(*arm.reference)(t)
         M, C, G, _ = arm.arm(q)
         asked = -Kp * (q - q_d) - Kd * (dq - dq_d)
         expected = G + asked - f_hat, M @ (ddq_d + asked) + C(dq) @ dq + G - f_hat
-        arguments = map(jnp.asarray, (t, q, dq, f_hat))
-        commands = law_commands(laws, context, *arguments)
-        np.testing.assert_allclose(commands, expected, rtol=1e-12, atol=1e-12)
-
-
-@jax.jit
-def law_commands(laws, context, t, q, dq, f_hat):
-    return jnp.stack([law.command(t, q, dq, f_hat, context, ())[0].tau for law in laws])
-
-
-# ---------------------------------------------------------------------------------- adaptive RBF
+        found = commands(*map(jnp.asarray, (t, q, dq, f_hat)))
+        np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
 
 
 def test_adaptation_descends_the_lyapunov_function():
@@ -81,8 +77,6 @@ def test_smooth_limit():
 
 @ij.component
 class _Fixed:
-    """A law that asks for a given torque."""
-
     tau: jax.Array = ij.leaf("N m", shape="any")
 
     def init(self, q, dq, context):
@@ -93,30 +87,22 @@ class _Fixed:
         return controllers.Command(self.tau, jnp.zeros_like(q), jnp.zeros_like(q), never, never), ()
 
 
-# ---------------------------------------------------------------------------- paths and wrappers
-
-
 def test_paths_reach_through_a_wrapper():
     scenario = ij.presets.zhang_yan_2024_saturated()
     paths = [p.path for p in ij.parameters(scenario)]
-    assert "controller.K2" in paths
-    assert "controller.limit" in paths
+    assert {"controller.K2", "controller.limit"} <= {*paths}
     assert not any(".law." in path for path in paths)
     for path in ("controller.K2[1]", "controller.law.K2[1]"):
         other = ij.with_parameters(scenario, {path: 33.0})
         np.testing.assert_array_equal(other.controller.law.K2, [20.0, 33.0])
-    with pytest.raises(ValueError, match=r"controller\.K2"):
-        ij.with_parameters(scenario, {"controller.K3": 1.0})
-    with pytest.raises(ValueError, match="> 0"):
-        ij.with_parameters(scenario, {"controller.K2": -1.0})
+    assert_refused(r"controller\.K2", ij.with_parameters, scenario, {"controller.K3": 1.0})
+    assert_refused("> 0", ij.with_parameters, scenario, {"controller.K2": -1.0})
 
 
 def test_a_wrapper_in_a_wrapper_keeps_both_fields_apart():
     scenario = ij.presets.zhang_yan_2024_saturated()
-    twice = dataclasses.replace(
-        scenario,
-        controller=controllers.Saturated(law=scenario.controller, limit=50.0, edge="smooth"),
-    )
+    outer = controllers.Saturated(law=scenario.controller, limit=50.0, edge="smooth")
+    twice = dataclasses.replace(scenario, controller=outer)
     values = {p.path: p.value for p in ij.parameters(twice)}
     np.testing.assert_array_equal(values["controller.limit"], [50.0, 50.0])
     np.testing.assert_array_equal(values["controller.law.limit"], [7.2, 1.5])
@@ -124,33 +110,79 @@ def test_a_wrapper_in_a_wrapper_keeps_both_fields_apart():
     other = ij.with_parameters(twice, {"controller.law.limit": 7.0, "controller.k1": 3.0})
     np.testing.assert_array_equal(other.controller.law.limit, [7.0, 7.0])
     np.testing.assert_array_equal(unwrapped(other.controller).k1, [3.0, 3.0])
-    again = rewrapped(twice.controller, PD)
-    assert isinstance(again.law.law, controllers.PDGravity)
+    assert isinstance(rewrapped(outer, PD).law.law, controllers.PDGravity)
 
 
-@pytest.mark.parametrize(
-    ("make", "words"),
-    [
-        (lambda: ij.presets.zhang_yan_2024(law="nonsense"), "mapping"),
-        (lambda: controllers.Saturated(PD, limit=1.0, edge="soft"), "hard"),
-        (lambda: controllers.Saturated(PD, limit=0.0), "> 0"),
-        (lambda: controllers.Saturated(3.0, limit=1.0), r"Saturated\.law"),
-        (lambda: ij.observers.ExtendedState(), "bandwidth"),
-        (lambda: ij.observers.ExtendedState(l1=1.0), "bandwidth"),
-        (lambda: ij.observers.ExtendedState(bandwidth=1.0, l1=1.0, l2=1.0), "bandwidth"),
-    ],
+START, END, RATE = 6.0, 0.3, 1.0
+FUNNEL = bounds.Bounds(bounds.Funnel(-START, -END, RATE), bounds.Funnel(START, END, RATE))
+
+
+def on_a_surface(**changes):
+    law = controllers.SurfaceBarrier(a=2.0, K=[4.0, 8.0], surface=FUNNEL)
+    width = (START - END) / (2.0 - RATE) + 1.0
+    sides = (bounds.Funnel(sign * width, sign * END / 2, RATE) for sign in (-1.0, 1.0))
+    parts = {
+        "controller": law,
+        "observer": ij.observers.NoObserver(),
+        "bounds": bounds.Bounds(*sides),
+        "initial": ij.Initial([1.5, -0.4], [1.0, 0.5]),
+    }
+    return ij.with_parts(ij.presets.zhang_yan_2024(law="pd"), **(parts | changes))
+
+
+def test_the_torque_of_a_barrier_on_a_surface_is_the_published_one():
+    base, t = on_a_surface(), 0.7
+    q, dq = np.array([0.9, 0.2]), np.array([0.3, -0.8])
+    arguments = map(jnp.asarray, (t, q, dq, np.ones(2)))
+    command, _ = base.controller.command(*arguments, base.context, ())
+    q_d, dq_d, _ = sine(*Loop().reference)(t)
+    sigma, rho = dq - dq_d + 2.0 * (q - q_d), (START - END) * np.exp(-RATE * t) + END
+    x, k = sigma / rho, np.array([1.0, 2.0])
+    expected = -2 * k * np.log((1 + x) / (1 - x)) / ((1 - x**2) * rho)
+    np.testing.assert_allclose(command.tau, expected, rtol=1e-12)
+    np.testing.assert_allclose(dq - command.alpha, sigma, rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_the_funnel_of_the_surface_is_one_of_the_error():
+    run = ij.simulate(on_a_surface(), duration=4.0, dt=1e-3)
+    assert int(run.status) == 0
+    sigma, t = np.asarray(run.dq - run.alpha), np.asarray(run.t)[:, None]
+    assert np.all(np.abs(sigma) < (START - END) * np.exp(-RATE * t) + END)
+    # e1' + a e1 = sigma, solved with |sigma| at its bound.
+    fading, fast = np.exp(-t), np.exp(-2 * t)
+    implied = fast * np.abs(run.e1[0]) + (START - END) * (fading - fast) + END / 2 * (1 - fast)
+    assert np.all(np.abs(run.e1) <= implied + 1e-9)
+
+
+def of(surface, **fields):
+    return controllers.SurfaceBarrier(a=2.0, K=4.0, surface=surface, **fields)
+
+
+def run_between(lower, upper):
+    law = of(bounds.Bounds(bounds.Constant(lower), bounds.Constant(upper)))
+    filtered = controllers.SafetyFilter(law=law)
+    return ij.simulate(on_a_surface(controller=filtered), duration=0.1, dt=1e-3)
+
+
+NOT_BETWEEN = r"SurfaceBarrier\.surface: .*expected lower < 0 < upper at t = 0"
+test_refusals_name_what_is_expected = refused(
+    (lambda: ij.presets.zhang_yan_2024(law="nonsense"), "mapping"),
+    (lambda: controllers.Saturated(PD, limit=1.0, edge="soft"), "hard"),
+    (lambda: controllers.Saturated(PD, limit=0.0), "> 0"),
+    (lambda: controllers.Saturated(3.0, limit=1.0), r"Saturated\.law"),
+    (lambda: ij.observers.ExtendedState(), "bandwidth"),
+    (lambda: ij.observers.ExtendedState(l1=1.0), "bandwidth"),
+    (lambda: ij.observers.ExtendedState(bandwidth=1.0, l1=1.0, l2=1.0), "bandwidth"),
+    (lambda: of(barriers.Log()), r"Barrier\.surface: .*expected an iblf_jax.bounds.Bounds"),
+    (lambda: of(FUNNEL, barrier=FUNNEL), r"SurfaceBarrier\.barrier"),
+    (lambda: run_between(1.0, [2.0, 3.0]), NOT_BETWEEN),
+    (lambda: run_between(-1.0, [2.0, 0.0]), NOT_BETWEEN),
 )
-def test_refusals_name_what_is_expected(make, words):
-    with pytest.raises(ValueError, match=words):
-        make()
-
-
-# --------------------------------------------------------------------- the weight of the barrier
-
 WEIGHTED = {
     "backstepping": controllers.Backstepping(k1=2.0, K2=20.0),
     "corrected_mapping": controllers.Backstepping(
-        k1=2.0, K2=20.0, barrier=ij.barriers.TransformedError(), variant="corrected"
+        k1=2.0, K2=20.0, barrier=barriers.TransformedError(), variant="corrected"
     ),
     "dynamic_surface": controllers.DynamicSurface(k1=2.0, K2=20.0, filter=0.02),
     "adaptive_rbf": controllers.AdaptiveRBF(k1=2.0, K2=20.0, nodes=4),
@@ -159,22 +191,19 @@ WEIGHT = jnp.array([0.3, 2.5])
 
 
 def weighted(name, weight=None):
-    """The paper's scenario under one of these laws, its weight given to the constructor."""
     law = dataclasses.replace(WEIGHTED[name], weight=weight)
-    velocities = ij.bounds.Bounds(lower=ij.bounds.Constant(-4.0), upper=ij.bounds.Constant(4.0))
-    paper = ij.presets.zhang_yan_2024()
-    return dataclasses.replace(paper, controller=law, bounds=(paper.bounds[0], velocities))
+    return dataclasses.replace(ij.presets.zhang_yan_2024(), controller=law)
 
 
 def commanded(scenario):
-    """What its law commands at one state."""
     law, context = scenario.controller, scenario.context
     f_hat, state = jnp.array([0.5, -0.2]), law.init(Q, DQ, context)
     return law.command(jnp.asarray(0.3), Q, DQ, f_hat, context, state)[0]
 
 
 @pytest.mark.parametrize("name", WEIGHTED)
-def test_the_weight_multiplies_slope_and_value_of_the_barrier(name):
+def test_the_weight_is_a_leaf_that_multiplies_slope_and_value_of_the_barrier(name):
+    """It has the unit that its barrier gives it."""
     plain, other = (commanded(weighted(name, weight)) for weight in (None, WEIGHT))
     scenario = weighted(name)
     tube, barrier = scenario.context.tube(jnp.asarray(0.3)), scenario.controller.barrier
@@ -183,28 +212,20 @@ def test_the_weight_multiplies_slope_and_value_of_the_barrier(name):
     np.testing.assert_allclose(other.V1, WEIGHT * plain.V1, rtol=1e-9)
     np.testing.assert_array_equal(plain.tau, commanded(weighted(name, 1.0)).tau)
     np.testing.assert_array_equal(scenario.controller.weight, [1.0, 1.0])
-
-
-@pytest.mark.parametrize(
-    ("name", "unit"), [("backstepping", "N m rad"), ("corrected_mapping", "N m/rad")]
-)
-def test_the_weight_is_a_leaf_with_the_unit_that_its_barrier_gives_it(name, unit):
-    found = {p.path: p for p in ij.parameters(weighted(name))}["controller.weight"]
-    assert (found.shape, found.unit) == ((2,), unit)
-    with pytest.raises(ValueError, match=r"weight.*> 0"):
-        ij.with_parameters(weighted(name), {"controller.weight": [1.0, 0.0]})
+    found = {p.path: p for p in ij.parameters(scenario)}["controller.weight"]
+    assert (found.shape, found.unit) == ((2,), "N m/rad" if "mapping" in name else "N m rad")
+    assert_refused(r"weight.*> 0", ij.with_parameters, scenario, {"controller.weight": [1.0, 0.0]})
 
 
 def test_files_without_a_weight_have_the_papers_and_others_keep_theirs(tmp_path):
-    ij.save_scenario(weighted("backstepping", WEIGHT), tmp_path / "scenario.toml")
-    text = (tmp_path / "scenario.toml").read_text()
-    loaded = ij.load_scenario(tmp_path / "scenario.toml")
-    np.testing.assert_array_equal(loaded.controller.weight, WEIGHT)
-    old = "\n".join(line for line in text.splitlines() if not line.startswith("weight"))
-    assert old != text.rstrip("\n")
-    (tmp_path / "old.toml").write_text(old)
-    loaded = ij.load_scenario(tmp_path / "old.toml")
-    np.testing.assert_array_equal(loaded.controller.weight, [1.0, 1.0])
+    file = tmp_path / "scenario.toml"
+    ij.save_scenario(weighted("backstepping", WEIGHT), file)
+    np.testing.assert_array_equal(ij.load_scenario(file).controller.weight, WEIGHT)
+    lines = file.read_text().splitlines()
+    old = [line for line in lines if not line.startswith("weight")]
+    assert old != lines
+    file.write_text("\n".join(old))
+    np.testing.assert_array_equal(ij.load_scenario(file).controller.weight, [1.0, 1.0])
 
 
 @pytest.mark.slow

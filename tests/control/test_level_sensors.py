@@ -1,7 +1,5 @@
 """Sensors of the levels of a plant: each part measures its own levels with its own noise."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,6 +13,7 @@ from iblf_jax.sensors import (
     Measured,
     Unmeasured,
 )
+from refused import assert_refused
 
 PERIOD = jnp.asarray(1e-3)
 ENCODER = Encoder(
@@ -53,17 +52,18 @@ def test_what_is_not_rounded_and_what_a_step_is():
 
 
 def test_the_derivative_of_a_rounded_reading_is_1():
-    slope = jax.grad(lambda x: Direct(resolution=0.25).measure_level(x, None, PERIOD, ())[0].sum())
-    np.testing.assert_array_equal(slope(jnp.array([0.3, -0.1])), [1.0, 1.0])
+    direct, encoder = Direct(resolution=0.25), Encoder(counts=100, velocity=Measured())
+    for read in (
+        lambda x: direct.measure_level(x, None, PERIOD, ())[0],
+        lambda x: encoder.measure(x, x, jnp.zeros((1, 2)), PERIOD, ())[0].q,
+    ):
+        slope = jax.grad(lambda x, read=read: read(x).sum())(jnp.array([0.3, -0.1]))
+        np.testing.assert_array_equal(slope, [1.0, 1.0])
 
 
-def test_levels_that_are_not_measured():
+def test_levels_that_are_not_measured_and_advice_that_names_the_part():
     sensor = Levels((Ideal(), None, Unmeasured(), Direct()))
-    assert sensor.measured == (1, 2, 5)
-    assert isinstance(sensor.parts[1], Unmeasured)
-
-
-def test_the_advice_names_the_part():
+    assert sensor.measured == (1, 2, 5) and isinstance(sensor.parts[1], Unmeasured)
     fast = Encoder(velocity=FilteredDifference(cutoff=1e5))
     (text,) = Levels((Direct(), fast)).advice(PERIOD)
     assert text.startswith("sensor.parts[1].velocity.cutoff = 100000 rad/s")
@@ -71,5 +71,4 @@ def test_the_advice_names_the_part():
 
 @pytest.mark.parametrize("parts", [(), ENCODER, (3.0,), (Levels((ENCODER,)),), (Measured(),)])
 def test_what_is_no_sensor_is_refused(parts):
-    with pytest.raises(ValueError, match=r"Levels\.parts"):
-        Levels(parts)
+    assert_refused(r"Levels\.parts", Levels, parts)

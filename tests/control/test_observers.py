@@ -1,7 +1,5 @@
 """Disturbance observers: the error equations that they are said to obey, point by point."""
 
-from __future__ import annotations
-
 import dataclasses
 import warnings
 
@@ -32,11 +30,8 @@ def estimate_rate():
             return scenario.observer.estimate(t, q, dq, scenario.model, eta)
 
         _, df_hat = jax.jvp(f_hat, (q, dq, eta), (rate.q, rate.dq, rate.observer))
-        return (
-            df_hat,
-            sample.disturbance - sample.disturbance_estimate,
-            mass_matrix_rate(scenario.model, q, dq) @ dq,
-        )
+        rest = mass_matrix_rate(scenario.model, q, dq) @ dq
+        return df_hat, sample.disturbance - sample.disturbance_estimate, rest
 
     return at
 
@@ -51,11 +46,7 @@ POLES = {
 """Member -> the poles that its docstring states for its gains."""
 
 
-def test_the_poles_of_every_observer_with_a_state_are_listed():
-    assert set(POLES) == set(members.OBSERVERS) - {"none"}
-
-
-@pytest.mark.parametrize("name", POLES)
+@pytest.mark.parametrize("name", sorted(members.OBSERVERS.keys() - {"none"}))
 def test_an_observer_has_the_poles_that_it_states(name):
     """The characteristic polynomial of its rate, and of its exact step over a period."""
     observer, model, period = members.OBSERVERS[name], members.TWO_LINK, 4e-3
@@ -79,17 +70,13 @@ def test_an_observer_has_the_poles_that_it_states(name):
 @pytest.mark.parametrize("payload", [0.0, 0.5], ids=["nominal", "unknown-payload"])
 @pytest.mark.parametrize("kind", [Momentum, AsPublished])
 def test_error_equation(estimate_rate, kind, payload, rng):
-    """f_hat' = kf f_tilde: f_tilde' = f' - kf f_tilde exactly (momentum), and less kf M0' q' as
-    printed."""
+    """f_tilde' = f' - kf f_tilde exactly (momentum), and less kf M0' q' as printed."""
     base = ij.presets.zhang_yan_2024()
-    kf = np.asarray([20.0, 12.0])
-    plant = dataclasses.replace(base.plant, payload=payload)
+    kf, plant = np.asarray([20.0, 12.0]), dataclasses.replace(base.plant, payload=payload)
     scenario = dataclasses.replace(base, plant=plant, observer=kind(kf=kf))
     for _ in range(5):
-        q, dq, eta = rng.uniform(0.3, 0.7, 2), rng.normal(size=2), rng.normal(size=2)
-        df_hat, f_tilde, rest = estimate_rate(
-            scenario, jnp.asarray(0.4), *map(jnp.asarray, (q, dq, eta))
-        )
+        states = rng.uniform(0.3, 0.7, 2), rng.normal(size=2), rng.normal(size=2)
+        df_hat, f_tilde, rest = estimate_rate(scenario, *map(jnp.asarray, (0.4, *states)))
         expected = kf * f_tilde + (kf * rest if kind is AsPublished else 0.0)
         np.testing.assert_allclose(df_hat, expected, rtol=1e-9, atol=1e-9)
         assert np.max(np.abs(rest)) > 1e-3
@@ -101,6 +88,5 @@ def test_a_law_without_an_observer_is_not_advised_about_kf(paper):
     with pytest.warns(UserWarning, match="Theorem 2 needs kf"):
         canonical(low)
     law = ij.controllers.AdaptiveRBF(k1=2.0, K2=20.0)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         canonical(dataclasses.replace(low, controller=law))

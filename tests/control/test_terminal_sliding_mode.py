@@ -1,7 +1,6 @@
-"""The nonsingular terminal sliding mode against a program of its own in plain NumPy, its claim, and
-what a sampled loop makes of its layer."""
+"""The nonsingular terminal sliding mode: beside a program of its own, its claim, its layer."""
 
-from __future__ import annotations
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -17,14 +16,14 @@ from iblf_jax.engine.period import radius_at
 from iblf_jax.simulation.scenario import canonical
 
 ARM = Loop(mass=(1.2, 0.7), length=(0.4, 0.3), centre=(0.2, 0.16), inertia=(0.02, 0.01))
-LAW = {
-    "beta": [1.3, 0.8],
-    "K": [25.0, 18.0],
-    "layer": [0.02, 0.05],
-    "p": np.array([1.4, 1.7]),
-    "smoothing": np.array([0.02, 0.05]),
-}
+LAW = {"beta": [1.3, 0.8], "K": [25.0, 18.0], "layer": [0.02, 0.05]}
+LAW |= {"p": np.array([1.4, 1.7]), "smoothing": np.array([0.02, 0.05])}
 SAMPLED = LAW | {"beta": 2.0, "K": 20.0, "layer": 0.05}
+WRAPPED = {
+    "limit": partial(ij.controllers.Saturated, limit=1e-3),
+    "auxiliary": partial(ij.controllers.Saturated, limit=1e-3, auxiliary=5.0, edge="smooth"),
+    "filter": partial(ij.controllers.SafetyFilter, limit=30.0),
+}
 START = ij.Initial(q=[0.8, 0.6], dq=[0.0, 0.0])
 
 
@@ -44,7 +43,6 @@ def torque(law, t, q, dq, f_hat):
 
 
 def loop(law, **parts):
-    """The scenario of this law on the arm of `ARM`."""
     return loop_on(ARM, ij.controllers.TerminalSlidingMode(**law), **parts)
 
 
@@ -55,18 +53,13 @@ def test_the_torque_at_random_states_and_parameters(rng):
     def command(law, t, q, dq, f_hat):
         return law.command(t, q, dq, f_hat, scenario.context, ())[0].tau
 
+    ranges = {"beta": (0.3, 3.0), "K": (5.0, 50.0), "layer": (0.01, 0.5)}
+    ranges |= {"p": (1.1, 1.9), "smoothing": (0.005, 0.1)}
     for _ in range(50):
-        law = {
-            "beta": rng.uniform(0.3, 3.0, 2),
-            "K": rng.uniform(5.0, 50.0, 2),
-            "layer": rng.uniform(0.01, 0.5, 2),
-            "p": rng.uniform(1.1, 1.9, 2),
-            "smoothing": rng.uniform(0.005, 0.1, 2),
-        }
-        t, f_hat = rng.uniform(0.0, 5.0), rng.normal(size=2)
-        q, dq = rng.normal(size=2), rng.normal(size=2)
+        law = {name: rng.uniform(*ends, 2) for name, ends in ranges.items()}
+        t, (q, dq, f_hat) = rng.uniform(0.0, 5.0), rng.normal(size=(3, 2))
         part = ij.controllers.TerminalSlidingMode(**law)
-        found = command(part, jnp.asarray(t), jnp.asarray(q), jnp.asarray(dq), jnp.asarray(f_hat))
+        found = command(part, *map(jnp.asarray, (t, q, dq, f_hat)))
         expected = torque(law, t, q, dq, f_hat)
         np.testing.assert_allclose(found, expected, atol=1e-12 * max(1.0, np.max(np.abs(expected))))
 
@@ -90,35 +83,23 @@ def test_an_exponent_without_a_law_is_refused():
 
 @pytest.mark.slow
 def test_a_sampled_loop_is_assessed_with_the_slope_of_the_layer():
-    """Outside the layer the torque does not depend on the position, which says nothing about the
-    period.  A layer that is too thin for the period is reported."""
+    """Outside the layer the torque does not depend on the position, which says nothing about it."""
     wide = loop(SAMPLED, initial=START, sampling=ij.Sampling(period=1e-3))
     tube = wide.context.tube(jnp.zeros(()))
     sigma, _ = surface(SAMPLED, np.asarray(START.q) - tube.q_d, np.asarray(START.dq) - tube.dq_d)
     assert np.all(np.abs(sigma) > SAMPLED["layer"])
-    radii, reported = [], []
-    for layer in (0.05, 1e-4):
+    for layer, is_thin in ((0.05, False), (1e-4, True)):
         with notices.muted():
             scenario = ij.with_parameters(wide, {"controller.layer": layer})
             run = ij.simulate(scenario, duration=0.1, dt=1e-3)
-        radii.append(float(run.metrics.sampling_radius))
-        reported.append(bool(int(run.status) & int(Status.SAMPLING_TOO_SLOW)))
-    assert radii[0] < 1.0 < radii[1]
-    assert reported == [False, True]
+        assert (float(run.metrics.sampling_radius) > 1.0) == is_thin, layer
+        assert bool(int(run.status) & int(Status.SAMPLING_TOO_SLOW)) == is_thin, layer
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "wrapped",
-    [
-        lambda law: ij.controllers.Saturated(law, limit=1e-3),
-        lambda law: ij.controllers.Saturated(law, limit=1e-3, auxiliary=5.0, edge="smooth"),
-        lambda law: ij.controllers.SafetyFilter(law, limit=30.0),
-    ],
-    ids=["limit", "auxiliary state", "filter"],
-)
-def test_limits_of_laws_within_others_are_left_out_of_the_linearisation(wrapped):
+@pytest.mark.parametrize("name", WRAPPED)
+def test_limits_of_laws_within_others_are_left_out_of_the_linearisation(name):
     """Wherever a limit is active the radius would be at least 1, that of an open loop."""
     scenario = loop(SAMPLED, initial=START, sampling=ij.Sampling(period=1e-3))
-    scenario = canonical(ij.with_parts(scenario, controller=wrapped(scenario.controller)))
+    scenario = canonical(ij.with_parts(scenario, controller=WRAPPED[name](scenario.controller)))
     assert radius_at(scenario, 1e-3, np.array([0.01, 0.02])) < 1.0

@@ -1,7 +1,4 @@
-"""The gpu backend on a CPU: its own source and its own launcher, with a CUDA driver that loops over
-the threads."""
-
-from __future__ import annotations
+"""The gpu backend on a CPU, with a CUDA driver that loops over the threads."""
 
 import ctypes
 from functools import lru_cache

@@ -1,7 +1,4 @@
-"""Backends: they agree with the reference run, runs do not touch each other, and what goes wrong
-falls back."""
-
-from __future__ import annotations
+"""Kernels on processors agree with the reference run, and runs do not touch each other."""
 
 import shutil
 from functools import partial
@@ -23,6 +20,7 @@ from iblf_jax.simulation.scenario import canonical
 from iblf_jax.tuning.quantities import Peak, Quantities, TimeIntegral
 
 needs_compiler = pytest.mark.skipif(native.unavailable() is not None, reason="no C++ compiler")
+pytestmark = needs_compiler
 COMPILED = {}
 
 
@@ -45,24 +43,27 @@ def draws(runs, seed=0):
     }
 
 
+def part(outcome, runs):
+    return jax.tree.map(lambda x: x[runs], outcome)
+
+
 def assert_same(found, expected, tolerance):
     """Equal up to a tolerance relative to the size of each array; infinities in the same places."""
-    assert jax.tree.structure(found) == jax.tree.structure(expected)
-    for x, y in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+
+    def compare(x, y):
+        x, y = np.asarray(x), np.asarray(y)
         assert (x.shape, x.dtype) == (y.shape, y.dtype)
-        finite = np.isfinite(y)
-        scale = 1 + np.max(np.abs(y[finite]), initial=0)
+        scale = 1 + np.max(np.abs(y[np.isfinite(y)]), initial=0)
         np.testing.assert_allclose(x, y, rtol=0, atol=tolerance * scale)
+
+    jax.tree.map(compare, found, expected)
 
 
 @pytest.fixture(scope="module")
 def recorded_steps():
-    """Steps of 19 runs with a record of every fifth one, as a function of a loop; and what the scan
-    gives."""
-    inputs = Inputs(
-        canonical(ij.presets.zhang_yan_2024()), (), jnp.asarray(1e-3), jnp.asarray(40.0)
-    )
-    step = TimeStep("euler")
+    """Steps of 19 runs with some records, as a function of a loop; and what the scan gives."""
+    scenario, step = canonical(ij.presets.zhang_yan_2024()), TimeStep("euler")
+    inputs = Inputs(scenario, (), jnp.asarray(1e-3), jnp.asarray(40.0))
 
     def steps(loop, values):
         batch = Batch.of(inputs, values)
@@ -89,41 +90,35 @@ def test_every_compiler_gives_the_same_numbers(tmp_path, monkeypatch, recorded_s
     steps, values, expected = recorded_steps
     cpu.kernel.cache_clear()
     compiled = jax.jit(partial(steps, loops.kernel_stepper(registry.NATIVE)))
-    found = jax.tree.map(np.asarray, compiled(values))
-    assert_same(found, jax.tree.map(np.asarray, expected), 1e-12)
-    fewer = jax.tree.map(np.asarray, compiled({k: v[2:] for k, v in values.items()}))
-    for x, y in zip(jax.tree.leaves(fewer), jax.tree.leaves(found), strict=True):
-        np.testing.assert_array_equal(x, y[2:])
+    found = compiled(values)
+    assert_same(found, expected, 1e-12)
+    fewer = compiled({k: v[2:] for k, v in values.items()})
+    jax.tree.map(np.testing.assert_array_equal, fewer, part(found, slice(2, None)))
     cpu.kernel.cache_clear()
 
 
 @pytest.mark.slow
-@needs_compiler
 def test_results_do_not_depend_on_place_or_number_of_runs():
     values = draws(83)
     together = batch(values=values)
     for few in (slice(0, 5), slice(40, 45), slice(78, 83)):
-        alone = batch(values={k: v[few] for k, v in values.items()})
-        for x, y in zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True):
-            np.testing.assert_array_equal(x[few], y)
+        alone, some = batch(values={k: v[few] for k, v in values.items()}), part(together, few)
+        jax.tree.map(np.testing.assert_array_equal, some, alone)
 
 
 @pytest.mark.slow
-@needs_compiler
 def test_a_run_that_fails_does_not_touch_the_others():
     good, broken = batch(dt=4e-3), draws(5)
     broken["plant.mass[1]"][[1, 4]] = np.nan, 0.02
     broken["initial.q"][3] = 40.0
     found = batch(values=broken, dt=4e-3)
-    for x, y in zip(jax.tree.leaves(found), jax.tree.leaves(good), strict=True):
-        np.testing.assert_array_equal(x[[0, 2]], y[[0, 2]])
+    jax.tree.map(np.testing.assert_array_equal, part(found, [0, 2]), part(good, [0, 2]))
     for run, flag in ((1, "NOT_FINITE"), (3, "BOUND_VIOLATED"), (4, "STEP_TOO_LARGE")):
         assert ij.Status[flag] in ij.Status(int(found.status[run]))
     np.testing.assert_array_equal(found.status, batch("vmap", broken, dt=4e-3).status)
 
 
 @pytest.mark.slow
-@needs_compiler
 @pytest.mark.parametrize(("runs", "dtype"), [(1, "float64"), (65, "float32")])
 def test_leaves_become_rows_and_leaves_again(runs, dtype):
     """As by JAX's own operations, for every type and shape that a carry may have."""
@@ -142,7 +137,6 @@ def test_leaves_become_rows_and_leaves_again(runs, dtype):
         np.testing.assert_array_equal(found, wanted, strict=True)
 
 
-@needs_compiler
 def test_rows_of_another_size_are_an_error_and_no_crash():
     """What XLA is told of the shapes is checked where memory is written."""
     for rows, integers, words in ((2, 0, "does not fit"), (5, 0, "without an array")):
@@ -155,10 +149,8 @@ def test_rows_of_another_size_are_an_error_and_no_crash():
 
 
 @pytest.mark.slow
-@needs_compiler
 def test_a_long_step_is_cut_into_functions(monkeypatch):
-    """Cut into pieces of fifty operations, and with its stages as calls, the numbers stay: the
-    places of some products with sums differ."""
+    """Of fifty operations, and with stages as calls: some products with sums have other places."""
     whole = batch(record_every=100)
     limits = thresholds.LOWERING_LIMITS._replace(written_out=10)
     monkeypatch.setattr(thresholds, "MAX_C_FUNCTION_NODES", 0)
@@ -179,8 +171,7 @@ DIRECTIONS = {"controller.K2": np.eye(3, 2), "observer.kf": np.eye(3, 2, -1)}
 
 
 def pushed(backend):
-    """A batch of the paper's runs with three tangents: outcome, tangents, and what the folds of a
-    loss give."""
+    """A batch of runs with three tangents: outcome, tangents, and what folds of a loss give."""
     scenario, dt = canonical(ij.presets.zhang_yan_2024()), jnp.asarray(1e-3)
     varied = {k: jnp.asarray(v) for k, v in draws(3).items()}
     losses = Quantities((TimeIntegral(), TimeIntegral("torque"), Peak(10.0)))
@@ -197,7 +188,6 @@ def pushed_by_vmap():
 
 
 @pytest.mark.slow
-@needs_compiler
 @pytest.mark.parametrize("by_columns", [False, True])
 def test_forward_sensitivities(monkeypatch, pushed_by_vmap, by_columns):
     if by_columns:
@@ -207,30 +197,28 @@ def test_forward_sensitivities(monkeypatch, pushed_by_vmap, by_columns):
         limits = executor.limits._replace(derivative_nodes=0)
         monkeypatch.setitem(registry.EXECUTORS, "native", executor._replace(limits=limits))
         monkeypatch.setattr(execute, "run_with_tangents", None)
-    found = jax.tree.map(np.asarray, pushed("auto" if by_columns else "native"))
-    for x, y in zip(found, pushed_by_vmap, strict=True):
-        assert_same(x, jax.tree.map(np.asarray, y), 1e-10)
+    found = pushed("auto" if by_columns else "native")
+    assert_same(found, pushed_by_vmap, 1e-10)
     _, tangents, products = found
     assert tangents["rmse"].shape == (3, 3, 2)
     assert [x.shape for x in products] == [(3, 3, 3)] * 2
 
 
 @pytest.mark.slow
-@needs_compiler
 def test_a_long_run_in_several_calls_is_the_same_run(monkeypatch):
     """Python sees Ctrl-C between them; the numbers are bit for bit those of one call."""
-    scenario = ij.presets.zhang_yan_2024()
     options = {"method": "euler", "record_every": 7, "backend": "native"}
-    whole = ij.simulate(scenario, duration=0.5, dt=1e-3, **options)
-    calls = []
+    run = partial(ij.simulate, ij.presets.zhang_yan_2024(), duration=0.5, dt=1e-3, **options)
+    whole, calls = run(), []
+
+    def steps_per_call(nodes, steps, every):
+        calls.append(nodes)
+        return 21 * 7
+
     monkeypatch.setattr(thresholds, "OPERATIONS_PER_CALL", 1.0)
-    monkeypatch.setattr(
-        thresholds, "steps_per_call", lambda nodes, steps, every: calls.append(nodes) or 21 * 7
-    )
-    parts = ij.simulate(scenario, duration=0.5, dt=1e-3, **options)
+    monkeypatch.setattr(thresholds, "steps_per_call", steps_per_call)
+    jax.tree.map(np.testing.assert_array_equal, run(), whole)
     assert len(calls) == 1 and calls[0] > 100
-    for x, y in zip(jax.tree.leaves(parts), jax.tree.leaves(whole), strict=True):
-        np.testing.assert_array_equal(np.asarray(x), np.asarray(y))
 
 
 @pytest.mark.parametrize(
@@ -244,7 +232,6 @@ def test_a_call_is_short_and_whole(nodes, steps, every):
     assert (length == steps) == (steps * nodes < thresholds.OPERATIONS_PER_CALL)
 
 
-@needs_compiler
 def test_copies_at_the_end_of_a_batch_have_the_results_of_their_runs():
     """The kernel does not compute blocks of copies; a copy of a run is not one of its neighbour."""
 

@@ -1,12 +1,9 @@
-"""The gpu backend: the kernel on a GPU or, without one, its logic on a CPU; its source through
-NVRTC; and what happens without a device.
+"""The gpu backend: the kernel on a GPU or, without one, on a CPU; NVRTC; and without a device.
 
     JAX_PLATFORMS=cuda,cpu python -m pytest tests/kernels/test_cuda.py
 
 runs on a GPU what elsewhere runs on the CPU.
 """
-
-from __future__ import annotations
 
 from functools import partial
 from types import SimpleNamespace
@@ -17,8 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from fallback import with_fallback
+from refused import assert_refused
 from scenarios_of_members import scenarios
-from test_cpu import assert_same, draws, needs_compiler
+from test_cpu import assert_same, draws, needs_compiler, part
 from test_from_jaxpr import DT, STANDARD, arrays_of, carry_of, stepped
 
 import iblf_jax as ij
@@ -34,7 +32,6 @@ from iblf_jax.kernels.layout import Layout
 from iblf_jax.kernels.packed import Packed
 from iblf_jax.kernels.program import Builder, finished
 from iblf_jax.kernels.toolchain import ToolchainError
-from iblf_jax.simulation.metrics import standard
 from iblf_jax.simulation.scenario import canonical
 
 pytestmark = pytest.mark.filterwarnings("error::iblf_jax.engine.compile.BackendWarning")
@@ -68,7 +65,6 @@ def test_a_kernel_does_what_its_program_does(name):
 
 
 def gpu_for_this_platform(monkeypatch, **changes):
-    """The gpu executor is the one that compiles kernels for CPUs."""
     record = registry.GPU._replace(platforms=("cpu",), **changes)
     monkeypatch.setattr(registry, "EXECUTORS", {"gpu": record})
 
@@ -88,7 +84,7 @@ TOLERANCE = {"float64": 1e-10, "float32": 1e-4}
 def runs_of(dtype, backend, steps):
     """Values -> the outcome of so many steps of runs of the paper's scenario."""
     scenario = canonical(ij.astype(ij.presets.zhang_yan_2024(), dtype))
-    folds = jax.tree.map(lambda x: jnp.asarray(x, dtype), standard())
+    folds = jax.tree.map(lambda x: jnp.asarray(x, dtype), STANDARD)
     dt, request = jnp.asarray(DT, dtype), RunRequest(steps, "heun", 7, backend=backend)
     compiled = jax.jit(lambda v: execute.run_batch(scenario, v, folds, dt, request))
     return lambda values: jax.tree.map(
@@ -97,11 +93,9 @@ def runs_of(dtype, backend, steps):
 
 
 def spoiled(runs):
-    """Draws, of which three fail."""
     values = draws(runs)
-    values["plant.mass[1]"][1] = np.nan
+    values["plant.mass[1]"][[1, 4]] = np.nan, 0.02
     values["initial.q"][3] = 40.0
-    values["plant.mass[1]"][4] = 0.02
     return values
 
 
@@ -113,22 +107,19 @@ def spoiled(runs):
     + [pytest.param(x, 1000, 1000, marks=on_a_gpu) for x in ("float64", "float32")],
 )
 def test_a_batch_agrees_with_the_reference(dtype, runs, steps, runs_here):
-    """37 runs are two blocks, the second not full; 200 steps are four launches, the last not
-    full.  Runs that fail have the reference's status and touch no other."""
+    """The last of two blocks and of four launches are not full.  Runs that fail touch no other."""
     values, by_kernel = spoiled(runs), runs_of(dtype, "gpu", steps)
     found, good = by_kernel(values), by_kernel(draws(runs))
     expected = runs_of(dtype, "vmap", steps)(values)
     np.testing.assert_array_equal(found.status, expected.status)
     assert len(set(found.status[[0, 1, 3]].tolist())) == 3
     others = np.setdiff1d(np.arange(runs), [1, 3, 4])
-    for x, y in zip(jax.tree.leaves(found), jax.tree.leaves(good), strict=True):
-        np.testing.assert_array_equal(x[others], y[others])
-    sound = [jax.tree.map(lambda x: x[others], x) for x in (found, expected)]
-    assert_same(*sound, TOLERANCE[dtype])
+    found, good, expected = (part(x, others) for x in (found, good, expected))
+    jax.tree.map(np.testing.assert_array_equal, found, good)
+    assert_same(found, expected, TOLERANCE[dtype])
 
 
 def results_of(operation, dtype, x, y):
-    """An operation on floats, for each pair of numbers, by the kernel."""
     builder = Builder(dtype)
     inputs = [builder.input("carry", i, "f") for i in range(2)]
     result = builder.emit(operation, *inputs, kind="f")
@@ -246,14 +237,12 @@ def test_auto_on_a_gpu_without_nvrtc_runs_on_vmap(monkeypatch):
 @needs_a_cpu
 @needs_compiler
 def test_the_default_device_decides_on_a_machine_with_a_gpu(paper, monkeypatch):
-    """Where JAX computes on a GPU, a user may compute on the processor: runs and studies take its
-    backend and its devices."""
+    """Runs and studies take the backend and the devices of the processor."""
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     draw = partial(ij.monte_carlo, paper, {"plant.mass[1]": ij.value(ij.uniform(0.7, 0.9))})
     executor = ij.studies.LocalExecutor(devices=jax.devices("cpu"))
     words = r"platform that JAX computes on, gpu.*jax\.default_device"
-    with pytest.raises(ValueError, match=words):
-        draw(runs=3, duration=0.05, executor=executor)
+    assert_refused(words, draw, runs=3, duration=0.05, executor=executor)
     monkeypatch.setattr(jax, "local_devices", lambda **_: pytest.fail("these would be GPUs"))
     with jax.default_device(jax.devices("cpu")[0]):
         assert registry.default_backend() == ("native", None)
@@ -262,27 +251,23 @@ def test_the_default_device_decides_on_a_machine_with_a_gpu(paper, monkeypatch):
     assert study.backend == "native" and not study.status.any()
 
 
-@pytest.mark.parametrize(
-    ("capabilities", "found"),
-    [
-        (["9.0"], "sm_90"),
-        (["12.0"] * 2, "sm_120"),
-        (["8.0", "9.0"], "differ"),
-        (["gfx90a"], "NVIDIA"),
-    ],
-)
-def test_architecture(capabilities, found, monkeypatch):
-    devices = [SimpleNamespace(device_kind="a card", compute_capability=x) for x in capabilities]
+ARCHITECTURES = {"sm_90": ["9.0"], "sm_120": ["12.0"] * 2}
+UNKNOWN = {"differ": ["8.0", "9.0"], "NVIDIA": ["gfx90a"]}
+
+
+@pytest.mark.parametrize("found", [*ARCHITECTURES, *UNKNOWN])
+def test_architecture(found, monkeypatch):
+    versions = (ARCHITECTURES | UNKNOWN)[found]
+    devices = [SimpleNamespace(device_kind="a card", compute_capability=x) for x in versions]
     monkeypatch.setattr(jax, "local_devices", lambda: devices)
-    if found.startswith("sm"):
+    if found in ARCHITECTURES:
         assert gpu.architecture() == found
-        return
-    with pytest.raises(ToolchainError, match=found):
-        gpu.architecture()
+    else:
+        with pytest.raises(ToolchainError, match=found):
+            gpu.architecture()
 
 
 def needs_nvrtc() -> None:
-    """Skips a test where there is no NVRTC."""
     try:
         nvrtc.library()
     except ToolchainError:
@@ -295,8 +280,7 @@ def test_nvrtc_compiles_the_kernel(architecture, dtype, paper):
     program, shared, lane, _ = step_of(paper, draws(2), method="rk4", dtype=dtype)
     text = source(program, shared.size, lane.shape[0], CUDA)
     image = nvrtc.compiled(text, architecture)
-    assert image[:4] == b"\x7fELF"
-    assert b"iblf_jax_advance" in image
+    assert image[:4] == b"\x7fELF" and b"iblf_jax_advance" in image
     assert nvrtc.compiled(text, architecture) == image
     for text, target in (("this is not CUDA;", "sm_90"), ("", "sm_1")):
         with pytest.raises(ToolchainError, match=r"^NVRTC \d+\.\d+ failed: .*error.*$"):

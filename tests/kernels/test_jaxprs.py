@@ -1,7 +1,5 @@
 """What the package knows of JAX's internals holds for the version that is installed."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -27,7 +25,6 @@ def with_a_reverse_rule(x):
 
 
 with_a_reverse_rule.defvjp(lambda x: (jnp.sin(x), x), lambda x, g: (g,))
-
 CALLS = {
     "jit": jax.jit(jnp.sin),
     "custom_jvp": with_a_rule,
@@ -47,8 +44,7 @@ def test_the_function_that_an_equation_calls_is_found(kind):
     inner = jaxprs.called(equation)
     assert names(inner) == ["sin"]
     (innermost,) = jaxprs.opened(inner)[0].eqns
-    assert jaxprs.called(innermost) is None
-    assert jaxprs.count_operations(traced) == 2
+    assert jaxprs.called(innermost) is None and jaxprs.count_operations(traced) == 2
 
 
 def test_a_function_that_is_called_often_is_visited_once():
@@ -76,8 +72,7 @@ def test_dependences():
     jaxpr, _ = jaxprs.opened(traced)
     x, y, z = jaxpr.invars
     found = jaxprs.needed(traced)
-    assert {x, z} <= found
-    assert y not in found
+    assert {x, z} <= found and y not in found
 
 
 def test_one_entry_of_a_stack():
@@ -88,9 +83,9 @@ def test_one_entry_of_a_stack():
     for index in range(2):
         entry = jaxprs.entry_of_stack(traced, index)
         np.testing.assert_array_equal(entry(jnp.asarray(0.3)), stacked(0.3)[index])
-    assert jaxprs.entry_of_stack(jax.make_jaxpr(jnp.sin)(0.3), 0) is None
     other_axis = jax.make_jaxpr(lambda x: jnp.stack([x, x], axis=1))(jnp.ones(2))
-    assert jaxprs.entry_of_stack(other_axis, 0) is None
+    for other in (jax.make_jaxpr(jnp.sin)(0.3), other_axis):
+        assert jaxprs.entry_of_stack(other, 0) is None
 
 
 def test_constants_and_primitives_of_inner_functions():
@@ -117,14 +112,10 @@ def test_constants_and_primitives_of_inner_functions():
         assert all(any(np.array_equal(x, y) for x in found) for y in wanted)
 
 
-def shape_of_first(x, y):
-    return x
-
-
 double_sum = new_primitive(
     "double_sum_of_the_tests",
     lambda x, y: 2.0 * x + 2.0 * y,
-    shapes=shape_of_first,
+    shapes=lambda x, y: x,
     jvp=lambda primals, tangents: (
         double_sum.bind(*primals),
         double_sum.bind(*map(without_symbol, tangents)),
@@ -150,7 +141,7 @@ def test_a_primitive_of_our_own_and_its_derivatives():
     first = new_primitive(
         "first_of_the_tests",
         lambda x, y: x,
-        shapes=shape_of_first,
+        shapes=lambda x, y: x,
         jvp=jvp,
         batch=lambda operands, axes: (operands[0], axes[0]),
     )

@@ -1,7 +1,5 @@
 """Elementary functions of the backends against NumPy in higher precision."""
 
-from __future__ import annotations
-
 import ctypes
 import inspect
 import platform
@@ -24,9 +22,10 @@ from iblf_jax.kernels.program import Builder, finished, kind_of
 LINE = np.linspace(-30, 30, 4001)
 UNIT = np.linspace(-0.999, 0.999, 4001)
 SPREAD = np.concatenate([10.0 ** np.linspace(-30, 30, 3001), np.linspace(0.4, 2.5, 3001)])
+TURNS = np.concatenate([LINE, 1e3 * LINE, np.pi / 2 * np.arange(-500, 500)])
 FUNCTIONS = {
-    "sin": (np.sin, np.concatenate([LINE, 1e3 * LINE, np.pi / 2 * np.arange(-500, 500)]), 1.5),
-    "cos": (np.cos, np.concatenate([LINE, 1e3 * LINE, np.pi / 2 * np.arange(-500, 500)]), 1.5),
+    "sin": (np.sin, TURNS, 1.5),
+    "cos": (np.cos, TURNS, 1.5),
     "tan": (np.tan, LINE, 5),
     "exp": (np.exp, 2.8 * LINE, 3),
     "expm1": (np.expm1, np.concatenate([LINE, 0.01 * LINE, 1e-6 * LINE]), 3),
@@ -59,12 +58,8 @@ def kernel(dtype, flags=()):
         for name in FUNCTIONS
     )
     entries += 'extern "C" __attribute__((visibility("default"))) int width() { return W; }\n'
-    source = (
-        f"#define DOUBLE {int(dtype == np.float64)}\n"
-        + emit_c.header("vector.h")
-        + emit_c.header("mathlib.h")
-        + entries
-    )
+    headers = emit_c.header("vector.h") + emit_c.header("mathlib.h")
+    source = f"#define DOUBLE {int(dtype == np.float64)}\n{headers}{entries}"
     return toolchain.loaded(toolchain.built(source, flags)[0])
 
 
@@ -76,20 +71,16 @@ def native_value(library, name, x):
     return y[: len(x)]
 
 
-def ulps(found, exact, dtype):
-    """Error in units of the last place of `dtype`; near a zero of sin, of the argument's own
-    precision."""
-    return np.abs(found.astype(np.longdouble) - exact) / np.spacing(
-        np.maximum(np.abs(exact.astype(dtype)), np.finfo(dtype).tiny)
-    )
-
-
-def exactly(f, x):
-    """f in the highest precision at hand."""
+def worst_error(library, name, f, x):
+    """The largest error at some points in units of the last place, beside the highest precision at
+    hand; near a zero of sin, of the argument's own precision."""
     try:
-        return f(x.astype(np.longdouble))
+        exact = f(x.astype(np.longdouble))
     except TypeError:
-        return f(x.astype(np.float64)).astype(np.longdouble)
+        exact = f(x.astype(np.float64)).astype(np.longdouble)
+    size = np.maximum(np.abs(exact.astype(x.dtype)), np.finfo(x.dtype).tiny)
+    error = native_value(library, name, x).astype(np.longdouble) - exact
+    return np.max(np.abs(error) / np.spacing(size))
 
 
 @needs_compiler
@@ -102,7 +93,7 @@ def test_native_functions(dtype):
         x = points.astype(dtype)
         x = x[np.abs(x) < 85] if name == "exp" and dtype == np.float32 else x
         x = np.concatenate([x, spread(dtype).astype(dtype)]) if name in ("sin", "cos") else x
-        worst = np.max(ulps(native_value(library, name, x), exactly(f, x), dtype))
+        worst = worst_error(library, name, f, x)
         assert worst <= limit + 0.6, f"{name} is off by {worst} ulp"
         with np.errstate(all="ignore"):
             found, expected = native_value(library, name, edges), f(edges)
@@ -118,7 +109,7 @@ def test_sin_and_cos_without_a_fused_multiply_add(dtype):
     library = kernel(dtype, ("-march=nehalem",))
     x = np.concatenate([LINE, UNIT, spread(dtype)]).astype(dtype)
     for name, f in (("sin", np.sin), ("cos", np.cos)):
-        assert np.max(ulps(native_value(library, name, x), exactly(f, x), dtype)) <= 2.1
+        assert worst_error(library, name, f, x) <= 2.1
 
 
 LAX = {
@@ -129,13 +120,11 @@ LAX = {
 
 
 def all_operations(dtype, runs=256):
-    """A program of every row of the table, on every kind that C takes; what goes in; and what NumPy
-    makes of it, with names."""
+    """A program of all rows on all kinds of C, its inputs, what NumPy makes of it, and names."""
     rng, b = np.random.default_rng(0), Builder(dtype)
     sizes = 10.0 ** rng.uniform(-3, 1, (3, runs)) * rng.choice([-1, 1], (3, runs))
-    floats = np.where(rng.random((3, runs)) < 0.5, sizes, rng.uniform(-3, 3, (3, runs))).astype(
-        dtype
-    )
+    moderate = rng.uniform(-3, 3, (3, runs))
+    floats = np.where(rng.random((3, runs)) < 0.5, sizes, moderate).astype(dtype)
     floats[:, :3] = 1e9  # sin and cos on their seldom way
     values = {
         "f": floats,
@@ -146,44 +135,31 @@ def all_operations(dtype, runs=256):
     inputs = {
         kind: [b.input("carry", 3 * k + i, kind) for i in range(3)] for k, kind in enumerate("fib")
     }
-    outputs, expected, names = (
-        [i for kind in "fib" for i in inputs[kind]],
-        [*values["f"], *values["i"], *values["b"]],
-        ["input"] * 9,
-    )
+    outputs = [i for kind in "fib" for i in inputs[kind]]
+    expected, names = [row for kind in "fib" for row in values[kind]], ["input"] * 9
 
     def add(op, kinds, result):
-        args = [inputs[kind][place] for place, kind in enumerate(kinds)]
-        node = (
-            b.lookup((7.0, 8.0, 9.0, 10.0, 11.0), *args)
-            if op == "lookup"
-            else b.emit(op, *args, kind=result)
-        )
         columns = [values[kind][place].tolist() for place, kind in enumerate(kinds)]
+        rows, args = zip(*columns, strict=True), [inputs[x][i] for i, x in enumerate(kinds)]
         if op == "lookup":
-            folded = [7 + min(max(x, 0), 4) for x in columns[0]]
+            node = b.lookup((7.0, 8.0, 9.0, 10.0, 11.0), *args)
+            folded = [7 + min(max(x, 0), 4) for (x,) in rows]
         else:
-            folded = [
-                fold(op, list(xs), list(kinds), result, types["f"])
-                for xs in zip(*columns, strict=True)
-            ]
+            node = b.emit(op, *args, kind=result)
+            folded = [fold(op, list(xs), list(kinds), result, types["f"]) for xs in rows]
         outputs.append(node)
         expected.append(np.asarray(folded, types[result]))
         names.append(f"{op} of {kinds}")
 
-    for op, row in OPERATIONS.items():
-        if op in ("convert", "lookup"):
-            continue
+    for op in (x for x in OPERATIONS if x not in ("convert", "lookup")):
         function = LAX.get(op) or getattr(jax.lax, op)
         arity = sum(p.default is p.empty for p in inspect.signature(function).parameters.values())
-        for first in row.c or "f":
-            for kinds in (
-                [(first, *2 * kind) for kind in "fib"] if op == "select" else [(first,) * arity]
-            ):
+        for first in OPERATIONS[op].c or "f":
+            same = [(first,) * arity]
+            for kinds in [(first, *2 * kind) for kind in "fib"] if op == "select" else same:
                 dummies = [jax.ShapeDtypeStruct((), types[kind]) for kind in kinds]
-                add(
-                    op, kinds, kind_of(jax.eval_shape(lambda *x, f=function: f(*x), *dummies).dtype)
-                )
+                result = jax.eval_shape(lambda *x, f=function: f(*x), *dummies)
+                add(op, kinds, kind_of(result.dtype))
     for source, target in ("if", "bf", "bi", "fi"):
         add("convert", (source,), target)
     add("lookup", ("i",), "f")
@@ -214,31 +190,23 @@ def test_constants_are_folded_as_jax_computes_them():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "executor",
-    [pytest.param("native", marks=needs_compiler), pytest.param("gpu", marks=needs_compiler)],
-)
+@needs_compiler
+@pytest.mark.parametrize("run", [native.run, gpu_on_cpu.run], ids=["native", "gpu"])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_every_operation_is_the_same_everywhere(executor, dtype):
-    run = {"native": native.run, "gpu": gpu_on_cpu.run}[executor]
+def test_every_operation_is_the_same_everywhere(run, dtype):
     program, (floats, ints), expected, names = all_operations(dtype)
     assert {name.partition(" ")[0] for name in names[9:]} == set(OPERATIONS)
-    kinds, more = program.kinds, [np.zeros(floats.shape[1])] * len(names)
-    packed = Packed(
-        jnp.asarray(np.stack([*floats, *more][: sum(kind == "f" for kind in kinds)]), dtype),
-        jnp.asarray(np.stack([*ints, *more][: sum(kind != "f" for kind in kinds)]), jnp.int32),
-    )
-    after = jax.jit(
-        lambda carry: run(
-            program, jnp.zeros(1, dtype), jnp.zeros((1, floats.shape[1]), dtype), carry, 1, None
-        )[0]
-    )(packed)
+    kinds, runs, number = program.kinds, floats.shape[1], np.finfo(dtype)
+
+    def filled(rows, kind, to):
+        results = sum((x == "f") == (kind == "f") for x in kinds) - len(rows)
+        return jnp.asarray(np.concatenate([rows, np.zeros((results, runs))]), to)
+
+    packed = Packed(filled(floats, "f", dtype), filled(ints, "i", jnp.int32))
+    none = jnp.zeros(1, dtype), jnp.zeros((1, runs), dtype)
+    after = jax.jit(lambda carry: run(program, *none, carry, 1, None)[0])(packed)
     rows = {"f": iter(np.asarray(after.floats)), "i": iter(np.asarray(after.ints))}
     for name, kind, exact in zip(names, kinds, expected, strict=True):
         found = next(rows["f" if kind == "f" else "i"])
-        if kind == "f":
-            np.testing.assert_allclose(
-                found, exact, rtol=16 * np.finfo(dtype).eps, atol=np.finfo(dtype).tiny, err_msg=name
-            )
-        else:
-            np.testing.assert_array_equal(found, exact, name)
+        allowed = {"rtol": 16 * number.eps, "atol": number.tiny} if kind == "f" else {"rtol": 0}
+        np.testing.assert_allclose(found, exact, err_msg=name, **allowed)

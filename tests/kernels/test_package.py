@@ -1,7 +1,5 @@
 """The compiler is a package of its own: it imports nothing else of iblf_jax."""
 
-from __future__ import annotations
-
 import doctest
 import re
 
@@ -36,8 +34,7 @@ def test_the_example_of_the_package_runs():
     except kernels.ToolchainError:
         pytest.skip("no C++ compiler")
     result = doctest.testmod(kernels)
-    assert result.attempted > 10
-    assert not result.failed
+    assert result.attempted > 10 and not result.failed
 
 
 def test_caches_count_their_results_and_forget_them():

@@ -1,7 +1,4 @@
-"""The compiler and the cache of kernels: whatever is wrong with either, a kernel is right or is not
-there."""
-
-from __future__ import annotations
+"""The compiler and the cache of kernels: whatever is wrong, a kernel is right or is not there."""
 
 import contextlib
 import json
@@ -35,16 +32,12 @@ from iblf_jax.kernels.toolchain import ToolchainError
 
 SOURCE = 'extern "C" __attribute__((visibility("default"))) int value(void) { return 41; }'
 OTHER = SOURCE.replace("41", "42")
-
 ZIG_CACHE = os.environ.get("ZIG_GLOBAL_CACHE_DIR") or str(Path.home() / ".cache" / "zig")
-"""Where ziglang keeps what it makes of its own libraries, which takes it four seconds; of one place
-for all tests."""
-
+"""Where ziglang keeps its own libraries for all tests; to make them takes it four seconds."""
 needs_compiler = pytest.mark.skipif(native.unavailable() is not None, reason="no C++ compiler")
 
 
 def value(source=SOURCE):
-    """What a small library returns, built if need be."""
     return toolchain.loaded(toolchain.built(source)[0], "value").value()
 
 
@@ -68,7 +61,6 @@ def cache(tmp_path, monkeypatch):
 
 @pytest.fixture
 def library(filled, cache):
-    """The first kernel in a cache with both."""
     shutil.copytree(filled[0], cache.parent)
     return cache / filled[1]
 
@@ -80,19 +72,17 @@ def flipped(data: bytes, bit: int) -> bytes:
 
 
 def damages():
-    """Ways in which a file comes to hold something else, as functions of the folder and the
-    file."""
+    """Ways in which a file comes to hold something else: functions of the folder and the file."""
     draw = random.Random(0)
 
+    def rewritten(change):
+        return lambda _, f: f.write_bytes(change(f.read_bytes()))
+
     def cut(share):
-        return lambda _, f: f.write_bytes(
-            f.read_bytes()[: int(share * f.stat().st_size) if share >= 0 else -1]
-        )
+        return rewritten(lambda x: x[: int(share * len(x)) if share >= 0 else -1])
 
     def flip(share):
-        return lambda _, f: f.write_bytes(
-            flipped(f.read_bytes(), int(share * 8 * f.stat().st_size))
-        )
+        return rewritten(lambda x: flipped(x, int(share * 8 * len(x))))
 
     def copied(of):
         return lambda folder, f: shutil.copy(of(folder, f), f)
@@ -100,9 +90,9 @@ def damages():
     ways = {f"cut at {x:.3f}": cut(x) for x in (0.0, draw.random(), -1.0)}
     ways |= {f"bit at {x:.3f}": flip(x) for x in (draw.random(), draw.random(), draw.random())}
     return ways | {
-        "text": lambda _, f: f.write_text("this is no library\n"),
-        "longer": lambda _, f: f.write_bytes(f.read_bytes() + b"\0"),
-        "zeros": lambda _, f: f.write_bytes(bytes(f.stat().st_size)),
+        "text": rewritten(lambda _: b"this is no library\n"),
+        "longer": rewritten(lambda x: x + b"\0"),
+        "zeros": rewritten(lambda x: bytes(len(x))),
         "another kernel": copied(lambda folder, f: next(x for x in folder.iterdir() if x != f)),
         "another library": copied(lambda *_: Path(jaxlib.__file__).parent / "_jax.so"),
         "a folder": lambda _, f: (f.unlink(), f.mkdir(), (f / "x").write_text("")),
@@ -118,33 +108,24 @@ DAMAGES = damages()
 @needs_compiler
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_a_damaged_kernel_is_built_again(library, damage):
-    """Never loaded, in this process or a later one: truncated it kills, with one bit flipped it may
-    return anything."""
+    """Never loaded: truncated it kills, with one bit flipped it may return anything."""
     DAMAGES[damage](library.parent, library)
     assert toolchain._checked(library) is None, "the damage is seen"
-    assert value() == 41
-    assert toolchain._checked(library) is not None
-    assert sorted(x.suffix for x in library.parent.iterdir()) == [".so", ".so"], (
-        "nothing temporary stays"
-    )
+    assert value() == 41 and toolchain._checked(library) is not None
+    assert [x.suffix for x in library.parent.iterdir()] == [".so", ".so"], "nothing temporary stays"
     assert stat.S_IMODE(library.stat().st_mode) == 0o700
 
 
 @needs_compiler
-def test_a_whole_kernel_is_not_built_again(library, monkeypatch):
+def test_a_whole_kernel_is_not_built_again_and_what_was_checked_is_loaded(library, monkeypatch):
+    """A file that is damaged before the load is not loaded, and after it does no harm."""
     monkeypatch.setattr(toolchain, "draft", lambda *_: pytest.fail("built again"))
     assert [value(), value(OTHER)] == [41, 42]
-
-
-@needs_compiler
-def test_what_was_checked_is_loaded(library):
-    """A file that is damaged between the check and the load is not loaded; one that is damaged
-    after it does no harm."""
+    toolchain.CACHES.libraries.clear()
     loaded = toolchain.loaded(library, "value")
     with open(library, "r+b") as file:
         file.truncate(100)  # a library that was mapped from this file would now kill with SIGBUS
-    assert loaded.value() == 41
-    assert toolchain.loaded(library) is loaded
+    assert loaded.value() == 41 and toolchain.loaded(library) is loaded
     toolchain.CACHES.libraries.clear()
     with pytest.raises(ToolchainError, match="damaged"):
         toolchain.loaded(library)
@@ -153,30 +134,23 @@ def test_what_was_checked_is_loaded(library):
 def test_machine_code_of_gpus_is_checked_too(cache, monkeypatch):
     monkeypatch.setattr(nvrtc, "version", lambda: "13.0")
     monkeypatch.setattr(nvrtc, "_compile", lambda source, flags: b"machine code")
-    assert nvrtc.compiled("source", "sm_90") == b"machine code"
-    (file,) = cache.iterdir()
-    file.write_bytes(flipped(file.read_bytes(), 5))
-    assert nvrtc.compiled("source", "sm_90") == b"machine code"
-
-
-# --------------------------------------------- links
+    for _ in range(2):
+        assert nvrtc.compiled("source", "sm_90") == b"machine code"
+        (file,) = cache.iterdir()
+        file.write_bytes(flipped(file.read_bytes(), 5))
 
 
 @needs_compiler
 def test_links_in_the_cache_are_not_followed(library, tmp_path):
-    """Neither one in a kernel's place, nor one that poses as a draft, nor one to the cache
-    itself."""
+    """Neither one in a kernel's place nor one that poses as a draft."""
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
-    (elsewhere / "file").write_bytes(library.read_bytes())
-    (elsewhere / "file").chmod(0o640)
-    library.unlink()
+    library.rename(elsewhere / "file").chmod(0o640)
     library.symlink_to(elsewhere / "file")
     for name in (".kernel.planted.partial", "tmp12345678"):
         (library.parent / name).symlink_to(elsewhere)
         os.utime(library.parent / name, (0, 0), follow_symlinks=False)
-    assert value() == 41
-    assert not library.is_symlink()
+    assert value() == 41 and not library.is_symlink()
     assert stat.S_IMODE((elsewhere / "file").stat().st_mode) == 0o640
     assert [x.name for x in elsewhere.iterdir()] == ["file"]
 
@@ -216,8 +190,7 @@ def test_programs_of_jax_get_the_check_of_the_kernels(cache, tmp_path, monkeypat
     assert stat.S_IMODE(cache.stat().st_mode) == 0o700
     (cache / "jit_run-cache").symlink_to(tmp_path)
     found, (said,) = chosen_cache(monkeypatch)
-    assert found is None
-    assert "jit_run-cache" in said
+    assert found is None and "jit_run-cache" in said
     shutil.rmtree(cache)
     (tmp_path / "elsewhere").mkdir(mode=0o755)
     cache.symlink_to(tmp_path / "elsewhere")
@@ -238,36 +211,29 @@ def test_files_and_folders_of_others_are_not_used(cache, monkeypatch):
         directory()
 
 
-def made(path, age):
-    """A file of a thousand bytes that was used that many seconds ago."""
+def made(path, days):
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(bytes(1000))
-    os.utime(path, (time.time() - age,) * 2)
+    os.utime(path, (time.time() - days * 24 * 3600.0,) * 2)
     return path
 
 
 def test_what_was_used_longest_ago_goes_first(cache, tmp_path, monkeypatch):
-    """A file that is no program of ours or JAX's stays, and so does what another process may be
-    about to load, and what is behind a link."""
+    """Foreign files stay, and so does what is about to be loaded, and what is behind a link."""
     days = {"a.so": 9, "xla-abc/b-cache": 7, "c.so": 5, "d.so": 1e-3, "notes.txt": 99}
     for name, age in days.items():
-        made(cache / name, age * 24 * 3600.0)
-    monkeypatch.setattr("iblf_jax.core.disk_cache.MAX_BYTES", 2500)
-    chosen_cache(monkeypatch)
-    assert sorted(path.name for path in cache.rglob("*.*")) == ["c.so", "d.so", "notes.txt"]
-    assert not (cache / "xla-abc" / "b-cache").exists()
-    monkeypatch.setattr("iblf_jax.core.disk_cache.MAX_BYTES", 0)
-    chosen_cache(monkeypatch)
-    assert sorted(path.name for path in cache.rglob("*.*")) == ["d.so", "notes.txt"]
-    precious = made(tmp_path / "elsewhere" / "precious.so", 1e9)
+        made(cache / name, age)
+    for size, left in ((2500, ["c.so", "d.so", "notes.txt"]), (0, ["d.so", "notes.txt"])):
+        monkeypatch.setattr("iblf_jax.core.disk_cache.MAX_BYTES", size)
+        chosen_cache(monkeypatch)
+        assert sorted(path.name for path in cache.rglob("*") if path.is_file()) == left
+    precious = made(tmp_path / "elsewhere" / "precious.so", 1e4)
     (cache / "xla-old").symlink_to(tmp_path / "elsewhere")
-    assert chosen_cache(monkeypatch)[0] is None
-    assert precious.exists()
+    assert chosen_cache(monkeypatch)[0] is None and precious.exists()
 
 
 def test_programs_of_another_processor_are_apart(cache, monkeypatch):
-    """A home that machines share must give no machine another's instructions; where XLA refuses its
-    own, nothing is kept."""
+    """Also in a home that machines share; where XLA refuses its own, nothing is kept."""
     folders = set()
     for flags in ("sse avx", "sse avx avx512f"):
         lines = ["model name : Same 9000", f"flags : {flags}"]
@@ -287,14 +253,18 @@ OPTIONS = [
 ]
 
 
+def keep_programs_as_told(folder, enabled):
+    jax.config.update("jax_compilation_cache_dir", folder)
+    jax.config.update("jax_enable_compilation_cache", enabled)
+    keep_programs.cache_clear()
+    keep_programs()
+
+
 @pytest.fixture
 def programs(cache):
     """The folder in which JAX keeps what it compiles, as in a user's process."""
     before = {name: getattr(jax.config, name) for name in OPTIONS}
-    jax.config.update("jax_compilation_cache_dir", None)
-    jax.config.update("jax_enable_compilation_cache", True)
-    keep_programs.cache_clear()
-    keep_programs()
+    keep_programs_as_told(None, True)
     yield Path(jax.config.jax_compilation_cache_dir)
     for name, x in before.items():
         jax.config.update(name, x)
@@ -303,8 +273,7 @@ def programs(cache):
 
 
 def values_of_programs():
-    """What three programs give that JAX has not compiled in this process; two of them take the same
-    arguments."""
+    """What three new programs give; two of them take the same arguments."""
     x = np.arange(3.0)
     programs = (lambda x, y: x + y, lambda x, y: x * y, lambda x: x - 4.0)
     arguments = ((x, 2.0), (x, 5.0), (x,))
@@ -328,8 +297,7 @@ def at_most(seconds):
     "damage", ["none", "swapped", "a pipe", "a folder", "text", "cut at -1.000", "longer", "zeros"]
 )
 def test_a_damaged_program_of_jax_is_compiled_again(programs, damage):
-    """Of another program, it ends in a foreign ValueError, or gives that program's numbers; at a
-    pipe, a reader waits.  A sound one, and what was compiled again, is used."""
+    """A sound one, and what was compiled again, is used; a swapped one has another's numbers."""
 
     def times():
         return [entry.lstat().st_mtime_ns for entry in entries]
@@ -352,16 +320,10 @@ def test_a_damaged_program_of_jax_is_compiled_again(programs, damage):
 
 
 def until(condition) -> bool:
-    """Whether a condition comes to hold within some seconds."""
-    for _ in range(2000):
-        if condition():
-            return True
-        time.sleep(0.01)
-    return False
+    return any(condition() or time.sleep(0.01) for _ in range(2000))
 
 
 def wait_for(path):
-    """Until a file has something in it."""
     assert until(lambda: path.exists() and path.read_text().strip())
 
 
@@ -372,15 +334,13 @@ def wait_for_compiler(calls):
 
 
 def has_ended(pid: Path) -> bool:
-    """Whether the process whose number is in a file ends."""
     state = Path(f"/proc/{pid.read_text().strip()}/stat")
 
     def ended():
         try:
-            text = state.read_text()
+            return "Z" in state.read_text().rpartition(")")[2]
         except (FileNotFoundError, ProcessLookupError):
             return True
-        return "Z" in text.rpartition(")")[2]
 
     return until(ended)
 
@@ -399,8 +359,7 @@ def test_what_is_built_ahead_is_built_once(slow_compiler, tmp_path, monkeypatch)
     calls = slow_compiler
     toolchain.build_ahead(SOURCE)
     wait_for(calls)
-    assert value() == 41
-    assert calls.read_text().split() == ["once"]
+    assert value() == 41 and calls.read_text().split() == ["once"]
     calls.unlink()
     broken = compiles(f"echo once >> {calls}; sleep 0.2; echo error: no >&2; exit 1")
     fake(tmp_path, monkeypatch, broken)
@@ -414,8 +373,7 @@ def test_what_is_built_ahead_is_built_once(slow_compiler, tmp_path, monkeypatch)
 
 @needs_compiler
 def test_who_stops_waiting_stops_the_compiler(cache, tmp_path, monkeypatch):
-    """Ctrl-C while another thread's compiler runs; what was stopped is built when it is asked for
-    again."""
+    """Ctrl-C while another thread's compiler runs; it is built when it is asked for again."""
     pid = tmp_path / "pid"
     fake(tmp_path, monkeypatch, compiles(f"echo $$ > {pid}; exec sleep 60"))
     toolchain.build_ahead(SOURCE)
@@ -430,7 +388,7 @@ def test_who_stops_waiting_stops_the_compiler(cache, tmp_path, monkeypatch):
 
 
 @needs_compiler
-def test_who_stops_leaves_the_compilers_of_other_threads(slow_compiler):
+def test_a_compiler_of_another_thread_is_left_and_who_waits_for_a_stopped_one_builds(slow_compiler):
     """An exception in one thread is no reason to end the build of another one."""
     with ThreadPoolExecutor(1) as other:
         found = other.submit(toolchain.built, SOURCE)
@@ -438,15 +396,11 @@ def test_who_stops_leaves_the_compilers_of_other_threads(slow_compiler):
         with pytest.raises(ZeroDivisionError), compile.building():
             raise ZeroDivisionError
         found.result()
-    assert slow_compiler.read_text().split() == ["once"]
-
-
-@needs_compiler
-def test_who_waits_for_a_stopped_build_builds_it(slow_compiler):
-    toolchain.build_ahead(SOURCE)
-    wait_for_compiler(slow_compiler)
-    with ThreadPoolExecutor(1) as other:
-        found = other.submit(toolchain.built, SOURCE)
+        assert slow_compiler.read_text().split() == ["once"]
+        slow_compiler.unlink()
+        toolchain.build_ahead(OTHER)
+        wait_for_compiler(slow_compiler)
+        found = other.submit(toolchain.built, OTHER)
         toolchain.stop_own_compilers()
         found.result()
     assert slow_compiler.read_text().split() == ["once"] * 2
@@ -491,22 +445,15 @@ def test_a_script_keeps_its_programs_without_being_told(tmp_path):
             [sys.executable, "-c", FRESH], env=environment, text=True, timeout=250
         )
         before, after, counts = printed.split(" ", 2)
-        assert before == "None"
-        assert Path(after.strip("'")).parent == tmp_path / "iblf_jax"
+        assert before == "None" and Path(after.strip("'")).parent == tmp_path / "iblf_jax"
         hits, misses = json.loads(counts)
         assert (misses == 0 < hits) if again else (misses > hits)
 
 
 @pytest.mark.parametrize(("folder", "enabled"), [("own", True), (None, False)])
 def test_who_told_jax_is_obeyed(programs, folder, enabled):
-    jax.config.update("jax_compilation_cache_dir", folder)
-    jax.config.update("jax_enable_compilation_cache", enabled)
-    keep_programs.cache_clear()
-    keep_programs()
+    keep_programs_as_told(folder, enabled)
     assert jax.config.jax_compilation_cache_dir == folder
-
-
-# --------------------------------------------- an unusable cache
 
 
 def nothing_fits(number):
@@ -525,15 +472,14 @@ def nothing_fits(number):
     return prepare
 
 
-def no_home():
-    raise RuntimeError("Could not determine home directory.")
-
-
 def no_room(*_):
     raise OSError(28, os.strerror(28))
 
 
 def without_home(_, patch):
+    def no_home():
+        raise RuntimeError("Could not determine home directory.")
+
     patch.delenv("XDG_CACHE_HOME")
     patch.setattr(Path, "home", no_home)
 
@@ -574,35 +520,26 @@ def falls_back(work):
         CACHE.clear(compile.WARNINGS)
         assert with_fallback("native", run_on, lambda: "vmap") == "vmap"
     (line,) = [str(x.message) for x in said]
-    assert line.endswith("running on vmap.")
-    assert "\n" not in line
+    assert line.endswith("running on vmap.") and "\n" not in line
     return line
-
-
-# --------------------------------------------- compilers
 
 
 def fake(folder, monkeypatch, script):
     """Puts a shell script in the compiler's place; $REAL is the real one."""
     path = folder / "fake-compiler"
-    script = script if isinstance(script, bytes) else script.encode()
-    path.write_bytes(b"#!/bin/sh\n" + script + b"\n")
+    path.write_text(f"#!/bin/sh\n{script}\n")
     path.chmod(0o755)
     monkeypatch.setenv("REAL", shutil.which("c++") or shutil.which("g++") or "")
     monkeypatch.setenv("CXX", str(path))
 
 
 def compiles(script: str, version: str = "echo fake 1.0") -> str:
-    """A compiler that says its version and else does what `script` does, with $out the file that it
-    is to write."""
-    return (
-        f'[ "$1" = --version ] && {{ {version}; exit 0; }}\nfor o; do [ "$p" = -o ] && out=$o;'
-        f" p=$o; done\n{script}"
-    )
+    """A compiler that says its version and else does what `script` does, into the file $out."""
+    words = 'for o; do [ "$p" = -o ] && out=$o; p=$o; done'
+    return f'[ "$1" = --version ] && {{ {version}; exit 0; }}\n{words}\n{script}'
 
 
 def ziglang_script(folder: Path) -> str:
-    """The path of a script that wraps ziglang's compiler, as a user would write it for $CXX."""
     path = folder / "zig-c++"
     path.write_text(f'#!/bin/sh\nexec {sys.executable} -m ziglang c++ "$@"\n')
     path.chmod(0o755)
@@ -654,8 +591,7 @@ def test_the_first_arguments_of_a_compiler(cache, tmp_path, monkeypatch):
     calls = tmp_path / "calls"
     fake(tmp_path, monkeypatch, f'echo "$1" >> {calls}; shift; exec "$REAL" "$@"')
     monkeypatch.setenv("CXX", f"'{os.environ['CXX']}' c++")
-    assert value() == 41
-    assert set(calls.read_text().split()) == {"c++"}
+    assert value() == 41 and set(calls.read_text().split()) == {"c++"}
     for wrong in ("no-such-compiler c++", "'open", " "):
         monkeypatch.setenv("CXX", wrong)
         with pytest.raises(ToolchainError, match=r"there is no C\+\+ compiler .*CXX"):
@@ -694,7 +630,7 @@ COMPILERS = {
     "hangs in a child": (compiles("sleep 100 | cat"), "longer than 0.5 s"),
     "hangs at its version": (compiles("exit 0", "sleep 100"), "longer than 0.5 s"),
     "removes its folder": (compiles('rm -r "$(dirname "$out")"'), "left no file"),
-    "is no program": (b"\0\1\2", ""),
+    "is no program": ("\0\1\2", ""),
 }
 
 
@@ -739,17 +675,13 @@ def test_two_processes_build_at_once_and_one_is_killed(cache, tmp_path, monkeypa
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     command = [sys.executable, "-c", BUILD, SOURCE]
     killed = subprocess.Popen(command)
-    assert until((tmp_path / "begun").exists)
-    assert drafts_in(cache)
+    assert until((tmp_path / "begun").exists) and drafts_in(cache)
     killed.kill()
     killed.wait()
     monkeypatch.delenv("CXX")
     both = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(2)]
     assert [process.communicate(timeout=60)[0] for process in both] == ["41\n", "41\n"]
     assert [x.suffix for x in cache.iterdir()] == [".so"]
-
-
-# --------------------------------------------- drafts
 
 
 HOLD = """
@@ -762,7 +694,7 @@ with drafts.draft(pathlib.Path(sys.argv[2]), "x"):
 """
 
 
-def test_the_draft_of_a_living_process_is_left_alone(tmp_path):
+def test_the_draft_of_a_living_process_or_a_young_one_is_left_alone(tmp_path):
     command = [sys.executable, "-c", HOLD, drafts.__file__, str(tmp_path)]
     holder = subprocess.Popen(command, stdout=subprocess.PIPE)
     assert holder.stdout.readline() == b"there\n"
@@ -776,18 +708,13 @@ def test_the_draft_of_a_living_process_is_left_alone(tmp_path):
         with drafts.draft(tmp_path, name):
             assert held.exists() == (name == "y")
     assert drafts_in(tmp_path) == []
-
-
-def test_drafts_of_other_machines_go_by_age(tmp_path, monkeypatch):
+    # Those of other machines go by age.
     young, old = (tmp_path / f".x.{name}.partial" for name in ("00000000.1", "00000000.2"))
     young.mkdir()
     old.mkdir()
     os.utime(old, (1.0, 1.0))
     with drafts.draft(tmp_path, "x"):
         assert (young.exists(), old.exists()) == (True, False)
-
-
-# --------------------------------------------- threads
 
 
 @pytest.mark.parametrize("wanted", ["9" * 5000, "257", "²", "000", "-1", "1.5", " 2"])

@@ -1,23 +1,21 @@
-"""What every figure must state: peaks with their sign and joint, the reason for a zoom, where a
-joint left its bounds, that a quantity is zero, that a margin is that of the start.
-"""
-
-from __future__ import annotations
+"""What every figure must state: peaks, zooms, violations, zeros, and margins of the start."""
 
 import dataclasses
 import inspect
 import re
-import warnings
+from functools import partial
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import study_cases as cases
+from drawing import drawn
 from made_up_runs import chain, made_up, runaway, with_signals
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.font_manager import findfont
 from matplotlib.text import Text
+from refused import assert_refused
 from stored_results import stored
 
 import iblf_jax as ij
@@ -31,16 +29,7 @@ def texts_of(axes):
     return [text.get_text() for text in axes.texts]
 
 
-def drawn(figure):
-    """Draws the figure; any warning of matplotlib's is an error."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        figure._repr_png_()
-    return figure
-
-
 def changed(run, joint, sample, value, field="q", flag=Status.BOUND_VIOLATED):
-    """The run with one sample of one joint changed, and a flag."""
     values = getattr(run, field).at[sample, joint].set(value)
     return with_signals(run, **{field: values}, status=jnp.int32(int(flag)))
 
@@ -86,10 +75,6 @@ def test_a_certificate_until_a_time_says_so():
     assert "as requested" not in certificate.plot().get_suptitle()
 
 
-def assert_inside(x, limits):
-    assert limits[0] < x.min() and x.max() < limits[1]
-
-
 def middle_share(scale, x):
     low, first, third, high = scale.forward(np.quantile(x, [0.0, 0.25, 0.75, 1.0]))
     return (third - first) / (high - low)
@@ -110,7 +95,8 @@ def test_an_axis_shows_all_values_and_squeezes_none(x, name):
     axes = Figure().subplots()
     _scales.follow(axes, "x", np.append(x, np.nan))
     assert axes.get_xscale() == name
-    assert_inside(x, axes.get_xlim())
+    low, high = axes.get_xlim()
+    assert low < x.min() and x.max() < high
     if name != "linear":
         scale = _scales.scale_of(x)
         assert middle_share(scale, x) > 2.0 * middle_share(_scales.LINEAR, x)
@@ -122,13 +108,6 @@ def study():
     return cases.study(64)
 
 
-def test_a_run_that_diverged_does_not_squeeze_the_velocity_portrait():
-    good = made_up(chain(2))
-    alone = plotting.velocity_portrait(good).axes[0].get_ylim()
-    both = plotting.velocity_portrait({"good": good, "bad": runaway(chain(2))}).axes[0].get_ylim()
-    assert both == alone
-
-
 def crosses_of(axes):
     """The marks of violations in a panel, by their times."""
     red = to_hex(_style.failure())
@@ -136,26 +115,26 @@ def crosses_of(axes):
     return [float(line.get_xdata()[0]) for line in lines if to_hex(line.get_color()) == red]
 
 
-def test_only_the_joint_that_left_its_bounds_is_marked():
+def test_the_joint_that_left_its_bounds_is_marked_and_where_a_run_diverged_every_panel():
     run = changed(made_up(chain(3)), 1, 20, 9.0)
     for make in (plotting.positions, plotting.errors, plotting.torques, plotting.velocities):
         marks = [crosses_of(axes) for axes in make(run).axes]
         assert marks == [[], [], [0.2], [0.2], [], []], make.__name__
     assert [crosses_of(axes) for axes in run.plot().axes[:3]] == [[], [0.2], []]
-
-
-def test_a_run_that_diverged_inside_its_bounds_is_marked_in_every_panel():
     run = made_up(chain(2), status=int(Status.NOT_FINITE))
     stopped = {
         name: getattr(run, name).at[100:].set(getattr(run, name)[100]) for name in ("q", "dq")
     }
     run = with_signals(run, **stopped)
     assert [crosses_of(axes) for axes in plotting.torques(run).axes[::2]] == [[1.0], [1.0]]
+    # It does not squeeze the velocity portrait.
+    good = made_up(chain(2))
+    alone, both = map(plotting.velocity_portrait, (good, {"good": good, "bad": runaway(chain(2))}))
+    assert both.axes[0].get_ylim() == alone.axes[0].get_ylim()
 
 
-def noise(run, size=1e-17):
-    values = size * np.random.default_rng(0).standard_normal(run.q.shape)
-    return jnp.asarray(values)
+def noise(run, size):
+    return jnp.asarray(size * np.random.default_rng(0).standard_normal(run.q.shape))
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-17, 1e-6])
@@ -166,8 +145,7 @@ def test_a_panel_of_rounding_errors_says_zero(size):
         says_zero = [text for text in texts_of(axes) if text.startswith("zero")]
         largest = np.abs(np.asarray(run.disturbance_estimate)).max()
         is_rounding = largest <= rounding_error(curves_of(run), "disturbance_estimate")
-        assert is_rounding == (size < 1e-6)
-        assert bool(says_zero) == is_rounding
+        assert is_rounding == (size < 1e-6) and bool(says_zero) == is_rounding
         if is_rounding:
             assert axes.get_yticks().tolist() == [0.0]
             assert np.ptp(axes.get_ylim()) > 1e6 * largest
@@ -178,8 +156,7 @@ def test_a_constant_has_no_axis_that_magnifies_rounding_errors():
     run = made_up(chain(2))
     run = dataclasses.replace(run, tau=5.0 + noise(run, 1e-15))
     for axes in drawn(plotting.torques(run)).axes:
-        assert axes.yaxis.get_offset_text().get_text() == ""
-        assert np.ptp(axes.get_ylim()) > 0.1
+        assert axes.yaxis.get_offset_text().get_text() == "" and np.ptp(axes.get_ylim()) > 0.1
 
 
 def with_margins(study, margins):
@@ -201,8 +178,7 @@ def test_a_study_says_when_the_start_sets_every_margin(study):
 
 def test_histograms_name_one_margin_for_all_runs_and_peaks_as_sizes(study):
     figure = drawn(plotting.histograms(with_margins(study, np.full((64, 2), 0.1)), ["margin"]))
-    assert texts_of(figure.axes[0]) == ["0.1 rad in every run"]
-    assert not figure.axes[0].patches
+    assert texts_of(figure.axes[0]) == ["0.1 rad in every run"] and not figure.axes[0].patches
     peaks = np.linspace(1.0, 2.0, 128).reshape(64, 2)
     metrics = ij.Metrics({"peak_torque": peaks}, (("peak_torque", "N m"),))
     figure = plotting.histograms(dataclasses.replace(study, metrics=metrics))
@@ -220,16 +196,9 @@ OF_RUNS = {
     *("uncertain_terms", "velocities", "velocity_errors", "velocity_portrait", "workspace"),
 }
 """Functions that draw any run."""
-OF_STUDIES = {
-    "bands": lambda study, table: (study,),
-    "heat_map": lambda study, table: (table,),
-    "histograms": lambda study, table: (study,),
-    "parallel": lambda study, table: (table,),
-    "scatter": lambda study, table: (study,),
-    "study_overview": lambda study, table: (study,),
-    "tube": lambda study, table: (study.scenario,),
-}
-"""Functions that draw a study, a sweep or a scenario -> their arguments."""
+OF_SWEEPS = {"heat_map", "parallel"}
+OF_STUDIES = {"bands", "histograms", "scatter", "study_overview", "tube"} | OF_SWEEPS
+"""Functions that draw a study, a sweep or, one of them, a scenario."""
 OF_RESULTS = {
     *("comparison", "failure_probability", "first_exit", "guaranteed_tube", "identification"),
     *("pareto", "tuning"),
@@ -239,26 +208,21 @@ ELSEWHERE = {"adaptation", "paths", "region_margins"}
 """The tests of adaptive laws, of searches and of regions call them with a figure."""
 
 
-def test_every_figure_function_is_called_with_a_figure():
-    assert set(PUBLIC) == OF_RUNS | set(OF_STUDIES) | OF_RESULTS | ELSEWHERE
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [*sorted(OF_RUNS), *OF_STUDIES])
+@pytest.mark.parametrize("name", sorted(OF_RUNS | OF_STUDIES))
 def test_a_figure_is_drawn_into_the_users_figure_and_returned(name, short_run, study):
     """Into a Figure, and into a SubFigure that leaves the other half alone."""
-    function, arguments = getattr(plotting, name), (short_run,)
-    if name in OF_STUDIES:
-        arguments = OF_STUDIES[name](study, cases.table())
-    whole = Figure(figsize=(12.0, 9.0))
-    left, right = whole.subfigures(1, 2)
-    assert function(*arguments, figure=left) is left
+    subject = short_run if name in OF_RUNS else study.scenario if name == "tube" else study
+    draw = partial(getattr(plotting, name), cases.table() if name in OF_SWEEPS else subject)
+    left, right = Figure(figsize=(12.0, 9.0)).subfigures(1, 2)
+    assert draw(figure=left) is left
     assert left.axes and not right.axes
     alone = Figure()
-    assert function(*arguments, figure=alone) is alone and alone.axes
+    assert draw(figure=alone) is alone and alone.axes
 
 
-def test_every_figure_function_takes_a_style_and_a_figure():
+def test_every_figure_function_takes_a_style_and_a_figure_and_is_called_with_one():
+    assert set(PUBLIC) == OF_RUNS | OF_STUDIES | OF_RESULTS | ELSEWHERE
     for name in PUBLIC:
         parameters = inspect.signature(getattr(plotting, name)).parameters
         assert {"style", "figure"} <= set(parameters), name
@@ -266,29 +230,23 @@ def test_every_figure_function_takes_a_style_and_a_figure():
         ({"style": "print"}, "style: got 'print'"),
         ({"figure": 3}, "figure: got 3, expected a matplotlib Figure"),
     ):
-        with pytest.raises(ValueError, match=message):
-            plotting.positions(made_up(chain(1)), **options)
-    with pytest.raises(ValueError, match="publisher: got 'acm'"):
-        plotting.Paper("acm")
+        assert_refused(message, plotting.positions, made_up(chain(1)), **options)
+    assert_refused("publisher: got 'acm'", plotting.Paper, "acm")
+
+
+JOURNALS = {
+    "IEEE, one column": ("paper", 3.5, plotting.torques, plotting.overview),
+    "Elsevier, two columns": (plotting.Paper("elsevier", 2), 190 / 25.4, plotting.phase_portrait),
+}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("style", "width", "figures"),
-    [
-        ("paper", 3.5, (plotting.torques, plotting.overview)),
-        (plotting.Paper("elsevier", 2), 190 / 25.4, (plotting.phase_portrait,)),
-    ],
-    ids=["IEEE, one column", "Elsevier, two columns"],
-)
-def test_a_figure_for_print_has_the_size_and_the_font_of_the_journal(
-    style, width, figures, tmp_path
-):
-    run = made_up(chain(2))
+@pytest.mark.parametrize("journal", JOURNALS)
+def test_a_figure_for_print_has_the_size_and_the_font_of_the_journal(journal, tmp_path):
+    run, (style, width, *figures) = made_up(chain(2)), JOURNALS[journal]
     for number, make in enumerate(figures):
         figure = drawn(make(run, style=style))
-        assert figure.get_figwidth() == pytest.approx(width)
-        assert figure.get_figheight() <= 9.0
+        assert figure.get_figwidth() == pytest.approx(width) and figure.get_figheight() <= 9.0
         assert figure._suptitle is None
         texts = [text for text in figure.findobj(Text) if text.get_text() and text.get_visible()]
         assert {text.get_fontsize() for text in texts} == {8.0}

@@ -7,10 +7,14 @@ import pytest
 from loops_of_plants import flexible_joint
 from made_up_runs import chain, made_up
 from plant_cases import body, pendulum
+from refused import assert_refused
 
 import iblf_jax as ij
 from iblf_jax import plotting
+from iblf_jax.plotting._arm import Scene, motions_of
 from iblf_jax.plotting._curves import curves_of
+
+LEVELS = ["angle $x_1$ [rad]", "speed $x_2$ [rad/s]", "current $x_{3}$ [A]"]
 
 
 @pytest.fixture(scope="module")
@@ -23,13 +27,7 @@ def body_run():
     return ij.simulate(body(), duration=0.8, dt=1e-2)
 
 
-@pytest.fixture(scope="module")
-def flexible_run():
-    return ij.simulate(flexible_joint(), duration=0.08, dt=1e-3)
-
-
 def labels_of(figure) -> list[str]:
-    """The vertical labels of a figure."""
     return [axes.get_ylabel() for axes in figure.axes]
 
 
@@ -37,8 +35,7 @@ def labels_of(figure) -> list[str]:
 def test_the_overview_has_a_row_for_every_level_with_bounds_and_virtual_control(run):
     figure = run.plot()
     labels = labels_of(figure)
-    assert labels[:3] == ["angle $x_1$ [rad]", "speed $x_2$ [rad/s]", "current $x_{3}$ [A]"]
-    assert "input $u$ [V]" in labels
+    assert labels[:3] == LEVELS and "input $u$ [V]" in labels
     assert "error $e_2$ [rad/s]" in labels
     # Only level 2 is disturbed.
     assert [x for x in labels if "$d_" in x] == [r"$d_{2}$ (broad), $\hat d_{2}$ [rad/s^2]"]
@@ -53,33 +50,29 @@ def test_the_overview_has_a_row_for_every_level_with_bounds_and_virtual_control(
 
 @pytest.mark.slow
 def test_figures_have_the_names_and_units_of_the_plant(run, body_run):
-    assert labels_of(plotting.levels(run))[::2] == [
-        "angle $x_1$ [rad]",
-        "speed $x_2$ [rad/s]",
-        "current $x_{3}$ [A]",
-        "input $u$ [V]",
-    ]
+    assert labels_of(plotting.levels(run))[::2] == [*LEVELS, "input $u$ [V]"]
     overview = labels_of(body_run.plot())
     assert overview[:3] == ["pose $x_1$ [m]", "pose $x_1$ [m]", "pose $x_1$ [rad]"]
     assert "force $u$ [N, N, N m]" in overview
     assert "north\n$u$ [N]" in labels_of(plotting.torques(body_run))
     assert "heading\n$x_2$ [rad/s]" in labels_of(plotting.velocities(body_run))
     assert plotting.positions(body_run).get_suptitle() == "Pose"
-    assert plotting.velocity_portrait(body_run, "heading").axes[0].get_xlabel() == (
-        "pose of heading [rad]"
-    )
-    (axes,) = plotting.phase_portrait(body_run).axes
-    assert axes.get_xlabel() == "pose of north [m]"
+    portraits = plotting.velocity_portrait(body_run, "heading"), plotting.phase_portrait(body_run)
+    found = [figure.axes[0].get_xlabel() for figure in portraits]
+    assert found == ["pose of heading [rad]", "pose of north [m]"]
     assert labels_of(plotting.uncertain_terms(run))[0] == "pendulum\n$d_{2}$ [rad/s^2]"
     assert labels_of(plotting.tube(body()))[2] == "heading\n$x_1$ [rad]"
 
 
 @pytest.mark.slow
-def test_levels_of_plants_of_different_orders_are_refused(run, body_run):
-    with pytest.raises(ValueError, match="the same number of levels"):
-        plotting.levels({"third": run, "second": made_up(chain(1))})
-    with pytest.raises(ValueError, match="a component, 0 to 2"):
-        plotting.levels(body_run, 3)
+def test_what_cannot_be_drawn_is_refused(run, body_run, tmp_path):
+    for words, draw, *arguments in (
+        ("the same number of levels", plotting.levels, {"third": run, "second": made_up(chain(1))}),
+        ("a component, 0 to 2", plotting.levels, body_run, 3),
+        ("expected a plant with a shape", plotting.workspace, run),
+        ("expected a plant with a shape", plotting.animate, run, tmp_path / "film.gif"),
+    ):
+        assert_refused(words, draw, *arguments)
 
 
 @pytest.mark.slow
@@ -94,24 +87,15 @@ def test_a_plant_with_an_outline_is_animated_and_drawn_along_its_path(body_run, 
 
 
 @pytest.mark.slow
-def test_a_flexible_arm_is_animated_with_its_motors(flexible_run, tmp_path):
-    from iblf_jax.plotting._arm import Scene, motions_of
-
-    t = np.array([0.0, 0.05])
-    curves = curves_of(flexible_run)
-    scene = Scene(curves, *motions_of(curves, t))
+def test_a_flexible_arm_is_animated_with_its_motors(tmp_path):
+    run = ij.simulate(flexible_joint(), duration=0.08, dt=1e-3)
+    curves = curves_of(run)
+    scene = Scene(curves, *motions_of(curves, np.array([0.0, 0.05])))
     scene.move_to(1)
     motors = scene.motors[0].get_xdata()
-    assert np.allclose(motors, flexible_run.x[50, 2], atol=1e-12)
-    assert not np.allclose(motors, flexible_run.q[50], atol=1e-3)
-    assert plotting.animate(flexible_run, tmp_path / "arm.gif", fps=5).exists()
-
-
-@pytest.mark.slow
-def test_a_plant_without_a_shape_is_refused(run, tmp_path):
-    for draw in (plotting.workspace, lambda run: plotting.animate(run, tmp_path / "film.gif")):
-        with pytest.raises(ValueError, match="expected a plant with a shape"):
-            draw(run)
+    assert np.allclose(motors, run.x[50, 2], atol=1e-12)
+    assert not np.allclose(motors, run.q[50], atol=1e-3)
+    assert plotting.animate(run, tmp_path / "arm.gif", fps=5).exists()
 
 
 @pytest.mark.slow

@@ -1,7 +1,4 @@
-"""The whole closed loop, with other masses, gains, starts and bounds, against an independent
-program (independent.py)."""
-
-from __future__ import annotations
+"""The closed loop with other masses, gains, starts and bounds, against `independent.py`."""
 
 import dataclasses
 
@@ -47,9 +44,8 @@ def random_loop(seed, law, variant) -> independent.Loop:
         force_b=(np.zeros(2), *rng.uniform(0.1, 1.5, (3, 2))),
         dq0=rng.uniform(-0.5, 0.5, 2),
     )
-    q_d, lower, upper = (
-        independent.sine(*x)(0.0)[0] for x in (loop.reference, loop.lower, loop.upper)
-    )
+    sides = loop.reference, loop.lower, loop.upper
+    q_d, lower, upper = (independent.sine(*x)(0.0)[0] for x in sides)
     loop.q0 = q_d + rng.choice([-0.6, 0.6], 2) * np.minimum(upper - q_d, q_d - lower)
     return loop
 
@@ -57,16 +53,13 @@ def random_loop(seed, law, variant) -> independent.Loop:
 def scenario_of(loop: independent.Loop) -> ij.Scenario:
     barrier = ij.barriers.Integral() if loop.p is None else ij.barriers.Log(p=loop.p)
     observer = ij.observers.Momentum if loop.corrected else ij.observers.AsPublished
-    a, b = loop.force_a[1:], loop.force_b[1:]
+    numbers = loop.mass, loop.length, loop.centre, loop.inertia
+    sides = ij.bounds.Sinusoid(*loop.lower), ij.bounds.Sinusoid(*loop.upper)
     return ij.Scenario(
-        plant=ij.robots.TwoLink(
-            mass=loop.mass, length=loop.length, centre=loop.centre, inertia=loop.inertia, g=loop.g
-        ),
+        plant=ij.robots.TwoLink(*numbers, g=loop.g),
         reference=ij.references.Sinusoid(*loop.reference),
-        bounds=ij.bounds.Bounds(
-            lower=ij.bounds.Sinusoid(*loop.lower), upper=ij.bounds.Sinusoid(*loop.upper)
-        ),
-        disturbance=ij.disturbances.ModelShaped(*a, *b),
+        bounds=ij.bounds.Bounds(*sides),
+        disturbance=ij.disturbances.ModelShaped(*loop.force_a[1:], *loop.force_b[1:]),
         controller=ij.controllers.Backstepping(
             k1=loop.k1,
             K2=loop.K2,
@@ -98,8 +91,7 @@ def test_other_numbers_against_scipy(seed, law, variant):
 
 
 def test_a_matched_start_of_the_observer():
-    """eta(0) = -kf M0 q'(0) makes f_hat(0) = 0, also with a moving start; as printed it does
-    not."""
+    """eta(0) = -kf M0 q'(0) makes f_hat(0) = 0, also with a moving start."""
     scenario = scenario_of(random_loop(1, "integral", "printed"))
     model, q, dq = scenario.model, scenario.initial.q, scenario.initial.dq
     printed = scenario.observer.kf * (model.mass_matrix(q) @ dq)
@@ -110,8 +102,7 @@ def test_a_matched_start_of_the_observer():
 
 
 def test_plant_error_is_the_uncertain_term(rng):
-    """A payload and friction that the model does not know: f = M0 q" + C0 q' + G0 - tau, with q"
-    from the plant by hand."""
+    """An unknown payload and friction: f = M0 q" + C0 q' + G0 - tau, with q" by hand."""
     base = ij.presets.zhang_yan_2024()
     friction = ij.disturbances.Friction(viscous=0.3, coulomb=0.2, width=0.1)
     plant = dataclasses.replace(base.plant, payload=0.4)
@@ -124,9 +115,8 @@ def test_plant_error_is_the_uncertain_term(rng):
     loaded.mass, loaded.centre, loaded.inertia = (2.0, m2 + mp), (0.175, c), (0.06125, i2)
     for _ in range(5):
         q, v, eta = rng.uniform(0.4, 0.7, 2), rng.normal(size=2), rng.normal(size=2)
-        rate, sample = step(
-            scenario, np.asarray(0.3), LoopState(jnp.stack([q, v]), (), jnp.asarray(eta))
-        )
+        state = LoopState(jnp.stack([q, v]), (), jnp.asarray(eta))
+        rate, sample = step(scenario, np.asarray(0.3), state)
         tau = np.asarray(sample.tau)
         M, C, G, _ = loaded.arm(q)
         ddq = np.linalg.solve(M, tau - 0.3 * v - 0.2 * np.tanh(v / 0.1) - C(v) @ v - G)

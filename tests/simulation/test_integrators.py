@@ -1,7 +1,5 @@
 """Integrators: order conditions, measured order of convergence, stability limits."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,8 +13,7 @@ methods = pytest.mark.parametrize("method", TABLEAUS)
 
 @methods
 def test_order_conditions(method):
-    """Butcher's conditions up to the order that the table claims, and the first one beyond it
-    fails."""
+    """Butcher's conditions hold up to the order that the table claims, and not beyond."""
     table = tableau(method)
     s = len(table.b)
     a, b, c = np.zeros((s, s)), np.asarray(table.b), np.asarray(table.c)
@@ -27,14 +24,10 @@ def test_order_conditions(method):
         1: [b.sum() - 1],
         2: [b @ c - 1 / 2],
         3: [b @ c**2 - 1 / 3, b @ a @ c - 1 / 6],
-        4: [
-            b @ c**3 - 1 / 4,
-            (b * c) @ a @ c - 1 / 8,
-            b @ a @ c**2 - 1 / 12,
-            b @ a @ a @ c - 1 / 24,
-        ],
+        4: [b @ c**3 - 1 / 4, (b * c) @ a @ c - 1 / 8, b @ a @ c**2 - 1 / 12],
         5: [b @ c**4 - 1 / 5],
     }
+    conditions[4].append(b @ a @ a @ c - 1 / 24)
     for order in range(1, table.order + 1):
         np.testing.assert_allclose(conditions[order], 0, atol=1e-15)
     assert max(abs(x) for x in conditions[table.order + 1]) > 1e-3
@@ -53,8 +46,7 @@ def test_stability_limit(method):
 
 @methods
 def test_order_on_a_nonlinear_problem_in_time(method):
-    """A driven pendulum, against SciPy; the number of steps is traced so that it compiles once.
-    Orders of the closed loop are in `test_step_size`."""
+    """A driven pendulum, against SciPy.  Orders of the closed loop are in `test_step_size`."""
 
     def rhs(t, x, xp=np):
         return xp.stack([x[1], -3 * xp.sin(x[0]) - 0.2 * x[1] * t + xp.cos(2 * t)])

@@ -1,12 +1,10 @@
-"""Sampled loops of plants in strict-feedback form: sensors of single levels, levels that are not
-measured, and the noise that an observer of levels amplifies."""
-
-from __future__ import annotations
+"""Levels that are not measured, and the noise that an observer of levels amplifies."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from iblf_jax.observers import StateObserver
 from iblf_jax.sensors import Direct, Encoder, FilteredDifference, Levels, Tracking
 
 import iblf_jax as ij
@@ -21,6 +19,7 @@ DRIVE = ij.plants.ElectricDrive(
 )
 GAINS = {3: (3.0, 20.0, 60.0), 4: (3.0, 20.0, 40.0, 60.0)}
 FILTERED = Encoder(counts=65536, noise=2e-5, velocity=FilteredDifference(cutoff=500.0))
+READING = StateObserver(bandwidth=200.0, measured=(1, 2))
 TRACKED = Encoder(noise=1e-4, velocity=Tracking(bandwidth=300.0))
 
 
@@ -41,12 +40,8 @@ def loop(plant, **parts):
 
 
 def simulated(scenario, duration=0.5):
-    """A run whose warnings are of no interest here."""
     with notices.muted():
         return ij.simulate(scenario, duration=duration, dt=5e-4, seed=3)
-
-
-# --- sensors of levels ----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -56,11 +51,7 @@ def simulated(scenario, duration=0.5):
         ((FILTERED, None), ij.observers.NoObserver(), "level 3.*StateObserver.*measured=.1, 2."),
         ((FILTERED, None), ij.observers.LevelObserver(gain=20.0), "level 3.*StateObserver"),
         ((None, Direct(), Direct()), ij.observers.NoObserver(), "level 1.*measure level 1"),
-        (
-            (Direct(), None, Direct()),
-            ij.observers.StateObserver(bandwidth=200.0, measured=(1, 2)),
-            "level 2 measured, which StateObserver reads",
-        ),
+        ((Direct(), None, Direct()), READING, "level 2 measured, which StateObserver reads"),
     ],
 )
 def test_a_level_that_is_neither_measured_nor_estimated_is_refused(parts, observer, text):
@@ -68,28 +59,19 @@ def test_a_level_that_is_neither_measured_nor_estimated_is_refused(parts, observ
         loop(DRIVE, sensor=Levels(parts), observer=observer)
 
 
-# --- levels that an observer estimates ------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def all_measured():
-    """A run of the flexible joint whose observer receives all levels."""
-    full = ij.observers.StateObserver(bandwidth=400.0, measured=(1, 2, 3, 4))
+    full = StateObserver(bandwidth=400.0, measured=(1, 2, 3, 4))
     return simulated(loop(FLEXIBLE, observer=full), duration=1.0)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("motor", [None, Direct()], ids=["link encoder", "link and motor encoder"])
 def test_unmeasured_levels_of_a_flexible_joint(motor, all_measured):
-    """Encoders without velocities track about as well as a measurement of all levels, under a
-    disturbance that the observer estimates.
-
-    With the link encoder alone the disturbance torque on the link appears as one of the motor, and
-    as a motor position of which K (theta - q) contains it."""
+    """Encoders without velocities track about as well as a measurement of all levels.  With that of
+    the link alone its disturbance appears as one of the motor, and in theta as K (theta - q)."""
     measured = (1,) if motor is None else (1, 3)
-    observer = ij.observers.StateObserver(
-        bandwidth=400.0, measured=measured, offset=(0.0, 0.02, 0.0, 0.02)
-    )
+    observer = StateObserver(bandwidth=400.0, measured=measured, offset=(0.0, 0.02, 0.0, 0.02))
     sensor = Levels((Direct(), None, motor, None))
     run = simulated(loop(FLEXIBLE, observer=observer, sensor=sensor), duration=1.0)
     late = slice(len(run.t) // 2, None, 2)
@@ -101,9 +83,6 @@ def test_unmeasured_levels_of_a_flexible_joint(motor, all_measured):
         inertia = np.asarray(LINK.mass_matrix(jnp.zeros(1)))[0]
         theta = theta + inertia * run.disturbance[late, 1] / 300.0
     np.testing.assert_allclose(run.measured.higher[late, 0], theta, atol=1e-5)
-
-
-# --- noise ----------------------------------------------------------------------------------------
 
 
 FINE = Encoder(counts=2**18, noise=2e-5, velocity=FilteredDifference(cutoff=500.0))
@@ -134,8 +113,7 @@ def test_the_noise_of_measured_levels_is_that_of_many_samples(encoder, rng):
 
 @pytest.mark.slow
 def test_noise_through_a_level_observer_is_reported():
-    """Of a drive whose observer has a gain for the current only, where the noise of the estimate
-    from sample to sample of a run is the one that the warning states."""
+    """Of a gain for the current only; that of a run is the one that the warning states."""
     sensor = Levels((TRACKED, Direct(noise=0.02)))
     observer = ij.observers.LevelObserver(gain=(0.0, 0.0, 50.0))
     with pytest.warns(UserWarning, match="LevelObserver amplifies the sensor's noise"):

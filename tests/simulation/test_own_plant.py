@@ -1,7 +1,5 @@
 """A plant of order 2 whose second level is not the rate of the first: two water tanks."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any, ClassVar
 
@@ -9,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from refused import assert_refused, refused
 
 import iblf_jax as ij
 from iblf_jax.certificates.terms import TorquePoint
@@ -20,7 +19,6 @@ from iblf_jax.simulation.scenario import canonical
 from iblf_jax.tuning.objectives import fitted
 
 LIMITS = {"limit": 9e-5, "lower_limit": 6e-5}
-
 ROOT_OF_2G = 4.429  # [m^0.5/s]
 SHORT = {"duration": 40.0, "dt": 0.2}
 
@@ -65,37 +63,23 @@ def tanks(**parts: Any) -> ij.Scenario:
     return ij.Scenario(**own | parts)
 
 
-def with_a_short_drift():
-    plant = ij.plants.StrictFeedback(
-        drift=lambda t, x: x[0], gain=lambda t, x: jnp.ones_like(x), n=1, order=2
-    )
-    return tanks(plant=plant)
+SHORT_DRIFT = ij.plants.StrictFeedback(lambda t, x: x[0], lambda t, x: jnp.ones_like(x), 1, 2)
 
 
-START = ij.Initial(q=0.125)
-NAMED = {
-    "bounded": (lambda: tanks(initial=START), r"x_2 is 0 if Initial has no dq: Initial\(x="),
-    "free": (
-        lambda: tanks(initial=START, bounds=TUBE),
-        r"x_2 is 0 if Initial has no dq: Initial\(x=",
-    ),
-    "singular": (
-        lambda: tanks(plant=Tanks(a1=5e-5, a2=1e-320), initial=ij.Initial(x=[[0.125], [0.2]])),
+def run_of(**parts):
+    return ij.simulate(tanks(**parts), **SHORT)
+
+
+START, ADVICE = ij.Initial(q=0.125), r"x_2 is 0 if Initial has no dq: Initial\(x="
+test_a_start_or_a_drift_that_does_not_fit_is_named_with_its_levels = refused(
+    (lambda: run_of(initial=START), ADVICE),
+    (lambda: run_of(initial=START, bounds=TUBE), ADVICE),
+    (
+        lambda: run_of(plant=Tanks(a1=5e-5, a2=1e-320), initial=ij.Initial(x=[[0.125], [0.2]])),
         r"The start is x = \[\[0.125\], \[0.2\]\](?!.*dq)",
     ),
-    "drift": (with_a_short_drift, r"drift.*The plant has 2 levels of 1 component\."),
-}
-
-
-@pytest.mark.parametrize("case", NAMED)
-def test_a_start_or_a_drift_that_does_not_fit_is_named_with_its_levels(case):
-    make, words = NAMED[case]
-    with pytest.raises(ValueError, match=words):
-        ij.simulate(make(), **SHORT)
-
-
-def test_weights_of_a_root_have_the_unit_of_its_square():
-    assert "1/m^2; 1/m " in repr(ij.parameters(tanks()))
+    (lambda: run_of(plant=SHORT_DRIFT), r"drift.*The plant has 2 levels of 1 component\."),
+)
 
 
 @pytest.mark.slow
@@ -123,14 +107,13 @@ def test_an_actuator_of_one_direction_is_checked_in_its_range():
     with pytest.raises(ij.testing.ContractError, match=r"torques=\(low, high\)"):
         ij.testing.check_actuator(pump)
     ij.testing.check_actuator(pump, torques=(0.0, 1e-4))
-    with pytest.raises(ValueError, match="torques: got"):
-        ij.testing.check_actuator(pump, torques=(1e-4, 0.0))
+    assert_refused("torques: got", ij.testing.check_actuator, pump, torques=(1e-4, 0.0))
 
 
-def test_requirements_have_the_names_of_the_plant():
-    objectives = ij.objectives
-    goal = objectives.tracking() + objectives.peak_torque_below(1e-4)
-    goal = fitted(goal + objectives.velocity_margin_above(0.05), tanks())
+def test_requirements_and_weights_have_the_names_and_units_of_the_plant():
+    assert "1/m^2; 1/m " in repr(ij.parameters(tanks()))
+    goal = ij.objectives.tracking() + ij.objectives.peak_torque_below(1e-4)
+    goal = fitted(goal + ij.objectives.velocity_margin_above(0.05), tanks())
     names = [requirement.name for requirement in goal.requirements]
     assert names == ["peak pump flow < 0.0001 m^3/s", "root of the upper level margin > 0.05 m^0.5"]
 
@@ -156,8 +139,6 @@ def test_a_certificate_counts_inaccurate_runs():
 
 @ij.component
 class Noting(ij.disturbances.Disturbance):
-    """Notes the kinds of the plant and of the model that it receives."""
-
     seen: ClassVar[set[tuple[str, str]]] = set()
 
     def torque(self, t, q, dq, plant, model):
@@ -171,10 +152,7 @@ class Noting(ij.disturbances.Disturbance):
 ROBOT = ij.robots.PlanarChain(mass=[1.3], length=[0.4], centre=[0.2], inertia=[0.02])
 FLEXIBLE = ij.plants.FlexibleJoint(ROBOT, stiffness=300.0, motor_inertia=0.01)
 WITHOUT_ROBOT = ij.plants.StrictFeedback(
-    drift=lambda t, x: jnp.stack([0.0 * x[0], -x[1]]),
-    gain=lambda t, x: jnp.ones_like(x),
-    n=1,
-    order=2,
+    lambda t, x: jnp.stack([0.0 * x[0], -x[1]]), lambda t, x: jnp.ones_like(x), n=1, order=2
 )
 PARTS = {
     "the model is Rigid": (ROBOT, ij.plants.Rigid(ROBOT), "PlanarChain"),
@@ -195,16 +173,10 @@ def test_every_user_of_a_disturbance_passes_it_the_same_plant_and_model(parts):
     law: ij.controllers.TrackingLaw = ij.controllers.Backstepping(k1=2.0, K2=5.0)
     if not isinstance(model, ij.robots.Robot):
         law = ij.controllers.BarrierBackstepping(k=(2.0, 10.0), weights=1.0)
-    scenario = canonical(
-        tanks(
-            plant=plant,
-            model=model,
-            bounds=ij.Bounds(lower=ij.bounds.Constant(-0.1), upper=ij.bounds.Constant(0.4)),
-            controller=law,
-            disturbance=ij.disturbances.Sum((noting, ij.disturbances.Levels((noting, noting)))),
-            initial=ij.Initial(q=0.12),
-        )
-    )
+    both = ij.disturbances.Sum((noting, ij.disturbances.Levels((noting, noting))))
+    parts = {"plant": plant, "model": model, "controller": law, "initial": ij.Initial(q=0.12)}
+    walls = ij.Bounds(lower=ij.bounds.Constant(-0.1), upper=ij.bounds.Constant(0.4))
+    scenario = canonical(tanks(bounds=walls, disturbance=both, **parts))
     expected = {("PlanarChain", received)}
     assert noting.seen == expected
     t, x, joint = jnp.zeros(()), start_levels(scenario), jnp.zeros(1)

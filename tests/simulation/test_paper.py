@@ -1,7 +1,4 @@
-"""The paper's simulation against an independent program (SciPy DOP853, rtol 1e-12), and the numbers
-that it must show."""
-
-from __future__ import annotations
+"""The paper's simulation against an independent program, and the numbers that it must show."""
 
 import numpy as np
 import pytest
@@ -38,23 +35,20 @@ def test_all_four_variants_at_one_millisecond(reference_data, law, variant):
         assert largest(getattr(run, name), ref[name]) <= size, name
     assert largest(run.disturbance_estimate, ref["f_hat"]) <= 1e-5
     assert largest(run.disturbance, ref["f"]) <= 1e-5
-    assert largest(run.observer_state, ref["eta"]) <= 1e-5
-    assert largest(run.V, ref["V2"]) <= 1e-6
+    assert largest(run.observer_state, ref["eta"]) <= 1e-5 and largest(run.V, ref["V2"]) <= 1e-6
 
 
 @pytest.mark.slow
 def test_float32(reference_data, paper):
     run = ij.simulate(ij.astype(paper, "float32"), **PAPER)
-    assert run.q.dtype == np.float32
-    assert run.ok
+    assert run.q.dtype == np.float32 and run.ok
     assert largest(run.q, reference_of(reference_data, *PRINTED)["q"]) <= 1e-4
 
 
 def test_what_the_paper_shows(paper_run):
     """Section 5 of the theory page: the numbers of the paper's own law."""
     xi, e1 = np.abs(np.asarray(paper_run.xi)), np.asarray(paper_run.e1)
-    assert np.max(xi) == pytest.approx(0.6154, abs=5e-5)
-    assert np.max(xi) == xi[0, 1]
+    assert np.max(xi) == pytest.approx(0.6154, abs=5e-5) and np.max(xi) == xi[0, 1]
     np.testing.assert_allclose(paper_run.metrics.settling_time, [0.99, 0.71], atol=5e-3)
     overshoot = np.max(-np.sign(e1[0]) * e1, axis=0)
     np.testing.assert_allclose(paper_run.metrics.overshoot, overshoot, rtol=1e-2)

@@ -1,19 +1,16 @@
-"""Units, names and paths of plants in strict-feedback form, in parameters, signals and metrics."""
+"""Units, names, paths, signals and metrics of plants in strict-feedback form."""
 
 import numpy as np
 import pytest
 from loops_of_plants import band, electric_drive, flexible_joint
-from plant_cases import body, pendulum
+from plant_cases import ANGLES, body, pendulum, symmetric
+from refused import assert_refused
 
 import iblf_jax as ij
 from iblf_jax.simulation.paths import get, unit_at
+from iblf_jax.simulation.signals import FIELDS, SIGNALS, VIEWS
 
-
-@pytest.fixture(scope="module")
-def pendulum_run():
-    return ij.simulate(pendulum(), duration=0.5, dt=1e-3)
-
-
+SHORT = {"duration": 0.02, "dt": 1e-3}
 UNITLESS = ij.controllers.BarrierBackstepping(
     k=(3.0, 10.0, 30.0),
     barriers=(ij.barriers.PrescribedPerformance(), *[ij.barriers.Quadratic()] * 2),
@@ -82,19 +79,19 @@ def test_levels_of_the_start_are_addressed_and_replaced():
     for table in (robot, ij.parameters(scenario, named=False)):
         assert not [p.path for p in table if p.path.startswith("initial.x[")]
     for path in ("initial.x[3]", "initial.x", "initial.x[0][1]"):
-        with pytest.raises(ValueError, match="expected the path of a leaf"):
-            get(scenario, path)
+        assert_refused("expected the path of a leaf", get, scenario, path)
 
 
-def test_margins_of_all_levels(pendulum_run):
-    x, alpha = np.asarray(pendulum_run.x), np.asarray(pendulum_run.x - pendulum_run.e)
-    metrics = pendulum_run.metrics
-    margin = np.min(20.0 - np.abs(x[:, 2:]), axis=0)
-    assert np.allclose(metrics.level_margin, margin, rtol=1e-12)
-    of_alpha = np.min(20.0 - np.abs(alpha[:, 2:]), axis=0)
-    assert np.allclose(metrics.level_alpha_margin, of_alpha, rtol=1e-12)
-    assert np.allclose(metrics.velocity_margin, np.min(3.0 - np.abs(x[:, 1]), axis=0))
-    assert np.allclose(metrics.alpha_margin, np.min(3.0 - np.abs(alpha[:, 1]), axis=0))
+def test_margins_of_all_levels():
+    run = ij.simulate(pendulum(), duration=0.5, dt=1e-3)
+    metrics = run.metrics
+    for x, of_level, of_velocity in (
+        (run.x, metrics.level_margin, metrics.velocity_margin),
+        (run.x - run.e, metrics.level_alpha_margin, metrics.alpha_margin),
+    ):
+        largest = np.max(np.abs(x), axis=0)
+        assert np.allclose(of_level, 20.0 - largest[2:], rtol=1e-12)
+        assert np.allclose(of_velocity, 3.0 - largest[1])
     assert metrics.first_level_violation_time == np.inf
     assert metrics.first_level_violation_level == -1
 
@@ -110,3 +107,29 @@ def test_the_input_above_gravity_is_that_of_the_plant():
     metrics = ij.simulate(scenario, duration=0.1, dt=1e-3, metrics=folds).metrics
     assert metrics.units["effort_above_gravity"] == "V"
     assert float(metrics.effort_above_gravity) < 1e-9 * float(np.max(metrics.torque_rms))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("above", [(), (None, symmetric(90.0))])
+def test_views_are_rows_and_bounds_end_with_the_last_level_that_has_some(above):
+    law = ij.controllers.BarrierBackstepping(k=(3.0, 10.0, 30.0))
+    run = ij.simulate(pendulum(controller=law, bounds=(ANGLES, *above)), **SHORT)
+    samples = run.t.size
+    assert run.x.shape == run.e.shape == (samples, 3, 1)
+    assert run.level_lower.shape == run.level_upper.shape == (samples, 1 + len(above), 1)
+    for name, view in VIEWS.items():
+        rows = np.asarray(getattr(run, view.signal))
+        expected = rows[:, view.row] if view.row < rows.shape[1] else ()
+        np.testing.assert_array_equal(getattr(run, name), expected, err_msg=name)
+    if above:
+        assert np.all(np.isneginf(run.dq_lower)) and np.all(np.isposinf(run.dq_upper))
+        np.testing.assert_array_equal(run.level_upper[:, 2], 90.0)
+
+
+def test_the_errors_of_a_robot_have_two_rows_and_every_signal_a_unit_and_a_meaning():
+    robot = ij.simulate(ij.presets.zhang_yan_2024(), **SHORT)
+    assert robot.x.shape == robot.e.shape == (21, 2, 2)
+    np.testing.assert_array_equal(robot.e1, robot.q - robot.q_d)
+    np.testing.assert_allclose(robot.e2, robot.dq - robot.alpha, rtol=0, atol=1e-15)
+    assert set(SIGNALS) == {*FIELDS, *VIEWS}
+    assert all(signal.unit and signal.meaning for signal in SIGNALS.values())

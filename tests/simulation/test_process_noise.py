@@ -1,7 +1,4 @@
-"""Process noise: the methods against exact solutions along the same Brownian path, an independent
-program, known moments, and the statistics of the first exit."""
-
-from __future__ import annotations
+"""Process noise: an independent program, known moments, and statistics of the first exit."""
 
 import dataclasses
 
@@ -9,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from refused import assert_refused, refused
 from scipy import linalg
 
 import iblf_jax as ij
@@ -24,6 +22,7 @@ from iblf_jax.simulation.noise import (
 )
 from iblf_jax.simulation.scenario import canonical
 
+HEUN = "stochastic_heun"
 INERTIA = 0.05 + 0.8 * 0.3**2
 START, SPEED = 0.2, 0.5
 
@@ -41,23 +40,18 @@ def link(noise=None, stiffness: float = 1.2, damping: float = 0.4, g: float = 0.
     )
 
 
-# --- independent program --------------------------------------------------------------------------
-
-
-def independent_path(method, sigma, dW, dt, stiffness=1.2, damping=0.4, g=9.81):
+def independent_path(method, sigma, dW, dt):
     """The same loop in NumPy: gravity in plant and law cancels, so only the PD terms remain."""
     q, v = START, SPEED
     found = [(q, v)]
 
     def drift(q, v):
-        weight = 0.8 * g * 0.3 * np.cos(q)
-        torque = weight - stiffness * q - damping * v
-        return (torque - weight) / INERTIA
+        return (-1.2 * q - 0.4 * v) / INERTIA
 
     for k, w in enumerate(dW):
         t = k * dt
         q1, v1 = q + v * dt, v + drift(q, v) * dt + sigma(t, v) * w
-        if method == "stochastic_heun":
+        if method == HEUN:
             v_end = v + 0.5 * dt * (drift(q, v) + drift(q1, v1))
             v_end += 0.5 * (sigma(t, v) + sigma(t + dt, v1)) * w
             q, v = q + 0.5 * dt * (v + v1), v_end
@@ -67,20 +61,21 @@ def independent_path(method, sigma, dW, dt, stiffness=1.2, damping=0.4, g=9.81):
     return np.array(found)
 
 
+def wave(t, xp):
+    return 0.5 + 0.3 * xp.sin(4.0 * t)
+
+
 CASES = {
     "euler_maruyama": (process_noise.Additive([[0.7]]), lambda t, v: 0.7),
-    "stochastic_heun": (
-        process_noise.Diffusion(
-            lambda t, x: (0.5 + 0.3 * jnp.sin(4.0 * t)) * jnp.ones_like(x[1:]), additive=True
-        ),
-        lambda t, v: 0.5 + 0.3 * np.sin(4.0 * t),
+    HEUN: (
+        process_noise.Diffusion(lambda t, x: wave(t, jnp) * jnp.ones_like(x[1:]), additive=True),
+        lambda t, v: wave(t, np),
     ),
     "euler_maruyama, of Ito": (process_noise.Proportional(0.6), lambda t, v: 0.6 * v),
 }
 
 
 def increments(substeps, count, dt):
-    """Those of many steps in two noisy levels."""
     noise = process_noise.Additive([[0.3], [0.2]], levels=(1, 2), substeps=substeps)
     key = noise_key(jax.random.PRNGKey(0), 0).astype(float)
     draw = jax.jit(jax.vmap(lambda step: brownian_increment(link(noise), key, step, dt)))
@@ -89,16 +84,13 @@ def increments(substeps, count, dt):
 
 @pytest.mark.parametrize("substeps", [1, 4])
 def test_increments_of_steps_are_independent_and_have_their_length_as_variance(substeps):
+    """Those of several substeps are on the path of short steps."""
     found, count = increments(substeps, 4096, 0.01), 4096
     pairs = np.concatenate([found[:-1], found[1:]], axis=1)
     np.testing.assert_allclose(np.cov(pairs.T) / 0.01, np.eye(4), atol=5 * np.sqrt(2 / count))
-
-
-def test_steps_of_several_substeps_are_on_the_path_of_short_steps():
-    short = increments(1, 64, 0.01)
-    np.testing.assert_allclose(
-        increments(4, 16, 0.04), short.reshape(16, 4, 2).sum(axis=1), atol=1e-15
-    )
+    of_substeps = increments(1, 16 * substeps, 0.01).reshape(16, substeps, 2).sum(axis=1)
+    path = increments(substeps, 16, 0.01 * substeps)
+    np.testing.assert_allclose(path, of_substeps, atol=1e-15)
 
 
 @pytest.mark.slow
@@ -108,12 +100,11 @@ def test_trajectories_against_an_independent_program(case):
     method, scenario = case.split(",")[0], link(noise, g=9.81)
     run = ij.simulate(scenario, duration=0.5, dt=5e-3, method=method, seed=4, backend="vmap")
     key = noise_key(jax.random.PRNGKey(4)).astype(float)
-    steps = jnp.arange(100)
-    dW = jax.vmap(lambda k: brownian_increment(canonical(scenario), key, k, jnp.asarray(5e-3)))(
-        steps
-    )
-    path = independent_path(method, sigma, np.asarray(dW)[:, 0, 0], 5e-3)
-    assert np.ptp(np.asarray(dW)) > 0.1
+    noisy = canonical(scenario)
+    increment = jax.vmap(lambda k: brownian_increment(noisy, key, k, jnp.asarray(5e-3)))
+    dW = np.asarray(increment(jnp.arange(100)))[:, 0, 0]
+    path = independent_path(method, sigma, dW, 5e-3)
+    assert np.ptp(dW) > 0.1
     np.testing.assert_allclose(run.x[:, :, 0], path, atol=1e-12)
     assert np.all(np.isnan(run.metrics["numerical_error"]))
     assert not int(run.status) & int(ij.Status.INACCURATE)
@@ -136,17 +127,14 @@ def test_the_variance_of_a_mode_is_right_to_five_per_cent(method):
 @pytest.mark.slow
 def test_the_recommended_step_is_that_of_a_noisy_mode():
     scenario = link(process_noise.Additive(0.7), stiffness=3.0, damping=2.0)
-    dt = ij.recommended_dt(scenario, duration=1.0, method="stochastic_heun")
-    run = ij.simulate(scenario, duration=0.1, dt=dt, method="stochastic_heun", backend="vmap")
+    dt = ij.recommended_dt(scenario, duration=1.0, method=HEUN)
+    run = ij.simulate(scenario, duration=0.1, dt=dt, method=HEUN, backend="vmap")
     assert 0.1 < dt * float(run.fastest_mode) <= NOISY_PHASES["stochastic_heun"]
     coarse = 2.1 / float(run.fastest_mode)
     with pytest.warns(ij.SimulationWarning, match=f"Take dt={dt:g}"):
-        run = ij.simulate(
-            scenario, duration=2 * coarse, dt=coarse, method="stochastic_heun", backend="vmap"
-        )
+        run = ij.simulate(scenario, duration=2 * coarse, dt=coarse, method=HEUN, backend="vmap")
     assert int(run.status) & int(ij.Status.STEP_TOO_LARGE)
-    with pytest.raises(ValueError, match="has process noise"):
-        ij.recommended_dt(scenario, duration=1.0)
+    assert_refused("has process noise", ij.recommended_dt, scenario, duration=1.0)
 
 
 @pytest.mark.slow
@@ -167,27 +155,17 @@ def test_a_divided_step_has_the_increment_of_the_step():
     np.testing.assert_allclose(covariance, np.diag([0.03, 0.03, 0.04]), atol=2e-3)
 
 
-# --- a study: moments, chunks, first exit ---------------------------------------------------------
+def make_study(runs=1500, **options):
+    """An Ornstein-Uhlenbeck process of second order that is stationary at the end."""
+    scenario = link(process_noise.Additive(2.6), stiffness=0.6, damping=0.5)
+    options |= {"duration": 4.0, "dt": 1e-2, "method": HEUN, "progress": False}
+    options["metrics"] = (ij.metrics.Margin(), ij.metrics.FirstExit())
+    return ij.monte_carlo(scenario, {}, runs=runs, **options)
 
 
 @pytest.fixture(scope="module")
 def study():
     return make_study()
-
-
-def make_study(runs=1500, **options):
-    """An Ornstein-Uhlenbeck process of second order that is stationary at the end."""
-    return ij.monte_carlo(
-        link(process_noise.Additive(2.6), stiffness=0.6, damping=0.5),
-        {},
-        runs=runs,
-        duration=4.0,
-        dt=1e-2,
-        method="stochastic_heun",
-        metrics=(ij.metrics.Margin(), ij.metrics.FirstExit()),
-        progress=False,
-        **options,
-    )
 
 
 @pytest.mark.slow
@@ -212,38 +190,29 @@ def test_first_exit(study):
     np.testing.assert_allclose(replayed.metrics["margin"], margin, atol=1e-12)
 
 
+def first_exits(study, times, **changes):
+    never = np.full(len(study) - len(times), np.inf, times.dtype)
+    metrics = dict(study.metrics) | {"first_violation_time": np.append(times, never)}
+    return dataclasses.replace(study, metrics=metrics, **changes).first_exit(instants=3)
+
+
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_an_exit_at_the_last_instant_counts_in_every_precision(study, dtype):
     """k dt, rounded to the precision of a run, may exceed the end of the study."""
-    steps = round(study.duration / study.dt)
-    last = np.nextafter(dtype(steps * study.dt), dtype(np.inf))
-    times = np.full(len(study), np.inf, dtype)
-    times[:600] = last
-    metrics = dict(study.metrics) | {"first_violation_time": times}
-    found = dataclasses.replace(study, metrics=metrics).first_exit(instants=3)
+    end = round(study.duration / study.dt) * study.dt
+    found = first_exits(study, np.full(600, np.nextafter(dtype(end), dtype(np.inf))))
     np.testing.assert_allclose(found.probability, [0.0, 0.0, 600 / len(study)])
 
 
-def test_a_run_that_diverged_before_an_exit_counts_at_the_end(study):
-    times = np.full(len(study), np.inf)
-    times[0] = 1.0
-    status = np.zeros(len(study), np.int32)
-    status[:3] = int(ij.Status.NOT_FINITE)
-    metrics = dict(study.metrics) | {"first_violation_time": times}
-    found = dataclasses.replace(study, metrics=metrics, status=status).first_exit(instants=3)
+def test_a_run_that_diverged_counts_at_the_end_and_a_missing_metric_is_named(study):
+    status = np.where(np.arange(len(study)) < 3, np.int32(ij.Status.NOT_FINITE), np.int32(0))
+    found = first_exits(study, np.array([1.0]), status=status)
     assert found.diverged == 2
     np.testing.assert_array_equal(found.times[:4], [1.0, 4.0, 4.0, np.inf])
     np.testing.assert_allclose(found.probability * len(study), [0.0, 1.0, 3.0])
-
-
-@pytest.mark.parametrize(("joint", "metric"), [(None, "Margin"), (0, "FirstExit")])
-def test_first_exit_names_the_missing_metric(study, joint, metric):
     bare = dataclasses.replace(study, metrics={})
-    with pytest.raises(ValueError, match=rf"ij\.metrics\.{metric}\(\)"):
-        bare.first_exit(joint=joint)
-
-
-# --- derivatives, refusals ---------------------------------------------------
+    for joint, missing in ((None, "Margin"), (0, "FirstExit")):
+        assert_refused(rf"ij\.metrics\.{missing}\(\)", bare.first_exit, joint=joint)
 
 
 @pytest.mark.slow
@@ -252,7 +221,7 @@ def test_pathwise_derivative_by_the_intensity():
 
     def end(intensity):
         noisy = ij.with_parameters(scenario, {"process_noise.intensity": intensity})
-        run = ij.simulate(noisy, duration=0.2, dt=1e-2, method="stochastic_heun", backend="vmap")
+        run = ij.simulate(noisy, duration=0.2, dt=1e-2, method=HEUN, backend="vmap")
         return run.q[-1, 0]
 
     slope = jax.grad(end)(0.7)
@@ -264,38 +233,24 @@ def simulated(noise, method):
     return ij.simulate(link(noise), duration=0.1, dt=1e-2, method=method)
 
 
-@pytest.mark.parametrize(
-    ("make", "words"),
-    [
-        (lambda: simulated(None, "euler_maruyama"), "has no process noise"),
-        (lambda: simulated(process_noise.Additive(0.1), "rk4"), "has process noise"),
-        (
-            lambda: simulated(process_noise.Proportional(0.1), "stochastic_heun"),
-            "depends on the state",
-        ),
-        (lambda: process_noise.Additive(0.1, levels=()), "levels"),
-        (lambda: process_noise.Additive(0.1, levels=(2, 1)), "increasing"),
-        (lambda: process_noise.Additive([[0.1], [0.2]]), "rows"),
-        (lambda: process_noise.Diffusion(3.0), "function"),
-        (lambda: link(process_noise.Additive(0.1, levels=(3,))), "levels up to 2"),
-        (lambda: link(process_noise.Diffusion(lambda t, x: x)), "shape"),
-        (lambda: link(3.0), "ProcessNoise"),
-    ],
+test_noise_or_a_method_that_does_not_fit_is_refused = refused(
+    (lambda: simulated(None, "euler_maruyama"), "has no process noise"),
+    (lambda: simulated(process_noise.Additive(0.1), "rk4"), "has process noise"),
+    (lambda: simulated(process_noise.Proportional(0.1), HEUN), "depends on the state"),
+    (lambda: process_noise.Additive(0.1, levels=()), "levels"),
+    (lambda: process_noise.Additive(0.1, levels=(2, 1)), "increasing"),
+    (lambda: process_noise.Additive([[0.1], [0.2]]), "rows"),
+    (lambda: process_noise.Diffusion(3.0), "function"),
+    (lambda: link(process_noise.Additive(0.1, levels=(3,))), "levels up to 2"),
+    (lambda: link(process_noise.Diffusion(lambda t, x: x)), "shape"),
+    (lambda: link(3.0), "ProcessNoise"),
 )
-def test_noise_or_a_method_that_does_not_fit_is_refused(make, words):
-    with pytest.raises(ValueError, match=words):
-        make()
-
-
-# --- the first exit against exact probabilities ---------------------------------------------------
-
 WALL, EXIT_SIGMA, EXIT_RATE, EXIT_RUNS = 0.1, 0.1, 2.0, 20_000
 
 
 def probability_of_exit(rate: float, duration: float, size: int = 400) -> float:
     """That dx = -rate x dt + sigma dW from 0 leaves (-WALL, WALL) before the duration: one minus
-    the solution of the backward equation u_t = sigma^2/2 u_xx - rate x u_x, u = 0 at the walls.
-    """
+    the solution of the backward equation u_t = sigma^2/2 u_xx - rate x u_x, u = 0 at the walls."""
     x, h = np.linspace(-WALL, WALL, size + 1)[1:-1], 2 * WALL / size
     diffusion, drift = 0.5 * EXIT_SIGMA**2 / h**2, 0.5 * rate * x / h
     generator = np.diag(np.full(size - 1, -2 * diffusion))
@@ -303,19 +258,17 @@ def probability_of_exit(rate: float, duration: float, size: int = 400) -> float:
     return 1.0 - (linalg.expm(duration * generator) @ np.ones(size - 1))[size // 2 - 1]
 
 
-def exits(rate: float, dt: float, level: int, **options) -> ij.Study:
-    """Runs of a link whose position (level 1) is Brownian, or whose velocity (level 2) is an
-    Ornstein-Uhlenbeck process."""
-    scenario = link(
-        process_noise.Additive(EXIT_SIGMA, levels=(level,)), stiffness=1e-9, damping=rate * INERTIA
+def exits(rate: float, level: int) -> ij.Study:
+    """Runs whose position is Brownian, or whose velocity is an Ornstein-Uhlenbeck process."""
+    noise = process_noise.Additive(EXIT_SIGMA, levels=(level,))
+    far, near = (bounds.Bounds(bounds.Constant(-x), bounds.Constant(x)) for x in (5.0, WALL))
+    scenario = ij.with_parts(
+        link(noise, stiffness=1e-9, damping=rate * INERTIA),
+        initial=ij.Initial(q=[0.0], dq=[0.0]),
+        bounds=(near, None) if level == 1 else (far, near),
     )
-    far, near = (
-        bounds.Bounds(lower=bounds.Constant(-x), upper=bounds.Constant(x)) for x in (5.0, WALL)
-    )
-    walls = (near, None) if level == 1 else (far, near)
-    scenario = ij.with_parts(scenario, initial=ij.Initial(q=[0.0], dq=[0.0]), bounds=walls)
-    given = {"runs": EXIT_RUNS, "duration": 1.0, "dt": dt, "method": "stochastic_heun"}
-    return ij.monte_carlo(scenario, {}, progress=False, **(given | options))
+    how = {"duration": 1.0, "dt": 4e-3, "method": HEUN, "progress": False}
+    return ij.monte_carlo(scenario, {}, runs=EXIT_RUNS, **how)
 
 
 @pytest.mark.slow
@@ -323,11 +276,10 @@ def exits(rate: float, dt: float, level: int, **options) -> ij.Study:
 def test_exits_between_two_instants_count(level, rate):
     exact = probability_of_exit(rate, 1.0)
     # Without a rate a small damping lets the velocity stay 0.
-    study = exits(rate or 1.0, 4e-3, level)
+    study = exits(rate or 1.0, level)
     found = np.asarray(study.violation_probability.estimate)
     deviation = np.sqrt(exact * (1 - exact) / EXIT_RUNS)
-    assert 0.2 < exact < 0.8
-    assert abs(found - exact) < 3.5 * deviation
+    assert 0.2 < exact < 0.8 and abs(found - exact) < 3.5 * deviation
     name = {1: "margin", 2: "velocity_margin"}[level]
     margins = np.asarray(study.metrics[name])[:, 0]
     np.testing.assert_array_equal(margins <= 0, np.asarray(study.status) & 1025 != 0)
@@ -346,7 +298,6 @@ def test_the_smallest_distance_has_the_distribution_of_the_bridge():
     for y in (-0.1, 0.0, 0.2):
         exact = np.exp(-2 * (before - y) * (now - y) / variance)
         assert np.mean(least < y) == pytest.approx(exact, abs=1e-3)
-    none = least_distances(
-        jnp.asarray([0.3, jnp.inf]), jnp.asarray([0.5, jnp.inf]), 0.0, uniform[:2]
-    )
+    ends = jnp.asarray([[0.3, jnp.inf], [0.5, jnp.inf]])
+    none = least_distances(*ends, 0.0, uniform[:2])
     np.testing.assert_allclose(none, [0.3, np.inf], rtol=1e-6)

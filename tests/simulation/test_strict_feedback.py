@@ -1,20 +1,19 @@
 """Closed loops of plants in strict-feedback form against the independent program."""
 
-from __future__ import annotations
-
 import dataclasses
-from functools import partial
 
 import chain_cases
 import independent_chains as other
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from refused import assert_refused
 
 import iblf_jax as ij
 from iblf_jax import bounds, controllers, plants
 
 DATA = np.load(other.FILE)
+WALL = ij.Bounds(lower=bounds.Constant(-1.0), upper=bounds.Constant(1.0))
 STEPS = {"flexible": 2e-4, "surface": 5e-4}
 """Cases whose runs are compared: the coupled chain is below, and `test_event_trigger` has the
 pendulum."""
@@ -29,10 +28,8 @@ def closed_loop(name: str) -> ij.Scenario:
 def test_equal_to_the_independent_program(name):
     """Every fifth instant of its run: states, input, estimates and sum w_i V_i."""
     run = {key: DATA[f"{name}.run.{key}"][::5] for key in ("x", "u", "d_hat", "V")}
-    dt = STEPS[name]
-    found = ij.simulate(
-        closed_loop(name), duration=4.0, dt=dt, record_every=round(0.05 / dt), throw=True
-    )
+    how = {"dt": STEPS[name], "record_every": round(0.05 / STEPS[name])}
+    found = ij.simulate(closed_loop(name), duration=4.0, throw=True, **how)
     np.testing.assert_allclose(found.x, run["x"], rtol=1e-8, atol=2e-8)
     np.testing.assert_allclose(found.tau, run["u"], rtol=1e-6, atol=1e-5)
     np.testing.assert_allclose(found.disturbance_estimate, run["d_hat"], rtol=1e-6, atol=1e-6)
@@ -53,9 +50,8 @@ def test_errors_and_uncertain_terms_of_the_levels():
 
 @pytest.mark.slow
 def test_a_flexible_joint_starts_at_the_equilibrium_of_its_springs():
-    scenario = chain_cases.scenario(
-        "flexible", initial=ij.Initial(q=other.ARM_START, dq=[0.1, 0.0])
-    )
+    start = ij.Initial(q=other.ARM_START, dq=[0.1, 0.0])
+    scenario = chain_cases.scenario("flexible", initial=start)
     run = ij.simulate(scenario, duration=0.01, dt=1e-3)
     gravity = np.asarray(scenario.plant.robot.gravity(jnp.asarray(other.ARM_START)))
     np.testing.assert_allclose(run.x[0, 2], other.ARM_START + gravity / other.STIFFNESS)
@@ -63,6 +59,7 @@ def test_a_flexible_joint_starts_at_the_equilibrium_of_its_springs():
 
 
 def test_bounds_have_one_entry_for_each_level():
+    """A single Bounds replaces that of the first level."""
     preset = ij.presets.motor_driven_pendulum()
     first, second, third = preset.bounds
     parts = {"controller": controllers.BarrierBackstepping(k=(2.0, 15.0, 60.0))}
@@ -78,32 +75,22 @@ def test_bounds_have_one_entry_for_each_level():
     given = (*arm.bounds[:2], None, None)
     rigid = ij.with_parts(arm, robot=arm.plant.robot, bounds=given, controller=law)
     assert rigid.bounds == arm.bounds[:2]
+    for one in (ij.presets.zhang_yan_2024_full_state(), preset):
+        changed = ij.with_parts(one, bounds=WALL)
+        np.testing.assert_array_equal(changed.bounds[0].upper.value, 1.0)
+        assert changed.bounds[1:] == one.bounds[1:]
 
 
-def test_a_single_bounds_replaces_that_of_the_first_level():
-    wide = ij.Bounds(lower=bounds.Constant(-3.0), upper=bounds.Constant(3.0))
-    for preset in (ij.presets.zhang_yan_2024_full_state(), ij.presets.motor_driven_pendulum()):
-        changed = ij.with_parts(preset, bounds=wide)
-        np.testing.assert_array_equal(changed.bounds[0].upper.value, 3.0)
-        assert changed.bounds[1:] == preset.bounds[1:]
-
-
-WALL = ij.Bounds(lower=bounds.Constant(-1.0), upper=bounds.Constant(1.0))
-
-
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
+def test_bounds_that_are_refused():
+    preset = ij.presets.motor_driven_pendulum()
+    for given, message in (
         ((WALL,) * 4, r"bounds: got '4 bounds', expected at most 3, for the levels 1 to 3"),
         ((WALL, 2.0), r"bounds\[1\]: got 2\.0?, expected a Bounds, or None for a level without"),
         ((None, WALL), r"bounds\[0\]: got None, expected the bounds of the first level"),
         ((), r"bounds\[0\]: got None, expected the bounds of the first level"),
         (2.0, r"bounds: got 2\.0?, expected a Bounds, .*, or a tuple of one for each level"),
-    ],
-)
-def test_bounds_that_are_refused(given, message):
-    with pytest.raises(ValueError, match=rf"Scenario\.{message}"):
-        ij.with_parts(ij.presets.motor_driven_pendulum(), bounds=given)
+    ):
+        assert_refused(rf"Scenario\.{message}", ij.with_parts, preset, bounds=given)
 
 
 def test_paths_of_earlier_versions_lead_to_the_bounds_of_levels():
@@ -141,14 +128,13 @@ def test_a_rigid_law_on_stiff_joints_tends_to_the_robot_with_motors():
     """With first order in 1/K, with the inertia of the motors in the model."""
     paper = ij.presets.zhang_yan_2024(variant="corrected")
     law = controllers.Backstepping(k1=2.0, K2=[4.0, 0.6], o=0.1, variant="corrected")
-    observer = ij.observers.NoObserver()
-    on = partial(ij.with_parts, paper, controller=law, observer=observer)
+    parts = {"controller": law, "observer": ij.observers.NoObserver()}
 
     def end(stiffness):
         motors = {"motor_inertia": [0.1, 0.02], "motor_damping": [2.0, 0.5]}
         plant = plants.FlexibleJoint(paper.plant, stiffness=stiffness or 1.0, **motors)
-        rigid = plant.rigid()
-        scenario = on(plant=plant if stiffness else rigid, model=rigid)
+        parts["model"] = plant.rigid()
+        scenario = ij.with_parts(paper, plant=plant if stiffness else parts["model"], **parts)
         return ij.simulate(scenario, duration=0.4, dt=2e-4, record_every=20).q
 
     errors = np.array([np.max(np.abs(end(K) - end(None))) for K in (2e3, 4e3, 8e3, 16e3)])

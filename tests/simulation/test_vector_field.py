@@ -1,7 +1,4 @@
-"""`vector_field`: the closed loop in other libraries' solvers, as docs/how_to/other_solvers.md
-shows it."""
-
-from __future__ import annotations
+"""`vector_field`: the closed loop in other solvers, as docs/how_to/other_solvers.md shows it."""
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +7,7 @@ import pytest
 import run_page
 from conftest import ROOT
 from members import LAWS, OBSERVERS
+from refused import assert_refused
 
 import iblf_jax as ij
 from iblf_jax.simulation.closed_loop import initial_state, rate
@@ -18,16 +16,11 @@ PAGE = ROOT / "docs" / "how_to" / "other_solvers.md"
 LAW_WITH_MEMORY = {"controller": LAWS["adaptive_rbf"], "observer": OBSERVERS["extended_state"]}
 
 
-@pytest.fixture(scope="module")
-def page() -> dict:
-    """What the code blocks of the page leave behind, run from top to bottom as a reader would."""
-    pytest.importorskip("diffrax")
-    return run_page.run(PAGE)
-
-
 @pytest.mark.slow
-def test_diffrax_and_scipy_agree_with_simulate(page, paper):
+def test_diffrax_and_scipy_agree_with_simulate(paper):
     """With so small a step that nothing is left of it at 1e-12."""
+    pytest.importorskip("diffrax")
+    page = run_page.run(PAGE)
     converged = ij.simulate(paper, duration=0.5, dt=2.5e-5, record_every=400)
     np.testing.assert_allclose(page["q"], converged.q, rtol=0, atol=1e-9)
     np.testing.assert_allclose(page["scipy_q"], converged.q, rtol=0, atol=1e-9)
@@ -76,12 +69,10 @@ def test_bad_arguments(paper):
     ]
     for x in (3.0, "q", None, 1j * np.zeros(6), [[1.0], [2.0, 3.0]], {"q": 1.0}):
         refused += [("x: ", lambda x=x: field.unpack(x)), ("x: ", lambda x=x: field(0.0, x))]
-    refused += [
-        ("t: ", lambda t=t: field.sample(t, field.start)) for t in ([0.0, 1.0], "now", None)
-    ]
+    for t in ([0.0, 1.0], "now", None):
+        refused.append(("t: ", lambda t=t: field.sample(t, field.start)))
     changed = ({"x": np.zeros((2, 3))}, {"controller": np.zeros(2)}, {"x": "ab"})
     for wrong in (3.0, None, (1, 2, 3, 4), *(state._replace(**change) for change in changed)):
         refused.append(("state: ", lambda wrong=wrong: field.pack(wrong)))
     for words, made in refused:
-        with pytest.raises(ValueError, match=words):
-            made()
+        assert_refused(words, made)

@@ -1,19 +1,18 @@
-"""The checkers themselves: they name what is wrong with a broken member, and accept classes that a
-user wrote."""
-
-from __future__ import annotations
+"""The checkers name what is wrong with a broken member, and accept classes of users."""
 
 import dataclasses
 from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
+import loops_of_plants
 import numpy as np
 import pytest
 from iblf_jax.controllers import Command
+from refused import assert_refused
 
 import iblf_jax as ij
-from iblf_jax import testing
+from iblf_jax import plants, testing
 from iblf_jax.testing import ContractError
 from iblf_jax.testing._contract import Findings, in_dtype
 from iblf_jax.testing.joints import joints_of
@@ -21,16 +20,13 @@ from iblf_jax.testing.own_claims import check_claims
 
 TWO_LINK = ij.robots.TwoLink
 ERROR = ij.barriers.TransformedError
-
-
-# --- classes of users -----------------------------------------------------------------------------
+FILTERED = ij.sensors.FilteredDifference
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class PlainLaw:
-    """A user's law, registered by hand: gravity compensation and a damped spring to the
-    reference."""
+    """A user's law, registered by hand: gravity compensation, a spring and a damper."""
 
     gain: jax.Array
 
@@ -142,22 +138,6 @@ class FiniteBarrier:
 
 
 @ij.component
-class Root:
-    """The root of an integral, which has no derivative on a run without any error."""
-
-    units: ClassVar[dict[str, str]] = {"rms": "rad"}
-
-    def init(self, sample):
-        return jnp.zeros_like(sample.t)
-
-    def update(self, acc, sample):
-        return acc + sample.dt * jnp.sum(sample.e1**2)
-
-    def finish(self, acc):
-        return {"rms": jnp.sqrt(acc)}
-
-
-@ij.component
 class Nothing:
     pass
 
@@ -177,11 +157,7 @@ class Strict:
         return jnp.broadcast_to(self.value, q_d.shape)
 
 
-# --- broken members -------------------------------------------------------------------------------
-
-
 def changed(base, **methods):
-    """A component like `base`'s class with some methods exchanged."""
     return ij.component(type("Broken", (base,), {"__annotations__": {}, **methods}))
 
 
@@ -201,6 +177,12 @@ def noise(**methods):
 
 def motor(**methods):
     return changed(VoltageMotor, **methods)(R=[1.0])
+
+
+def root(name):
+    """The root of an integral, which has no derivative on a run without any error."""
+    methods = {"units": {name: "rad"}, "finish": lambda self, acc: {"rms": jnp.sqrt(acc)}}
+    return changed(WeightedSquare, **methods)(weight=1.0)
 
 
 def law(gain=3.0, **methods):
@@ -239,7 +221,65 @@ WRONG_IDENTITIES = {
     "inverse_dynamics": lambda self, q, v, u, a: TWO_LINK.mass_matrix(self, q) @ a,
     "energy_gradient": lambda self, q, v: v,
 }
+PENDULUM = ij.presets.motor_driven_pendulum().plant
+
+
+def drift(t, x):
+    return jnp.stack([jnp.cos(x[0]), x[0] * x[1]])
+
+
+def gain(t, x):
+    return jnp.stack([jnp.ones_like(x[0]), 2.0 + x[0] ** 2])
+
+
+def plant_of(drift=drift, gain=gain, **others):
+    return plants.StrictFeedback(drift=drift, gain=gain, **({"n": 1, "order": 2} | others))
+
+
+def pendulum(**methods):
+    return changed(type(PENDULUM), **methods)(**vars(PENDULUM))
+
+
 QUICK = {
+    "plant": {
+        "StrictFeedback.drift(t, x): got row 0 that depends on x[1] | row 0 of the gain": lambda: (
+            plant_of(drift=lambda t, x: jnp.stack([x[1], x[0]]))
+        ),
+        "row 1 of gain(t, x) is not finite at x = [ | check_plant(plant, x=": lambda: plant_of(
+            gain=lambda t, x: jnp.stack([x[0] ** 0, jnp.sqrt(x[1] - 1.0)])
+        ),
+        "(1,). All rows of jnp.stack must have one shape: write 0.0 * x[0]": lambda: plant_of(
+            drift=lambda t, x: jnp.stack([0.0, x[1]])
+        ),
+        "row 1 of gain(t, x) is singular": lambda: plant_of(
+            gain=lambda t, x: jnp.stack([x[0] ** 0, 0.0 * x[0]])
+        ),
+        "row 0 of gain(t, x) is singular": lambda: plant_of(
+            drift=lambda t, x: -x, gain=lambda t, x: jnp.ones((2, 2, 2), x.dtype), n=2
+        ),
+        "drift(t, x) | has shape (1,) | It must be (2, 1)": lambda: plant_of(
+            drift=lambda t, x: x[0]
+        ),
+        "gain(t, x) | has shape (1, 1) | (2, 1) for diagonal gains": lambda: plant_of(
+            gain=lambda t, x: jnp.ones((1, 1), x.dtype)
+        ),
+        "not finite": lambda: plant_of(drift=lambda t, x: jnp.stack([jnp.sqrt(x[0] - x[0]), x[1]])),
+        "level_rate is not f_i + G_i x_{i+1}": lambda: pendulum(
+            level_rate=lambda self, level, t, x, above, torque: above
+        ),
+        "level_input is not the inverse": lambda: pendulum(
+            level_input=lambda self, level, t, x, rate, torque: rate
+        ),
+        "transposed_gain is not G_i^T s": lambda: pendulum(
+            transposed_gain=lambda self, level, t, x, s: 2.0 * s
+        ),
+        "do not hold the plant at q": lambda: pendulum(steady_input=lambda self, q: 1.0 + 0.0 * q),
+        "weights has negative entries": lambda: pendulum(weights=lambda self, x: -jnp.ones_like(x)),
+        "level_names | expected a tuple of 3 texts": lambda: pendulum(
+            level_names=("angle", "speed")
+        ),
+        "4 units": lambda: pendulum(units=("rad", "rad/s", "V")),
+    },
     "law": {
         "JAX does not know its class | iblf_jax.component": object,
         "command(t, q, dq, f_hat, context, state) is missing | init(q, dq": Nothing,
@@ -248,12 +288,8 @@ QUICK = {
         "it is a class": lambda: TWO_LINK,
         "mass_matrix(q) is missing | potential(q) is missing | n | [kg m^2]": Nothing,
     },
-    "fold": {
-        "'units' is missing | update(acc, sample) is missing": Nothing,
-    },
-    "side": {
-        "cannot be rebuilt by JAX | check(self)": lambda: Strict(0.9),
-    },
+    "fold": {"'units' is missing | update(acc, sample) is missing": Nothing},
+    "side": {"cannot be rebuilt by JAX | check(self)": lambda: Strict(0.9)},
     "disturbance": {
         "jumps at t = 4.567 | jump_times": lambda: changed(
             ij.disturbances.Step, jump_times=lambda self: jnp.zeros(0)
@@ -346,15 +382,14 @@ SLOW = {
         ),
     },
     "fold": {
-        "NaN on a run without any error": Root,
-        "units names ['other']": changed(Root, units={"other": "1"}),
+        "NaN on a run without any error": lambda: root("rms"),
+        "units names ['other']": lambda: root("other"),
     },
 }
 """Family -> words of what is found, and a member that is broken so."""
 
 
 def broken():
-    """Every broken member with its family, slow ones with their mark."""
     for table, marks in ((QUICK, ()), (SLOW, pytest.mark.slow)):
         for family, rows in table.items():
             for words, make in rows.items():
@@ -370,32 +405,18 @@ def test_what_is_wrong_with_a_broken_member_is_named(family, words, make):
         assert word in str(caught.value), str(caught.value)
 
 
-# --- members that fit -----------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_classes_of_users_fit():
-    testing.check_law(PlainLaw(jnp.asarray(30.0)))
-    testing.check_process_noise(Gusts(0.3))
-
-
-def test_an_actuator_of_one_joint_whose_input_is_a_voltage():
-    testing.check_actuator(VoltageMotor(R=[1.0]))
-    with pytest.raises(ValueError, match=r"actuator.R: got .*expected one number, or 2"):
-        testing.check_actuator(VoltageMotor(R=[1.0]), n=2)
-
-
-def without_memory(self, command, dq, state):
-    """Its input is a current in mA, its torque proportional to it, in the other direction."""
-    return delivered(-1e-3 * self.Kt * command)
-
-
-def washed_out(self, command, dq, state):
-    """It delivers what changes, and in the end nothing."""
-    return delivered(command - state, self.R * (command - state))
-
-
 def test_actuators_with_other_inputs_and_without_a_steady_state():
+    """A voltage; one in mA and in the other direction; a torque that follows changes only."""
+
+    def without_memory(self, command, dq, state):
+        return delivered(-1e-3 * self.Kt * command)
+
+    def washed_out(self, command, dq, state):
+        return delivered(command - state, self.R * (command - state))
+
+    words = r"actuator.R: got .*expected one number, or 2"
+    testing.check_actuator(VoltageMotor(R=[1.0]))
+    assert_refused(words, testing.check_actuator, VoltageMotor(R=[1.0]), n=2)
     testing.check_actuator(motor(init=lambda self, tau: (), deliver=without_memory))
     testing.check_actuator(motor(init=lambda self, tau: 0.0 * tau, deliver=washed_out))
 
@@ -422,15 +443,13 @@ def published():
 @pytest.mark.slow
 def test_a_law_that_is_undefined_beyond_its_bounds_fits_with_a_remark():
     (remark,) = testing.check_law(unguarded(1.0))
-    assert "undefined beyond the bound" in remark
-    assert "-40, -1, 1, 40" in remark
+    assert "undefined beyond the bound" in remark and "-40, -1, 1, 40" in remark
     position, velocity = testing.check_law(published())
     assert "undefined beyond the bound" in position
     assert "undefined beyond the velocity bound" in velocity
 
 
 def claims_of(law):
-    """What `check_law` finds wrong with a law's own claim."""
     findings = Findings(law, "Controller")
     with jax.numpy_dtype_promotion("standard"), jax.enable_x64(True):
         base = ij.with_parts(ij.presets.zhang_yan_2024(), controller=law)
@@ -438,39 +457,29 @@ def claims_of(law):
     return findings.problems
 
 
-@pytest.mark.parametrize(
-    ("methods", "words"),
-    [
-        ({"decay": ij.controllers.RobotLaw.decay}, "it has lyapunov and no decay"),
+SHAPES = r"\(t, q, dq, f_tilde, context, state\) gives .*must be an array of shape \(\) or \(2,\)"
+
+
+def test_broken_claims_of_a_law():
+    for words, claims in (
+        ("it has lyapunov and no decay", {"decay": ij.controllers.RobotLaw.decay}),
+        (f"decay{SHAPES}", {"decay": lambda self, *args: jnp.zeros(3)}),
         (
-            {"decay": lambda self, *args: jnp.zeros(3)},
-            r"decay\(t, q, dq, f_tilde, context, state\) gives .*must be an array of shape \(\) or"
-            r" \(2,\)",
-        ),
-        (
-            {"disturbance_terms": lambda self, t, q, dq, f, df, *_: df.astype("float64")},
             r"disturbance_terms.* gives float64 for float32",
+            {"disturbance_terms": lambda self, t, q, dq, f, df, *_: df.astype("float64")},
         ),
-    ],
-)
-def test_broken_claims_of_a_law(methods, words):
-    with pytest.raises(ContractError, match=words):
-        claims_of(changed(Stating, **methods)(3.0))
+    ):
+        with pytest.raises(ContractError, match=words):
+            claims_of(changed(Stating, **claims)(3.0))
 
 
 @pytest.mark.slow
-def test_claims_of_a_law_are_nonnegative():
+def test_classes_of_users_fit_and_claims_of_a_law_are_nonnegative():
+    testing.check_law(PlainLaw(jnp.asarray(30.0)))
+    testing.check_process_noise(Gusts(0.3))
     assert claims_of(changed(Stating)(3.0)) == []
     growing = changed(Stating, decay=lambda self, t, q, dq, *args: 3.0 * (dq - 0.2) * dq)
     assert any("decay is -" in problem for problem in claims_of(growing(3.0)))
-
-
-# --- any number of joints -------------------------------------------------------------------------
-
-
-def encoder(k):
-    velocity = ij.sensors.FilteredDifference(cutoff=200 * k)
-    return ij.sensors.Encoder(counts=4096, velocity=velocity)
 
 
 def saturated(k):
@@ -479,7 +488,7 @@ def saturated(k):
 
 MEMBERS_OF_JOINTS = {
     "actuator": (6, lambda k: VoltageMotor(R=k)),
-    "sensor": (3, encoder),
+    "sensor": (3, lambda k: ij.sensors.Encoder(counts=4096, velocity=FILTERED(cutoff=200 * k))),
     "observer": (3, lambda k: ij.observers.Momentum(kf=20 * k)),
     "disturbance": (6, lambda k: ij.disturbances.Friction(viscous=0.1 * k)),
     "reference": (1, lambda k: ij.references.Sinusoid(offset=0.5 * k, amplitude=0.1)),
@@ -493,27 +502,63 @@ MEMBERS_OF_JOINTS = {
 QUICK_FAMILIES = ("sensor", "disturbance", "side")
 
 
-@pytest.mark.parametrize(
-    "family",
-    [
-        pytest.param(x, marks=[pytest.mark.slow] * (x not in QUICK_FAMILIES))
-        for x in MEMBERS_OF_JOINTS
-    ],
-)
+def families():
+    for family in MEMBERS_OF_JOINTS:
+        yield pytest.param(family, marks=[pytest.mark.slow] * (family not in QUICK_FAMILIES))
+
+
+@pytest.mark.parametrize("family", list(families()))
 def test_members_of_any_number_of_joints(family):
     n, member_of = MEMBERS_OF_JOINTS[family]
     getattr(testing, f"check_{family}")(member_of(np.linspace(1.0, 2.0, n)))
 
 
-def test_coordinates_of_the_tip_are_no_numbers_of_joints():
-    assert joints_of(ij.disturbances.TipForce(amplitude=[1.0, 2.0, 3.0])) == 2
-
-
 def test_a_number_of_joints_beside_a_robot_must_be_its_own(paper):
+    """Coordinates of the tip are no numbers of joints."""
+    assert joints_of(ij.disturbances.TipForce(amplitude=[1.0, 2.0, 3.0])) == 2
     for check, member, beside in (
         (testing.check_law, paper.controller, {"scenario": paper}),
         (testing.check_observer, paper.observer, {"model": paper.model}),
         (testing.check_disturbance, paper.disturbance, {"plant": paper.plant}),
     ):
-        with pytest.raises(ValueError, match=r"n: got 3, expected 2"):
-            check(member, n=3, **beside)
+        assert_refused(r"n: got 3, expected 2", check, member, n=3, **beside)
+
+
+@pytest.mark.slow
+def test_states_may_be_given_for_a_plant_that_is_defined_in_a_part_of_the_space():
+    tank = plant_of(drift=lambda t, x: jnp.stack([-jnp.sqrt(x[0]), -x[1]]))
+    with pytest.raises(ContractError, match="not finite"):
+        testing.check_plant(tank)
+    testing.check_plant(tank, x=[[[0.5], [0.1]], [[2.0], [-0.3]]])
+    assert_refused(r"x: got .* shape \(m, 2, 1\)", testing.check_plant, tank, x=[[0.5, 0.1]])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "case", [pytest.param("electric drive", marks=pytest.mark.release), "user functions"]
+)
+def test_laws_of_plants_pass_in_their_scenario(case):
+    scenario = loops_of_plants.CASES[case]()
+    assert testing.check_law(scenario.controller, scenario=scenario) == ()
+
+
+@ij.component
+class WrongShape:
+    """A law whose input has a row for every level, (r, n) in the place of (n,)."""
+
+    k: ij.Leaf = ij.leaf("1/s", default=1.0)
+    receives_x = True
+
+    def init(self, x, context):
+        return ()
+
+    def command(self, t, x, d_hat, context, state):
+        inside = jnp.zeros(x.shape[1:], bool)
+        return Command(-self.k * x, x[1], jnp.zeros_like(x[0]), inside, inside), ()
+
+
+def test_a_law_of_another_order_or_with_an_input_of_the_wrong_shape_says_so():
+    with pytest.raises(ContractError, match=r"3 levels.*expected 2 levels"):
+        testing.check_law(ij.controllers.BarrierBackstepping(k=(2.0, 20.0, 30.0)))
+    with pytest.raises(ContractError, match=r"Command\.tau"):
+        testing.check_law(WrongShape(), scenario=loops_of_plants.user_class())

@@ -1,8 +1,7 @@
-"""Arms in space: against MuJoCo's dynamics, against the planar closed form, and what they carry."""
-
-from __future__ import annotations
+"""Arms in space: MuJoCo's dynamics, the planar closed form, what they carry, names and checks."""
 
 import dataclasses
+import re
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from iblf_jax.robots import Arm, Payload, coriolis_from_mass_matrix
 from members import TWO_LINK
+from refused import assert_refused
 
 import iblf_jax as ij
 from iblf_jax.simulation import paths
@@ -24,45 +24,28 @@ mujoco = pytest.importorskip("mujoco")
 
 @jax.jit
 def dynamics(arm, q, v):
-    return jax.vmap(
-        lambda q, v: (arm.mass_matrix(q), arm.coriolis(q, v, v) + arm.gravity(q), arm.gravity(q))
-    )(q, v)
+    return arm.mass_matrix(q), arm.coriolis(q, v, v) + arm.gravity(q), arm.gravity(q)
 
 
 @jax.jit
 def everything(arm, q, v):
-    return (
-        (arm.mass_matrix(q), arm.coriolis(q, v, v) + arm.gravity(q)),
-        arm.pose(q),
-        arm.twist_jacobian(q),
-    )
+    return dynamics(arm, q, v)[:2], arm.pose(q), arm.twist_jacobian(q)
 
 
 def relative(a, b) -> float:
     return float(np.max(np.abs(np.asarray(a) - b)) / np.max(np.abs(b)))
 
 
-def real(name: str):
-    """A real arm as ours and as MuJoCo's, without friction."""
-    arm = ij.robots.load(ARMS / REAL[name])
-    n = arm.n
-    arm = dataclasses.replace(arm, damping=np.zeros(n), friction=np.zeros(n))
-    return arm, without_constraints(mujoco.MjModel.from_xml_path(str(ARMS / REAL[name])))
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", REAL)
 def test_real_arms_have_the_dynamics_that_mujoco_gives(name):
-    arm, model = real(name)
-    rng, states = np.random.default_rng(0), 200
+    arm, rng, states = ij.robots.load(ARMS / REAL[name]), np.random.default_rng(0), 200
+    model = without_constraints(mujoco.MjModel.from_xml_path(str(ARMS / REAL[name])))
     q, v = rng.uniform(-np.pi, np.pi, (states, arm.n)), rng.normal(size=(states, arm.n)) * 2
-    ours = [np.asarray(x) for x in dynamics(arm, q, v)]
-    for i in range(states):
-        M, bias = dynamics_of(model, q[i], v[i])
-        G = dynamics_of(model, q[i], 0 * v[i])[1]
-        assert relative(ours[0][i], M) < 1e-9
-        assert relative(ours[1][i], bias) < 1e-9
-        assert relative(ours[2][i], G) < 1e-9
+    found = jax.jit(jax.vmap(dynamics, (None, 0, 0)))(arm, q, v)
+    for i, ours in enumerate(zip(*found, strict=True)):
+        expected = *dynamics_of(model, q[i], v[i]), dynamics_of(model, q[i], 0 * v[i])[1]
+        assert max(map(relative, ours, expected)) < 1e-9
 
 
 @pytest.mark.slow
@@ -75,8 +58,7 @@ def test_random_chains_have_the_dynamics_that_mujoco_gives(n, seed):
     q, v = rng.normal(size=(2, n))
     M, bias = dynamics_of(model, q, v)
     ours, pose, twist = everything(arm, q, v)
-    assert relative(ours[0], M) < 1e-9
-    assert relative(ours[1], bias) < 1e-9
+    assert relative(ours[0], M) < 1e-9 and relative(ours[1], bias) < 1e-9
     data = mujoco.MjData(model)
     data.qpos[:] = q
     mujoco.mj_forward(model, data)
@@ -115,50 +97,34 @@ def test_momentum_and_inverse_dynamics_are_the_products_of_the_matrices(rng):
 
 def two_link_in_space(**fields) -> Arm:
     """The paper's arm as an Arm: both axes along y, gravity down."""
-    p = TWO_LINK
-    axis = [0.0, -1.0, 0.0]
-    inertia = np.zeros((2, 6))
-    inertia[:, 1] = p.inertia
-    along = np.array([1.0, 0.0, 0.0])
+    p, along, across = TWO_LINK, np.eye(3)[0], np.eye(6)[1]
     return Arm(
         mass=p.mass,
-        centre=np.asarray(p.centre)[:, None] * along,
-        inertia=inertia,
-        position=[[0.0, 0.0, 0.0], [float(p.length[0]), 0.0, 0.0]],
-        axis=axis,
+        centre=np.outer(p.centre, along),
+        inertia=np.outer(p.inertia, across),
+        position=np.outer([0.0, p.length[0]], along),
+        axis=[0.0, -1.0, 0.0],
         tip_position=float(p.length[1]) * along,
         **fields,
     )
 
 
-# ---------------------------------------------------------------------------- in the closed loop
-
-
-def scenario_with(plant, **parts) -> ij.Scenario:
-    return dataclasses.replace(
-        ij.presets.zhang_yan_2024(variant="corrected"),
-        plant=plant,
-        model=two_link_in_space(),
-        **parts,
-    )
-
-
-def accelerations(scenario, t: float) -> np.ndarray:
-    scenario = canonical(scenario)
-    start = initial_state(scenario)
-    state = start._replace(x=start.x.at[1].set(jnp.asarray([0.3, -0.4])))
-    return np.asarray(evaluate(scenario, jnp.asarray(t), state)[0].dq)
+def scenario_with(plant) -> ij.Scenario:
+    paper = ij.presets.zhang_yan_2024(variant="corrected")
+    return dataclasses.replace(paper, plant=plant, model=two_link_in_space())
 
 
 @pytest.mark.slow
 def test_friction_of_the_joints_acts_on_the_plant():
-    plain = accelerations(scenario_with(two_link_in_space()), 0.0)
-    damped = accelerations(scenario_with(two_link_in_space(damping=[0.5, 0.2], friction=0.1)), 0.0)
-    dq = np.array([0.3, -0.4])
+    dq, found = np.array([0.3, -0.4]), []
+    for friction in ({}, {"damping": [0.5, 0.2], "friction": 0.1}):
+        scenario = canonical(scenario_with(two_link_in_space(**friction)))
+        start = initial_state(scenario)
+        state = start._replace(x=start.x.at[1].set(dq))
+        found.append(np.asarray(evaluate(scenario, jnp.zeros(()), state)[0].dq))
     M = np.asarray(two_link_in_space().mass_matrix(jnp.asarray([0.8, 0.8])))
-    np.testing.assert_allclose(
-        M @ (damped - plain), -(np.array([0.5, 0.2]) * dq + 0.1 * np.tanh(dq / 0.05)), atol=1e-12
-    )
+    expected = -(np.array([0.5, 0.2]) * dq + 0.1 * np.tanh(dq / 0.05))
+    np.testing.assert_allclose(M @ (found[1] - found[0]), expected, atol=1e-12)
 
 
 def test_a_load_that_is_picked_up_has_its_share_of_all_moments():
@@ -179,17 +145,13 @@ def test_the_model_does_not_know_when():
     assert np.max(np.abs(after.disturbance - before.disturbance)) > 0.1, "what is picked up is in f"
 
 
-# ------------------------------------------------------------------------------ names and checks
-
-
 def test_rows_have_names():
     named = two_link_in_space(links=("upper arm", "fore/arm"), joints=("shoulder", "elbow"))
     scenario = scenario_with(named)
     assert float(paths.get(scenario, "plant.link[fore/arm].mass")) == float(scenario.plant.mass[1])
     values = {"plant.link[fore/arm].centre[2]": 0.3, "plant.joint[elbow].damping": 0.7}
     changed = ij.with_parameters(scenario, values)
-    assert float(changed.plant.centre[1, 2]) == 0.3
-    assert float(changed.plant.damping[1]) == 0.7
+    assert float(changed.plant.centre[1, 2]) == 0.3 and float(changed.plant.damping[1]) == 0.7
     both = dataclasses.replace(scenario, model=scenario.plant)
     both = ij.with_parameters(both, {"robot.link[0].mass": 3.0})
     assert float(both.plant.mass[0]) == float(both.model.mass[0]) == 3.0
@@ -202,27 +164,15 @@ def test_rows_have_names():
     assert paths.sign_at(scenario, "plant.joint[elbow].effort") == "positive"
 
 
-@pytest.mark.parametrize(
-    ("path", "words"),
-    [
-        ("plant.link[forearms].mass", "expected the path of a leaf"),
-        ("plant.link[9].mass", "expected the path of a leaf"),
-        ("plant.link[link1].damping", "expected the path of a leaf"),
-        ("plant.link", "expected the path of a leaf"),
-        ("plant[link1].mass", "expected the path of a leaf"),
-        ("plant.link[link7].mass", r"plant\.link\[link1\]\.mass"),
-    ],
-)
-def test_unknown_rows_are_refused_and_a_name_is_suggested(path, words):
-    with pytest.raises(ValueError, match=words):
-        paths.get(scenario_with(two_link_in_space()), path)
-
-
-def test_two_names_for_one_number_overlap():
-    some = ij.factor(ij.uniform(0.7, 1.3))
+def test_unknown_rows_and_two_names_for_one_number_are_refused():
+    scenario, some = scenario_with(two_link_in_space()), ij.factor(ij.uniform(0.7, 1.3))
+    unknown = ("link[forearms].mass", "link[9].mass", "link[link1].damping", "link")
+    for path in (*(f"plant.{row}" for row in unknown), "plant[link1].mass"):
+        with pytest.raises(ValueError, match=rf"{re.escape(path)}.*expected the path of a leaf"):
+            paths.get(scenario, path)
+    assert_refused(r"plant\.link\[link1\]\.mass", paths.get, scenario, "plant.link[link7].mass")
     draws = {"plant.link[link2].mass": some, "plant.mass[1]": some}
-    with pytest.raises(ValueError, match="do not overlap"):
-        ij.monte_carlo(scenario_with(two_link_in_space()), draws, runs=2, duration=0.1, dt=1e-3)
+    assert_refused("do not overlap", ij.monte_carlo, scenario, draws, runs=2, duration=0.1, dt=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -240,7 +190,4 @@ def test_two_names_for_one_number_overlap():
     ],
 )
 def test_fields_that_do_not_fit_are_refused(fields, message):
-    arm = two_link_in_space()
-    kept = {f.name: getattr(arm, f.name) for f in dataclasses.fields(arm)}
-    with pytest.raises(ValueError, match=message):
-        Arm(**{**kept, **fields})
+    assert_refused(message, dataclasses.replace, two_link_in_space(), **fields)

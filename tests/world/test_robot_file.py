@@ -1,20 +1,18 @@
 """Scenario, study and tuning files that name a robot's own file; what is saved needs it no more."""
 
-from __future__ import annotations
-
 import shutil
+import sys
 
 import jax
 import numpy as np
 import pytest
 from conftest import ROOT
 from iblf_jax.controllers import Saturated
+from refused import assert_refused
 
 import iblf_jax as ij
-from iblf_jax.files import scenario as scenario_file
 
 pytest.importorskip("mujoco")
-
 REFERENCE = """
 [reference]
 kind = "sinusoid"
@@ -36,15 +34,14 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
-def written(folder, text):
-    path = folder / "scenario.toml"
-    path.write_text(text)
-    return path
+def loaded(folder, text):
+    (folder / "scenario.toml").write_text(text + REFERENCE)
+    return ij.load_scenario(folder / "scenario.toml")
 
 
 @pytest.mark.slow
 def test_what_the_file_leaves_out_follows_from_the_arm(folder):
-    scenario = ij.load_scenario(written(folder, ROBOT + REFERENCE))
+    scenario = loaded(folder, ROBOT)
     arm = ij.robots.load(folder / "ur5.urdf", tip="tool0")
     np.testing.assert_array_equal(scenario.bounds[0].lower.value, arm.lower)
     assert isinstance(scenario.controller, Saturated)
@@ -55,7 +52,7 @@ def test_what_the_file_leaves_out_follows_from_the_arm(folder):
     for side, distance in (("lower", -0.35), ("upper", 0.35)):
         value = (np.array([0.0, -1.2, 1.6, -1.4, -1.57, 0.0]) + distance).tolist()
         near += f"[bounds.{side}]\nkind = 'constant'\nvalue = {value}\n"
-    bounded = ij.load_scenario(written(folder, ROBOT + REFERENCE + near))
+    bounded = loaded(folder, ROBOT + near)
     expected = ij.presets.arm_scenario(arm, bounded.reference, bounds=bounded.bounds[0])
     weight = bounded.controller.law.weight
     np.testing.assert_array_equal(weight, expected.controller.law.weight)
@@ -63,44 +60,41 @@ def test_what_the_file_leaves_out_follows_from_the_arm(folder):
 
 
 def test_what_it_says_counts(folder):
-    text = ROBOT + REFERENCE + '[controller]\nkind = "computed_torque"\nKp = 30.0\nKd = 11.0\n'
+    text = ROBOT + '[controller]\nkind = "computed_torque"\nKp = 30.0\nKd = 11.0\n'
     text += "[initial]\nq = [0.1, -1, 1.4, -1.2, -1.5, 0.2]\n"
     text += '[parameters]\n"plant.payload" = 2.0\n"plant.link[forearm_link].mass" = 3.0\n'
-    scenario = ij.load_scenario(written(folder, text))
-    assert scenario.controller.law.Kp[3] == 30.0
-    assert scenario.initial.q[0] == 0.1
+    scenario = loaded(folder, text)
+    assert scenario.controller.law.Kp[3] == 30.0 and scenario.initial.q[0] == 0.1
     assert (float(scenario.plant.payload), float(scenario.model.payload)) == (2.0, 0.0)
     assert (float(scenario.plant.mass[2]), float(scenario.model.mass[2])) == (3.0, 2.275)
 
 
 def test_joints_have_one_name_in_paths_and_messages(folder):
-    text = ROBOT + REFERENCE + '[parameters]\n"controller.K2[elbow_joint]" = 9.0\n'
-    scenario = ij.load_scenario(written(folder, text))
+    scenario = loaded(folder, ROBOT + '[parameters]\n"controller.K2[elbow_joint]" = 9.0\n')
     assert scenario.controller.law.K2[2] == 9.0
-    outside = ij.with_parameters(scenario, {'initial.q["elbow_joint"]': 4.0})
-    with pytest.raises(ValueError, match=r"^initial\.q\[elbow_joint\]: got 4"):
-        ij.simulate(outside, duration=0.01)
-    high = ij.with_parameters(scenario, {"bounds.lower.value[elbow_joint]": 5.0})
-    with pytest.raises(ValueError, match=r"^bounds of joint elbow_joint: got"):
-        ij.simulate(high, duration=0.01)
+    for path, value, words in (
+        ('initial.q["elbow_joint"]', 4.0, r"^initial\.q\[elbow_joint\]: got 4"),
+        ("bounds.lower.value[elbow_joint]", 5.0, r"^bounds of joint elbow_joint: got"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            ij.simulate(ij.with_parameters(scenario, {path: value}), duration=0.01)
     assert scenario.loop.plant.notation.left_bounds(1, 2) == "Joint elbow_joint left its bounds"
 
 
 @pytest.mark.slow
 def test_plant_and_model_from_two_files_and_a_locked_joint(folder):
-    (folder / "believed.urdf").write_text(
-        (folder / "ur5.urdf").read_text().replace('<mass value="2.275" />', '<mass value="2.0" />')
-    )
-    both = '[plant]\nfile = "ur5.urdf"\ntip = "tool0"\nlocked = { wrist_3_joint = 0.3 }\n'
-    both += '[model]\nfile = "believed.urdf"\ntip = "tool0"\nlocked = { wrist_3_joint = 0.3 }\n'
-    reference = REFERENCE.replace(", 0.0]", "]")
-    scenario = ij.load_scenario(written(folder, both + reference))
+    believed = (folder / "ur5.urdf").read_text().replace("2.275", "2.0")
+    (folder / "believed.urdf").write_text(believed)
+    locked = 'tip = "tool0"\nlocked = { wrist_3_joint = 0.3 }\n'
+    text = f'[plant]\nfile = "ur5.urdf"\n{locked}[model]\nfile = "believed.urdf"\n{locked}'
+    (folder / "both.toml").write_text(text + REFERENCE.replace(", 0.0]", "]"))
+    scenario = ij.load_scenario(folder / "both.toml")
     assert scenario.n == 5
     assert (float(scenario.plant.mass[2]), float(scenario.model.mass[2])) == (2.275, 2.0)
 
 
 def test_saved_it_needs_no_other_file(folder):
-    scenario = ij.load_scenario(written(folder, ROBOT + REFERENCE))
+    scenario = loaded(folder, ROBOT)
     (folder / "ur5.urdf").unlink()
     ij.save_scenario(scenario, folder / "saved.toml")
     again = ij.load_scenario(folder / "saved.toml")
@@ -127,35 +121,30 @@ def test_saved_it_needs_no_other_file(folder):
 )
 def test_what_is_wrong_is_said(folder, text, message):
     with pytest.raises(ValueError, match=message) as error:
-        ij.load_scenario(written(folder, text + REFERENCE))
+        loaded(folder, text)
     assert "scenario.toml" in str(error.value)
 
 
 def test_without_the_extra_it_says_so(folder, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "mujoco", None)
-    with pytest.raises(ValueError, match=r"robot\.file: .*\.\[robots\]"):
-        scenario_file.load_scenario(written(folder, ROBOT + REFERENCE))
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    assert_refused(r"robot\.file: .*\.\[robots\]", loaded, folder, ROBOT)
 
 
 def test_the_plant_may_have_other_rotors_than_the_model(folder):
     tables = '[plant]\nfile = "ur5.urdf"\narmature = 0.01\n[model]\nfile = "ur5.urdf"\n'
-    scenario = ij.load_scenario(written(folder, tables + REFERENCE))
-    plain = ij.load_scenario(written(folder, ROBOT + REFERENCE))
-    np.testing.assert_array_equal(np.asarray(scenario.plant.armature), 0.01)
+    scenario, plain = loaded(folder, tables), loaded(folder, ROBOT)
+    np.testing.assert_array_equal(scenario.plant.armature, 0.01)
     np.testing.assert_array_equal(scenario.model.armature, plain.plant.armature)
-    K2 = [one.controller.law.K2 for one in (scenario, plain)]
-    np.testing.assert_array_equal(*K2)
+    np.testing.assert_array_equal(scenario.controller.law.K2, plain.controller.law.K2)
 
 
 @pytest.mark.slow
 def test_repair(folder):
     text = (folder / "ur5.urdf").read_text()
     (folder / "ur5.urdf").write_text(text.replace('ixx="0.049443313556"', 'ixx="9"'))
-    with pytest.raises(ValueError, match="repair=True"):
-        ij.load_scenario(written(folder, ROBOT + REFERENCE))
+    assert_refused("repair=True", loaded, folder, ROBOT)
     with pytest.warns(UserWarning, match="repaired: link 'forearm_link': inertia"):
-        scenario = ij.load_scenario(written(folder, ROBOT + "repair = true\n" + REFERENCE))
+        scenario = loaded(folder, ROBOT + "repair = true\n")
     assert len(scenario.plant.repaired) == 1
     ij.save_scenario(scenario, folder / "saved.toml")
-    again = ij.load_scenario(folder / "saved.toml")
-    assert again.plant.repaired == scenario.plant.repaired
+    assert ij.load_scenario(folder / "saved.toml").plant.repaired == scenario.plant.repaired

@@ -1,7 +1,4 @@
-"""Robots against independent sources: the closed form, kinetic energy from positions, the
-identities of C."""
-
-from __future__ import annotations
+"""Planar robots against the closed form, energies from positions, and products of matrices."""
 
 import jax
 import jax.numpy as jnp
@@ -10,45 +7,34 @@ import pytest
 from iblf_jax.robots import PlanarChain, TwoLink, energy_gradient, inverse_dynamics, momentum
 
 import iblf_jax as ij
+from iblf_jax.core.linalg import solve_spd
 
 
 def random_links(n, rng):
     mass, length = rng.uniform(0.5, 2, n), rng.uniform(0.2, 0.5, n)
-    inertia = mass * length**2 / 12
-    return {
-        "mass": mass,
-        "length": length,
-        "centre": length * rng.uniform(0.3, 0.7, n),
-        "inertia": inertia,
-        "payload": rng.uniform(0, 1),
-    }
+    numbers = {"mass": mass, "length": length, "centre": length * rng.uniform(0.3, 0.7, n)}
+    return numbers | {"inertia": mass * length**2 / 12, "payload": rng.uniform(0, 1)}
 
 
 @jax.jit
 def everything(robot, q, v, u):
-    return (
-        robot.mass_matrix(q),
-        robot.coriolis(q, v, u),
-        robot.gravity(q),
-        robot.potential(q),
-        robot.tip(q),
-        robot.jacobian(q),
-        robot.skeleton(q),
-    )
+    parts = robot.mass_matrix, robot.gravity, robot.potential, robot.tip, robot.jacobian
+    return robot.coriolis(q, v, u), robot.skeleton(q), *(part(q) for part in parts)
 
 
-def test_chain_of_two_is_the_closed_form(rng):
+def test_chain_of_two_is_the_closed_form_with_its_lumped_parameters(rng):
     for _ in range(5):
         links = random_links(2, rng)
         q, v, u = rng.uniform(-3, 3, (3, 2))
         pair = (everything(kind(**links), q, v, u) for kind in (PlanarChain, TwoLink))
         for a, b in zip(*pair, strict=True):
             np.testing.assert_allclose(a, b, rtol=0, atol=1e-12)
+    p = ij.presets.customary_two_link().lumped()
+    np.testing.assert_allclose(p, [0.226625, 0.0408425, 0.0461125, 0.6475, 0.13175], rtol=1e-12)
 
 
 def test_kinetic_and_potential_energy_from_positions(rng):
-    """1/2 q'^T M q' = sum 1/2 m |velocity of the centre|^2 + 1/2 I omega^2, from where the centres
-    are."""
+    """q'^T M q' = sum m |velocity of the centre|^2 + I omega^2, from where the centres are."""
     links = random_links(4, rng)
     robot = PlanarChain(**links)
     q, v = rng.uniform(-3, 3, (2, 4))
@@ -75,13 +61,14 @@ def test_sums_along_a_chain_are_the_products_of_its_matrices(n, rng):
     q, v, u, a = rng.uniform(-3, 3, (4, n))
     arms = np.tril(np.ones((n + 1, n)), -1) * links["length"]
     arms += np.eye(n + 1, n) * links["centre"]
-    A = arms.T @ (np.append(links["mass"], links["payload"])[:, None] * arms)
+    masses = np.append(links["mass"], links["payload"])
+    A = arms.T @ (masses[:, None] * arms)
     S, phi = np.tril(np.ones((n, n))), np.cumsum(q)
     between = phi[:, None] - phi
     M = S.T @ (A * np.cos(between) + np.diag(links["inertia"])) @ S
     Cu = S.T @ (A * np.sin(between)) @ (np.cumsum(v) * np.cumsum(u))
     Cv = S.T @ (A * np.sin(between)) @ np.cumsum(v) ** 2
-    G = 9.81 * S.T @ (arms.T @ np.append(links["mass"], links["payload"]) * np.cos(phi))
+    G = 9.81 * S.T @ (arms.T @ masses * np.cos(phi))
     slope = -S.T @ (np.cumsum(v) * ((A * np.sin(between)) @ np.cumsum(v)))
     scale = np.max(np.abs(M)) * 9 * n
     for found, expected in (
@@ -96,15 +83,8 @@ def test_sums_along_a_chain_are_the_products_of_its_matrices(n, rng):
         np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-14 * scale)
 
 
-def test_lumped_parameters_of_the_customary_arm():
-    p = ij.presets.customary_two_link().lumped()
-    np.testing.assert_allclose(p, [0.226625, 0.0408425, 0.0461125, 0.6475, 0.13175], rtol=1e-12)
-
-
 @pytest.mark.parametrize("n", [2, 7])
 def test_small_algebra_against_numpy(n, rng):
-    from iblf_jax.core.linalg import solve_spd
-
     A = rng.normal(size=(n, n))
     A = A @ A.T + 0.1 * np.eye(n)
     b = rng.normal(size=n)

@@ -1,16 +1,15 @@
-"""Plants whose parameters switch: an independent program, order of convergence, the distribution of
-a Markov chain's path, and what a run reports."""
-
-from __future__ import annotations
+"""Plants whose parameters switch: an independent program, the order, and Markov chains."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from loops_of_plants import band
+from refused import refused
 from scipy.integrate import solve_ivp
 
 import iblf_jax as ij
-from iblf_jax import bounds, controllers, plants, references
+from iblf_jax import controllers, plants, references
 from iblf_jax.engine.diagnosis import report
 from iblf_jax.simulation.closed_loop import initial_state, rate
 from iblf_jax.simulation.noise import noise_key, realised
@@ -22,13 +21,9 @@ Q = np.array([[-3.0, 2.0, 1.0], [1.0, -1.5, 0.5], [0.0, 4.0, -4.0]])
 
 
 def scenario_of(plant):
-    return ij.Scenario(
-        plant=plant,
-        reference=references.Sinusoid(offset=0.1, amplitude=0.3, frequency=2.0),
-        bounds=bounds.Bounds(lower=bounds.Constant(-2.0), upper=bounds.Constant(2.0)),
-        controller=controllers.PDGravity(Kp=9.0, Kd=2.0),
-        initial=ij.Initial(q=[0.2], dq=[0.5]),
-    )
+    parts = {"bounds": band(-2.0, 2.0), "initial": ij.Initial(q=[0.2], dq=[0.5])}
+    parts["reference"] = references.Sinusoid(offset=0.1, amplitude=0.3, frequency=2.0)
+    return ij.Scenario(plant=plant, controller=controllers.PDGravity(Kp=9.0, Kd=2.0), **parts)
 
 
 SWITCHED = plants.Switched(LINK, {"mass[0]": MASSES}, TIMES)
@@ -54,33 +49,27 @@ def independent_end(duration):
 
 def test_vector_field_against_an_independent_program():
     scenario = canonical(scenario_of(SWITCHED))
-    field = jax.jit(
-        lambda t, q, dq: rate(scenario, t, initial_state(scenario)._replace(x=jnp.stack([q, dq])))
-    )
+    field = jax.jit(lambda t, x: rate(scenario, t, initial_state(scenario)._replace(x=x)).x)
     rng = np.random.default_rng(3)
     for _ in range(30):
-        t, q, v = rng.uniform((0.0, -1.0, -2.0), (1.2, 1.0, 2.0))
+        t, *x = rng.uniform((0.0, -1.0, -2.0), (1.2, 1.0, 2.0))
         mass = MASSES[int(np.searchsorted(TIMES, t, side="right"))]
-        found = field(jnp.asarray(t), jnp.asarray([q]), jnp.asarray([v]))
-        np.testing.assert_allclose(
-            [found.q[0], found.dq[0]], independent_rate(t, (q, v), mass), atol=1e-11, rtol=1e-12
-        )
+        found = field(jnp.asarray(t), jnp.asarray(x)[:, None])[:, 0]
+        expected = independent_rate(t, x, mass)
+        np.testing.assert_allclose(found, expected, atol=1e-11, rtol=1e-12)
 
 
 @pytest.mark.slow
 def test_trajectory_and_order_with_switches_between_the_instants():
-    exact = independent_end(1.0)
-    errors = []
-    for dt in (1.0 / 40, 1.0 / 80):
-        run = ij.simulate(scenario_of(SWITCHED), duration=1.0, dt=dt, backend="vmap")
-        errors.append(np.max(np.abs(np.array([run.q[-1, 0], run.dq[-1, 0]]) - exact)))
-    assert errors[1] < 1e-5
+    exact, errors = independent_end(1.0), []
+    for steps in (40, 80, 320):
+        run = ij.simulate(scenario_of(SWITCHED), duration=1.0, dt=1.0 / steps, backend="vmap")
+        errors.append(np.max(np.abs(run.x[-1, :, 0] - exact)))
+    assert errors[1] < 1e-5 and errors[2] < 1e-7
     assert np.log2(errors[0] / errors[1]) > 3.5
-    fine = ij.simulate(scenario_of(SWITCHED), duration=1.0, dt=1.0 / 320, backend="vmap")
-    np.testing.assert_allclose([fine.q[-1, 0], fine.dq[-1, 0]], exact, atol=1e-7)
-    assert float(fine.metrics["switches"]) == 2
-    assert float(fine.metrics["shortest_dwell_time"]) == pytest.approx(0.313)
-    assert float(fine.metrics["mean_dwell_time"]) == pytest.approx(0.7021 / 2)
+    assert float(run.metrics["switches"]) == 2
+    assert float(run.metrics["shortest_dwell_time"]) == pytest.approx(0.313)
+    assert float(run.metrics["mean_dwell_time"]) == pytest.approx(0.7021 / 2)
 
 
 def test_members_of_the_inner_plant_are_passed_through():
@@ -89,9 +78,8 @@ def test_members_of_the_inner_plant_are_passed_through():
     )
     outer = plants.Switched(drive, {"resistance": (5.0, 6.0), "robot.mass[0]": (0.8, 1.0)}, [0.4])
     assert (outer.n, outer.order) == (1, 3)
-    assert plants.units_of(outer) == plants.units_of(drive)
-    assert plants.level_names(outer) == plants.level_names(drive)
-    assert plants.input_name(outer) == plants.input_name(drive)
+    for member in (plants.units_of, plants.level_names, plants.input_name):
+        assert member(outer) == member(drive)
     assert float(outer.at(jnp.asarray(0.5)).robot.mass[0]) == 1.0
     assert float(outer.robot.mass[0]) == 0.8
     scenario = scenario_of(SWITCHED)
@@ -99,8 +87,6 @@ def test_members_of_the_inner_plant_are_passed_through():
     both = ij.with_parameters(scenario, {"robot.mass[0]": 0.9})
     assert float(both.model.mass[0]) == 0.9 == float(both.plant.mass[0])
 
-
-# --- a Markov chain -------------------------------------------------------------------------------
 
 PAIR = {"mass[0]": (1.0, 2.0)}
 
@@ -110,7 +96,6 @@ def markov(**fields):
 
 
 def paths_of(scenario, seed, count):
-    """The plants of many runs, each with a path of its own."""
     keys = jax.vmap(lambda i: noise_key(jax.random.PRNGKey(seed), i))(jnp.arange(count))
     return jax.jit(jax.vmap(lambda key: realised(scenario, key).plant))(keys.astype(float))
 
@@ -145,37 +130,31 @@ def test_a_rate_that_is_varied_alone_changes_the_dwell_time():
 def test_every_run_of_a_study_has_a_path_of_its_own():
     scenario = scenario_of(markov(switches=2))
 
-    def make(runs, chunk):
-        how = {"duration": 0.5, "dt": 1e-2, "metrics": (ij.metrics.Tracking(),), "progress": False}
-        executor = ij.studies.LocalExecutor(chunk=chunk)
-        return ij.monte_carlo(scenario, {}, runs=runs, executor=executor, **how)
-
-    every, some = make(600, None), make(300, 256)
+    how = {"duration": 0.5, "dt": 1e-2, "metrics": (ij.metrics.Tracking(),), "progress": False}
+    every, some = (
+        ij.monte_carlo(
+            scenario, {}, runs=runs, executor=ij.studies.LocalExecutor(chunk=chunk), **how
+        )
+        for runs, chunk in ((600, None), (300, 256))
+    )
     for name in ("ise", "switches", "shortest_dwell_time"):
         np.testing.assert_array_equal(some.metrics[name], every.metrics[name][:300])
     lost = (np.asarray(every.status) & int(ij.Status.MODES_EXHAUSTED)) != 0
-    times = [np.asarray(every.replay(i).scenario.plant.times) for i in (0, 1)]
-    assert not np.array_equal(*times)
+    assert not np.array_equal(*(every.replay(i).scenario.plant.times for i in (0, 1)))
     assert 0 < lost.sum() < 300
     with pytest.warns(ij.SimulationWarning, match=r"Increase plant\.switches"):
         report(every.replay(int(np.flatnonzero(lost)[0])), 50, throw=False)
     assert np.all(every.metrics["switches"][lost] == 2)
 
 
-@pytest.mark.parametrize(
-    ("make", "words"),
-    [
-        (lambda: plants.Switched(LINK, {"mass[0]": (1.0, 2.0)}, [0.5, 0.6]), "3 values"),
-        (lambda: plants.Switched(LINK, {"weight": (1.0, 2.0)}, [0.5]), "path of a parameter"),
-        (lambda: plants.Switched(LINK, {"mass[0]": (1.0, -2.0)}, [0.5]), "positive values"),
-        (lambda: plants.MarkovSwitched(LINK, {"mass[0]": (1.0, 0.0)}, Q[:2, :2]), "positive"),
-        (lambda: plants.Switched(LINK, {"mass[0]": (1.0, 2.0, 3.0)}, [0.6, 0.5]), "increasing"),
-        (lambda: plants.Switched(3.0, {"mass[0]": (1.0, 2.0)}, [0.5]), "Robot"),
-        (lambda: plants.Switched(LINK, {}, [0.5]), "parameters"),
-        (lambda: plants.MarkovSwitched(LINK, PAIR, [[-1.0, 2.0], [0, 0]]), "sum"),
-        (lambda: scenario_of(plants.Switched(markov(), PAIR, [0.5])), "as the plant itself"),
-    ],
+test_modes_that_do_not_fit_are_refused = refused(
+    (lambda: plants.Switched(LINK, {"mass[0]": (1.0, 2.0)}, [0.5, 0.6]), "3 values"),
+    (lambda: plants.Switched(LINK, {"weight": (1.0, 2.0)}, [0.5]), "path of a parameter"),
+    (lambda: plants.Switched(LINK, {"mass[0]": (1.0, -2.0)}, [0.5]), "positive values"),
+    (lambda: plants.MarkovSwitched(LINK, {"mass[0]": (1.0, 0.0)}, Q[:2, :2]), "positive"),
+    (lambda: plants.Switched(LINK, {"mass[0]": (1.0, 2.0, 3.0)}, [0.6, 0.5]), "increasing"),
+    (lambda: plants.Switched(3.0, {"mass[0]": (1.0, 2.0)}, [0.5]), "Robot"),
+    (lambda: plants.Switched(LINK, {}, [0.5]), "parameters"),
+    (lambda: plants.MarkovSwitched(LINK, PAIR, [[-1.0, 2.0], [0, 0]]), "sum"),
+    (lambda: scenario_of(plants.Switched(markov(), PAIR, [0.5])), "as the plant itself"),
 )
-def test_modes_that_do_not_fit_are_refused(make, words):
-    with pytest.raises(ValueError, match=words):
-        make()

@@ -1,7 +1,5 @@
 """References, bounds and disturbances against closed forms, SciPy and finite differences."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import jax
@@ -31,21 +29,16 @@ TIMES = (0.5, 1.0, 2.2, 3.0, 4.5)
 POINTS = np.asarray([[0.0, 0.1], [0.4, 0.3], [0.2, 0.8], [0.6, 0.4], [0.5, 0.5]])
 
 
-def test_spline_passes_its_waypoints_and_rests_at_the_ends():
+def test_spline_is_the_quintic_of_scipy_and_rests_outside():
     spline = references.WaypointSpline(TIMES, POINTS)
-    at = derivatives(spline.position, 2)
-    for t, point in zip(TIMES, POINTS, strict=True):
-        np.testing.assert_allclose(at(t)[0], point, atol=1e-12)
+    at, places = derivatives(spline.position, 2), [spline.position(t) for t in (0.0, *TIMES, 20.0)]
+    np.testing.assert_allclose(places, POINTS[[0, 0, 1, 2, 3, 4, 4]], atol=1e-12)
     for t, point in ((0.0, POINTS[0]), (0.5, POINTS[0]), (4.5, POINTS[-1]), (20.0, POINTS[-1])):
-        q, v, a = at(t)
-        np.testing.assert_allclose(q, point, atol=1e-12)
-        np.testing.assert_allclose([v, a], 0, atol=1e-9)
+        np.testing.assert_allclose(at(t), [point, [0, 0], [0, 0]], atol=1e-9)
     rest = [(1, np.zeros(2)), (2, np.zeros(2))]
     expected = make_interp_spline(TIMES, POINTS, k=5, bc_type=(rest, rest))
-    for t in np.linspace(0.5, 4.5, 23)[1:-1]:
-        got = at(t)
-        for order in range(3):
-            np.testing.assert_allclose(got[order], expected(t, order), atol=1e-9)
+    for t in [*TIMES[1:-1], *np.linspace(0.5, 4.5, 23)[1:-1]]:
+        np.testing.assert_allclose(at(t), [expected(t, i) for i in range(3)], atol=1e-9)
 
 
 @pytest.mark.slow
@@ -62,13 +55,13 @@ def test_spline_with_more_derivatives_rests_at_its_ends(m):
         np.testing.assert_allclose(rates, 0, atol=1e-7)
         assert np.max(np.abs(next_one)) > 0.5
     for t in TIMES[1:-1]:
-        before, after = at(t - 1e-9), at(t + 1e-9)
-        for order in range(m + 2):
-            np.testing.assert_allclose(before[order], after[order], atol=1e-5 * 10**order)
+        for order, (before, after) in enumerate(zip(at(t - 1e-9), at(t + 1e-9), strict=True)):
+            np.testing.assert_allclose(before, after, atol=1e-5 * 10**order)
 
 
 @pytest.mark.parametrize("m", [1, 2, 4])
 def test_smooth_step_has_the_derivatives_that_it_states(m):
+    """With two of them it is the quintic."""
     start, end, duration = np.asarray([0.1, 0.5]), np.asarray([0.9, -0.2]), 2.5
     step = references.SmoothStep(start, end, duration, derivatives=m)
     assert step.continuous_derivatives == m
@@ -78,16 +71,11 @@ def test_smooth_step_has_the_derivatives_that_it_states(m):
         np.testing.assert_allclose(q, expected, atol=1e-14)
         np.testing.assert_allclose(rates, 0, atol=1e-8)
         assert np.max(np.abs(next_one)) > 0.1
-    q, *_ = at(0.5 * duration)
-    np.testing.assert_allclose(q, (start + end) / 2, atol=1e-14)
+    np.testing.assert_allclose(at(0.5 * duration)[0], (start + end) / 2, atol=1e-14)
     np.testing.assert_allclose(at(9.0)[0], end)
-
-
-def test_smooth_step_of_two_derivatives_is_the_quintic():
-    numbers = ([0.1, 0.5], [0.9, -0.2], 2.5)
-    one, other = references.Quintic(*numbers), references.SmoothStep(*numbers, derivatives=2)
-    for t in np.linspace(-0.5, 3.0, 15):
-        np.testing.assert_allclose(one.position(t), other.position(t), atol=1e-14)
+    quintic = references.Quintic(start, end, duration)
+    for t in np.linspace(-0.5, 3.0, 15) if m == 2 else ():
+        np.testing.assert_allclose(quintic.position(t), step.position(t), atol=1e-14)
 
 
 @pytest.mark.parametrize("m", [0, 13, 2.5])
@@ -136,30 +124,23 @@ def test_tube_rates_against_finite_differences(sides):
         np.testing.assert_allclose(tube.xi(tube.q_d), 0.0)
 
 
-@pytest.mark.parametrize(
-    "reference",
-    [
-        references.Quintic([0.1, 0.5], [0.9, -0.2], 2.5),
-        references.WaypointSpline((0.0, 1.0, 2.2), [[0.0, 0.1], [0.4, 0.3], [0.2, 0.8]]),
-    ],
-    ids=["quintic", "spline"],
-)
-def test_the_tube_has_the_acceleration_of_its_reference(reference):
+def test_the_tube_has_the_acceleration_of_its_reference():
     sides = bounds.Bounds(lower=bounds.Funnel(-0.5, -0.1, 1.5), upper=bounds.Constant(3.0))
-    at, tube = derivatives(reference.position, 2), jax.jit(lambda t: tube_at(reference, sides, t))
-    for t in (0.3, 1.7, 2.4):
-        np.testing.assert_allclose(tube(t).ddq_d, at(t)[2], rtol=1e-12, atol=1e-12)
+    quintic = references.Quintic([0.1, 0.5], [0.9, -0.2], 2.5)
+    for reference in (quintic, references.WaypointSpline(TIMES, POINTS)):
+        acceleration = derivatives(reference.position, 2)
+        tube = jax.jit(lambda t, reference=reference: tube_at(reference, sides, t))
+        for t in (0.3, 1.7, 2.4):
+            expected = acceleration(t)[2]
+            np.testing.assert_allclose(tube(t).ddq_d, expected, rtol=1e-12, atol=1e-12)
 
 
 def test_a_reference_needs_two_derivatives_and_no_third():
-    """One from outside of JAX, say: it gives position, velocity and acceleration, and there it
-    ends."""
+    """One from outside of JAX, say: it gives position, velocity and acceleration."""
 
-    def outside(function):
-        shape = jax.ShapeDtypeStruct((2,), float)
-        return lambda t: jax.pure_callback(
-            lambda t: np.asarray(function(float(t))), shape, t, vmap_method="sequential"
-        )
+    def outside(f):
+        shape, how = jax.ShapeDtypeStruct((2,), float), {"vmap_method": "sequential"}
+        return lambda t: jax.pure_callback(lambda t: np.asarray(f(float(t))), shape, t, **how)
 
     acceleration = outside(lambda t: [-0.1 * np.sin(t), -0.1 * np.cos(t)])
     velocity = jax.custom_jvp(outside(lambda t: [0.1 * np.cos(t), -0.1 * np.sin(t)]))
@@ -199,6 +180,10 @@ def test_disturbances_by_hand(rng):
     expected = torque(friction, 4.0, q, dq) + np.asarray([1.0, -2.0])
     np.testing.assert_allclose(torque(both, 4.0, q, dq), expected)
     np.testing.assert_array_equal(both.jump_times(), [3.0, 5.0])
+    # That of the paper, (4.3), has the matrices of the model.
+    f, heavy = ij.presets.zhang_yan_2024().disturbance, dataclasses.replace(TWO_LINK, mass=5.0)
+    np.testing.assert_allclose(torque(f, 1.7, q, dq), Loop().disturbance(1.7, q, dq), rtol=1e-12)
+    np.testing.assert_array_equal(torque(f, 1.7, q, dq, heavy), torque(f, 1.7, q, dq))
 
 
 def test_tip_force_does_the_work_that_it_should(rng):
@@ -209,11 +194,3 @@ def test_tip_force_does_the_work_that_it_should(rng):
     ahead, behind = (np.asarray(TWO_LINK.tip(q + h * dq)) for h in (1e-6, -1e-6))
     moved = (ahead - behind) / 2e-6
     assert torque(push, t, q, dq) @ dq == pytest.approx(force @ moved, rel=1e-8)
-
-
-def test_the_papers_disturbance_has_the_matrices_of_the_model(rng):
-    """(4.3) itself is in `independent.Loop`."""
-    f, heavy = ij.presets.zhang_yan_2024().disturbance, dataclasses.replace(TWO_LINK, mass=5.0)
-    q, dq = rng.uniform(-1, 1, 2), rng.normal(size=2)
-    np.testing.assert_allclose(torque(f, 1.7, q, dq), Loop().disturbance(1.7, q, dq), rtol=1e-12)
-    np.testing.assert_array_equal(torque(f, 1.7, q, dq, heavy), torque(f, 1.7, q, dq))
