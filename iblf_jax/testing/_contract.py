@@ -7,10 +7,11 @@ float32, and records the problems.
 
 from __future__ import annotations
 
+import functools
 import inspect
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from typing import Any, NoReturn, TypeVar
+from typing import Any, NamedTuple, NoReturn, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -191,6 +192,20 @@ def shape_of(findings: Findings, label: str, call: Callable, *args: Any) -> Any:
         findings.stop(f"{label}{findings.kind} raised {first_line(error)}", remedy)
 
 
+def traced_methods() -> Callable[[str], Callable[..., Any]]:
+    """The methods of components as JAX keeps them: a function of a name that returns the method,
+    of (component, *arguments).
+
+    JAX transforms what it has traced, so that Python runs once for each type of the arguments.
+    """
+
+    @functools.cache
+    def method(name: str) -> Callable[..., Any]:
+        return jax.jit(lambda part, *arguments: getattr(part, name)(*arguments))
+
+    return method
+
+
 def abstract_shape(x: object) -> tuple[int, ...]:
     """The shape of an abstract result; () for objects that are not arrays."""
     shape: tuple[int, ...] = getattr(x, "shape", ())
@@ -283,7 +298,7 @@ def check_function(
     *,
     rtol: float = 1e-5,
     seed: int = 0,
-) -> None:
+) -> Callable[[Any], dict[str, jax.Array]]:
     """Tests `outputs(member, *args) -> {name: array}` compiled, batched, differentiated in both
     modes and in float32.
 
@@ -294,8 +309,12 @@ def check_function(
       args: the other arguments, at a point where the functions are smooth.
       rtol: relative tolerance of derivatives.
       seed: seed of the random directions.
+
+    Returns:
+      `outputs` as a compiled function of the tuple (member, *args).
     """
     point = in_dtype((member, *args), "float64")
+    # Python runs once for each type of numbers: what follows transforms what JAX has traced.
     function = jax.jit(lambda p: outputs(*p))
     values = function(point)
     for name, value in values.items():
@@ -304,37 +323,92 @@ def check_function(
             f"{name} is not finite at an ordinary point: {np.asarray(value)}",
         )
     findings.stop_if_any()
-    _derivatives(findings, function, values, point, rtol, np.random.default_rng(seed))
-    _batch(findings, function, values, point)
-    _float32(findings, outputs, values, point)
+    along = _directions(point, values, np.random.default_rng(seed))
+    points = [jax.tree.map(lambda x, c=c: c * np.asarray(x), point) for c in BATCH]
+    errors: dict[str, Exception] = {}
+
+    @jax.jit
+    def transformed(point, points, low, along):
+        # All in one program, because each program has a cost of its own.
+        found = {"float32": function(low)}
+        for name, transform, arguments in (
+            ("slopes", _slopes, (function, point, along)),
+            ("batch", _batch, (function, points)),
+        ):
+            try:
+                found[name] = transform(*arguments)
+            except Exception as error:
+                errors[name] = error
+        return found
+
+    stacked = jax.tree.map(lambda *xs: np.stack(xs), *points)
+    found = transformed(point, stacked, in_dtype(point, "float32"), along)
+    if "slopes" in errors:
+        problem = f"it cannot be differentiated ({first_line(errors['slopes'])})"
+        findings.add(problem, "Use only jax.numpy")
+    elif found["slopes"] is not None:
+        _same_slopes(findings, function, values, point, along, found["slopes"], rtol)
+    if "batch" in errors:
+        problem = f"it does not work under vmap ({first_line(errors['batch'])})"
+        findings.add(problem, "Write it for one run, in jax.numpy")
+    else:
+        single = [values, *(function(p) for p in points[1:])]
+        _same_batch(findings, single, found["batch"])
+    _same_in_float32(findings, values, found["float32"])
+    return function
 
 
-def _derivatives(findings, function, values, point, rtol, rng) -> None:
-    """Forward mode against central differences, reverse mode against forward mode."""
+BATCH = (1.0, 1.001, 0.999)
+"""Factors of the points of a batch."""
 
+
+class Along(NamedTuple):
+    """Random directions in which derivatives are compared."""
+
+    direction: Any
+    """Of the arguments, of their structure."""
+    weights: dict[str, np.ndarray]
+    """Of the results that are floating-point numbers."""
+
+
+def _directions(point: Any, values: dict[str, jax.Array], rng: np.random.Generator) -> Along:
     def random_like(x):
         size = np.where(np.isfinite(x), np.maximum(np.abs(x), 0.1), 0.1)  # limits may be infinite
         return rng.normal(size=np.shape(x)) * size
 
+    direction = jax.tree.map(random_like, point)
+    weights = {k: rng.normal(size=v.shape) for k, v in values.items() if is_float(v)}
+    return Along(direction, weights)
+
+
+def _slopes(function: Callable, point: Any, along: Along) -> tuple[dict[str, jax.Array], jax.Array]:
+    """The forward derivative of each result along a direction, and the reverse derivative of all
+    of them with their weights along the same direction.
+    """
+
     def floats(p):
         return {k: v for k, v in function(p).items() if is_float(v)}
 
-    direction = jax.tree.map(random_like, point)
-    weights = {k: rng.normal(size=v.shape) for k, v in values.items() if is_float(v)}
+    forward = jax.jvp(floats, (point,), (along.direction,))[1]
+    (pulled,) = jax.vjp(floats, point)[1](along.weights)
+    return forward, _dot(pulled, along.direction)
 
-    @jax.jit
-    def both(point, direction, weights):
-        _, forward = jax.jvp(floats, (point,), (direction,))
-        _, pull = jax.vjp(floats, point)
-        return forward, _dot(pull(weights)[0], direction)
 
-    try:
-        forward, reverse = both(point, direction, weights)
-    except Exception as error:
-        findings.add(f"it cannot be differentiated ({first_line(error)})", "Use only jax.numpy")
-        return
-    ahead = function(jax.tree.map(lambda x, d: np.asarray(x) + STEP * d, point, direction))
-    behind = function(jax.tree.map(lambda x, d: np.asarray(x) - STEP * d, point, direction))
+def _dot(a: Any, b: Any) -> Any:
+    return sum(jnp.vdot(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
+
+
+def _batch(function: Callable, points: Any) -> dict[str, jax.Array]:
+    return jax.vmap(function)(points)
+
+
+def _same_slopes(findings, function, values, point, along, slopes, rtol) -> None:
+    """Forward mode against central differences, reverse mode against forward mode."""
+    forward, reverse = slopes
+    ahead, behind = (
+        function(jax.tree.map(lambda x, d, h=h: np.asarray(x) + h * d, point, along.direction))
+        for h in (STEP, -STEP)
+    )
     remedy = (
         "Look for rounding, clipping, stop_gradient and wrong custom derivatives in the function"
     )
@@ -344,9 +418,9 @@ def _derivatives(findings, function, values, point, rtol, rng) -> None:
         off = largest(slope - difference)
         problem = f"the derivative of {name} differs from its finite difference by {off:.2g}"
         findings.require(off <= rtol * scale, problem, remedy)
-    along = sum(float(np.vdot(weights[k], forward[k])) for k in weights)
+    total = sum(float(np.vdot(weight, forward[k])) for k, weight in along.weights.items())
     size = max([1.0, *map(largest, forward.values())])
-    off = abs(float(reverse) - along)
+    off = abs(float(reverse) - total)
     findings.require(
         off <= 1e-8 * size * max(1, len(forward)),
         f"forward and reverse derivative differ by {off:.2g}",
@@ -354,32 +428,18 @@ def _derivatives(findings, function, values, point, rtol, rng) -> None:
     )
 
 
-def _dot(a: Any, b: Any) -> Any:
-    return sum(jnp.vdot(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
-
-
-def _batch(findings, function, values, point) -> None:
-    """Requires that a batch of three points gives the results of single evaluations."""
-    factors = (1.0, 1.001, 0.999)
-    points = [jax.tree.map(lambda x, c=c: c * np.asarray(x), point) for c in factors]
-    try:
-        batch = jax.jit(jax.vmap(function))(jax.tree.map(lambda *xs: np.stack(xs), *points))
-    except Exception as error:
-        remedy = "Write it for one run, in jax.numpy"
-        findings.add(f"it does not work under vmap ({first_line(error)})", remedy)
-        return
-    single = [values, *(function(p) for p in points[1:])]
-    for name in values:
-        for batched, one in zip(batch[name], single, strict=True):
+def _same_batch(findings, single, batch) -> None:
+    """Requires that a batch of points gives the results of single evaluations."""
+    for name, rows in batch.items():
+        for batched, one in zip(rows, single, strict=True):
             expected = np.asarray(one[name], float)
             off = largest(np.asarray(batched, float) - expected)
             problem = f"{name} differs by {off:.2g} between vmap and one run"
             findings.require(off <= 1e-9 * max(1.0, largest(expected)), problem)
 
 
-def _float32(findings, outputs, values, point) -> None:
+def _same_in_float32(findings, values, result) -> None:
     """Requires float32 results for float32 arguments, with about the same numbers."""
-    result = jax.jit(lambda p: outputs(*p))(in_dtype(point, "float32"))
     remedy = "Make constants with the dtype of an argument, jnp.zeros_like(q), or Python numbers"
     for name, value in result.items():
         if not is_float(values[name]):
@@ -392,24 +452,28 @@ def _float32(findings, outputs, values, point) -> None:
 
 
 def find_jump(
-    function: Callable, start: float, end: float, known: Sequence[float] = ()
+    values: Callable[[np.ndarray], Any], start: float, end: float, known: Sequence[float] = ()
 ) -> float | None:
-    """A time in [start, end] at which `function` (t -> array) jumps, other than the known times;
-    None if there is none.
+    """A time in [start, end] at which a function jumps, other than the known times; None if there
+    is none.
 
     The search refines the intervals of a grid with the largest changes until a smooth function
     would not change any more.
-    """
-    batched = jax.jit(jax.vmap(function))
 
-    def values(times):
-        return np.asarray(batched(jnp.asarray(times)), float).reshape(GRID, -1)
+    Args:
+      values: the function at the times of a grid, (GRID,) -> (GRID, ...).
+      start, end: of the interval [s].
+      known: times of known jumps [s].
+    """
+
+    def at(times):
+        return np.asarray(values(times), float).reshape(GRID, -1)
 
     def changes(times):
-        return np.max(np.abs(np.diff(values(times), axis=0)), axis=1, initial=0)
+        return np.max(np.abs(np.diff(at(times), axis=0)), axis=1, initial=0)
 
     times = np.linspace(start, end, GRID)
-    scale = max(largest(values(times)), 1e-9)
+    scale = max(largest(at(times)), 1e-9)
     for index in np.argsort(-changes(times))[:8]:
         a, b = times[index], times[index + 1]
         if any(a - 1e-9 <= t <= b + 1e-9 for t in known):

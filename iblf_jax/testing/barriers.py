@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -18,6 +19,7 @@ from iblf_jax.testing._contract import (
     check_function,
     has_shape,
     in_dtype,
+    traced_methods,
 )
 from iblf_jax.testing.joints import examine_joints, scenario_of
 from iblf_jax.world.bounds import Tube
@@ -87,82 +89,86 @@ def check_barrier(barrier: object, *, n: int | None = None) -> None:
         o = jnp.asarray(np.resize([0.1, 0.2], joints)) if fitted.uses_o else None
         tube = context.tube(jnp.asarray(1.0))
         q = tube.q_d + np.resize([0.2, -0.15], joints)
+        functions = _functions()
+        arguments = (fitted, tube, q, k1, o)
         for name, label in FUNCTIONS.items():
-
-            def function(*args, name=name):
-                return _functions(*args)[name]
-
-            call_has_shape(findings, label, function, (fitted, tube, q, k1, o), (joints,))
+            call_has_shape(findings, label, functions[name], arguments, (joints,))
         findings.stop_if_any()
 
         def outputs(*args):
-            return {FUNCTIONS[name]: x for name, x in _functions(*args).items()}
+            return {FUNCTIONS[name]: function(*args) for name, function in functions.items()}
 
-        check_function(findings, outputs, fitted, (tube, q, k1, o))
-        jacobians = jax.jit(jax.jacfwd(lambda q: _functions(fitted, tube, q, k1, o)))(q)
+        check_function(findings, outputs, fitted, arguments[1:])
+
+        def of_q(q):
+            return {name: function(fitted, tube, q, k1, o) for name, function in functions.items()}
+
+        jacobians = jax.jit(jax.jacfwd(of_q))(q)
         for name, J in jacobians.items():
             findings.require(
                 np.all(np.diag(np.diag(J)) == J),
                 f"{name} mixes joints",
                 "The law needs a barrier that acts on every joint separately",
             )
-        for t in TIMES:
-            tube = context.tube(jnp.asarray(t))
-            numbers = _numbers(fitted, context, jnp.asarray(t), k1, o, jnp.asarray(XI))
-            _at_every_xi(findings, numbers, fitted.guard)
-            _claims(findings, fitted, tube, k1, numbers)
-            _grows_without_bound(findings, fitted, context, jnp.asarray(t), k1, o)
+        times = jnp.asarray(TIMES)
+        numbers = _numbers(functions, fitted, context, times, k1, o)
+        for at_time in numbers:
+            _at_every_xi(findings, at_time, fitted.guard)
+        _claims(findings, fitted, context, times, k1, numbers)
+        _grows_without_bound(findings, fitted, context, times, k1, o)
 
 
-def _functions(
-    barrier: Barrier, tube: Tube, q: jax.Array, k1: jax.Array, o: jax.Array | None
-) -> dict[str, jax.Array]:
-    """The three functions of a barrier by name, (n,) each."""
+Functions = dict[str, Callable[..., jax.Array]]
+"""The three functions of a barrier by name, of (barrier, tube, q, k1, o)."""
+
+
+def _functions() -> Functions:
+    """The functions of a barrier as JAX has traced them."""
+    method = traced_methods()
     return {
-        "value": barrier.value(tube, q),
-        "slope": barrier.slope(tube, q),
-        "virtual_velocity": barrier.virtual_velocity(tube, q, k1, o),
+        "value": lambda barrier, tube, q, k1, o: method("value")(barrier, tube, q),
+        "slope": lambda barrier, tube, q, k1, o: method("slope")(barrier, tube, q),
+        "virtual_velocity": method("virtual_velocity"),
     }
 
 
-@jax.jit
 def _numbers(
+    functions: Functions,
     barrier: Barrier,
     context: LawContext,
-    t: jax.Array,
+    times: jax.Array,
     k1: jax.Array,
     o: jax.Array | None,
-    xi: jax.Array,
-) -> dict[str, jax.Array]:
-    """The barrier at every xi, its derivatives with respect to q in both modes, and the rate of V1
-    along q' = alpha.
+) -> list[dict[str, np.ndarray]]:
+    """The functions of a barrier at every xi, their derivatives with respect to q in both modes,
+    and the rate of V1 along q' = alpha; one record for each time.
     """
 
-    def at(xi):
+    def at(t, xi):
         tube: Tube = context.tube(t)
         q = tube.q_d + xi * jnp.where(xi > 0, tube.k_u, tube.k_l)
-
-        def functions(q):
-            return _functions(barrier, tube, q, k1, o)
-
         ones = jnp.ones_like(q)
-        values, forward = jax.jvp(functions, (q,), (ones,))
-        found = values | {"xi": tube.xi(q)}
-        for name in FUNCTIONS:
-            pull = jax.vjp(lambda q, name=name: functions(q)[name], q)[1]
-            found |= {f"d{name}": forward[name], f"r{name}": pull(ones)[0]}
+        found = {"xi": tube.xi(q)}
+        for name, function in functions.items():
+
+            def of_q(q, function=function):
+                return function(barrier, tube, q, k1, o)
+
+            found[name], found[f"d{name}"] = jax.jvp(of_q, (q,), (ones,))
+            found[f"r{name}"] = jax.vjp(of_q, q)[1](ones)[0]
         found["decay"] = jax.jvp(
-            lambda t, q: barrier.value(context.tube(t), q),
+            lambda t, q: functions["value"](barrier, context.tube(t), q, k1, o),
             (t, q),
-            (jnp.ones_like(t), values["virtual_velocity"]),
+            (jnp.ones_like(t), found["virtual_velocity"]),
         )[1]
         return found
 
-    return jax.vmap(at)(xi)
+    of_times = jax.jit(jax.vmap(jax.vmap(at, (None, 0)), (0, None)))
+    found = {name: np.asarray(x) for name, x in of_times(times, jnp.asarray(XI)).items()}
+    return [{name: x[i] for name, x in found.items()} for i in range(len(times))]
 
 
-def _at_every_xi(findings: Findings, numbers: dict[str, jax.Array], guard: float) -> None:
-    got = {name: np.asarray(value) for name, value in numbers.items()}
+def _at_every_xi(findings: Findings, got: dict[str, np.ndarray], guard: float) -> None:
     xi = np.asarray(XI)[:, None] + 0 * got["xi"]
     remedy = (
         "Evaluate at iblf_jax.barriers.guarded_error; remove singularities at e1 = 0 by a double"
@@ -209,7 +215,7 @@ def _grows_without_bound(
     findings: Findings,
     barrier: Any,
     context: LawContext,
-    t: jax.Array,
+    times: jax.Array,
     k1: jax.Array,
     o: jax.Array | None,
 ) -> None:
@@ -226,15 +232,21 @@ def _grows_without_bound(
     if sharp.guard == -math.inf or 100.0 * nearest >= 1.0:
         return
     inside = 1.0 - nearest * np.array([100.0, 10.0, 1.0])
-    xi = jnp.asarray([*inside, *-inside])
-    V1 = np.asarray(_numbers(sharp, context, t, k1, o, xi)["value"]).reshape(2, 3, -1)
-    before, last = np.diff(V1, axis=1).swapaxes(0, 1)
-    findings.require(
-        np.all(last > LEAST_INCREMENT * before),
-        f"V1 is finite at the bound: it is {V1[:, -1].max():.4g} at |xi| = {inside[-1]:.9g}",
-        "A barrier grows without bound as |xi| -> 1, or a disturbance carries the joint across; a"
-        " V1 that does not states guard = -math.inf",
-    )
+
+    def value(t, xi):
+        tube = context.tube(t)
+        return sharp.value(tube, tube.q_d + xi * jnp.where(xi > 0, tube.k_u, tube.k_l))
+
+    of_times = jax.vmap(jax.vmap(value, (None, 0)), (0, None))
+    found = np.asarray(jax.jit(of_times)(times, jnp.asarray([*inside, *-inside])))
+    for V1 in found.reshape(len(times), 2, 3, -1):
+        before, last = np.diff(V1, axis=1).swapaxes(0, 1)
+        findings.require(
+            np.all(last > LEAST_INCREMENT * before),
+            f"V1 is finite at the bound: it is {V1[:, -1].max():.4g} at |xi| = {inside[-1]:.9g}",
+            "A barrier grows without bound as |xi| -> 1, or a disturbance carries the joint across;"
+            " a V1 that does not states guard = -math.inf",
+        )
 
 
 SMALL_GUARD = 1e-7
@@ -246,43 +258,53 @@ before: 1 for a logarithm, 0.32 for a square root, 0.1 for a function with a slo
 def _claims(
     findings: Findings,
     barrier: Barrier,
-    tube: Tube,
+    context: LawContext,
+    times: jax.Array,
     k1: jax.Array,
-    numbers: dict[str, jax.Array],
+    numbers: list[dict[str, np.ndarray]],
 ) -> None:
     """Tests the claims of the barrier about V1, if it states any."""
-    xi, V1, decay = (np.asarray(numbers[name]) for name in ("xi", "value", "decay"))
-    inside = np.abs(xi) < min(1 - 2 * barrier.guard, 1.0)
     rate = barrier.decay_rate(k1)
     if rate is not None:
         has_shape(findings, "decay_rate(k1)", rate, k1.shape)
-        excess = float(np.max((decay + np.asarray(rate) * V1)[inside]))
-        findings.require(
-            excess <= 1e-9,
-            f"V1' + decay_rate V1 reaches {excess:.3g} along q' = alpha",
-            "Claim a smaller rate, or None",
-        )
-    error_over_slope = barrier.error_over_slope
-    if error_over_slope(tube, tube.q_d) is not None:
-        q = tube.q_d + xi * np.where(xi > 0, tube.k_u, tube.k_l)
-        found = np.asarray(jax.jit(jax.vmap(lambda q: error_over_slope(tube, q)))(q))
-        product = found * np.asarray(numbers["slope"])
-        off = np.abs(product - (q - np.asarray(tube.q_d)))[inside]
-        remedy = "It is e1/s inside the bound, in a form without 0/0 at e1 = 0"
-        findings.require(
-            np.max(off) < 1e-9,
-            f"error_over_slope times the slope is not e1 (off by {np.max(off):.2g})",
-            remedy,
-        )
-        findings.require(
-            np.all(np.isfinite(found)), "error_over_slope is not finite somewhere", remedy
-        )
-    xi_bound = barrier.xi_bound
-    if xi_bound(jnp.asarray(V1[0]), tube) is not None:
-        claimed = np.asarray(jax.jit(jax.vmap(lambda V: xi_bound(V, tube)))(V1))
-        kept = (np.abs(xi) <= claimed * (1 + 1e-9) + 1e-12)[inside]
-        findings.require(
-            np.all(kept),
-            "|xi| is beyond xi_bound(V1, tube)",
-            "It must hold wherever V1 <= V; return None for no claim",
-        )
+
+    def claimed(t, xi, V1):
+        tube = context.tube(t)
+        q = tube.q_d + xi * jnp.where(xi > 0, tube.k_u, tube.k_l)
+        return q - tube.q_d, barrier.error_over_slope(tube, q), barrier.xi_bound(V1, tube)
+
+    of_times = jax.jit(jax.vmap(jax.vmap(claimed, (None, 0, 0))))
+    xi, V1, slope, decay = (
+        np.stack([at_time[name] for at_time in numbers])
+        for name in ("xi", "value", "slope", "decay")
+    )
+    inside = np.abs(xi) < min(1 - 2 * barrier.guard, 1.0)
+    error, ratio, bound = of_times(times, xi, V1)
+    for i in range(len(times)):
+        within = inside[i]
+        if rate is not None:
+            excess = float(np.max((decay[i] + np.asarray(rate) * V1[i])[within]))
+            findings.require(
+                excess <= 1e-9,
+                f"V1' + decay_rate V1 reaches {excess:.3g} along q' = alpha",
+                "Claim a smaller rate, or None",
+            )
+        if ratio is not None:
+            found = np.asarray(ratio[i])
+            off = np.abs(found * slope[i] - np.asarray(error[i]))[within]
+            remedy = "It is e1/s inside the bound, in a form without 0/0 at e1 = 0"
+            findings.require(
+                np.max(off) < 1e-9,
+                f"error_over_slope times the slope is not e1 (off by {np.max(off):.2g})",
+                remedy,
+            )
+            findings.require(
+                np.all(np.isfinite(found)), "error_over_slope is not finite somewhere", remedy
+            )
+        if bound is not None:
+            kept = (np.abs(xi[i]) <= np.asarray(bound[i]) * (1 + 1e-9) + 1e-12)[within]
+            findings.require(
+                np.all(kept),
+                "|xi| is beyond xi_bound(V1, tube)",
+                "It must hold wherever V1 <= V; return None for no claim",
+            )

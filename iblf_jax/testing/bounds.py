@@ -5,12 +5,14 @@ The law must be finite inside.  If it is undefined beyond the bounds, the checke
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.control.controllers import Command
 from iblf_jax.control.controllers._base import law_of_x
 from iblf_jax.simulation.levels import has_speed_limits, levels_on_reference, start_levels
 from iblf_jax.simulation.scenario import Scenario
@@ -39,33 +41,40 @@ class Points(NamedTuple):
     V1: np.ndarray
 
 
-def check_at_the_bounds(findings: Findings, scenario: Scenario) -> bool:
+CommandOf = Callable[..., tuple[Command, Any]]
+"""The command of a law, of (law, t, x, f_hat, context, state), as JAX has traced it."""
+
+
+def check_at_the_bounds(findings: Findings, scenario: Scenario, command_of: CommandOf) -> bool:
     """Requires that torque, V1 and their derivatives in both modes are finite inside the bounds.
 
     Returns:
       Whether they are finite beyond the bounds, too.
     """
-    infinite = _infinite_in_e2(findings, scenario)
-    everywhere = _swept(findings, scenario, "xi", infinite)
+
+    @jax.jit
+    def command(scenario, law, q, dq):
+        """Torque, alpha and V1 without a disturbance; further levels are those on the reference."""
+        context, t, model = scenario.context, jnp.asarray(TIME), scenario.loop.model
+        state = law_of_x(law).init(start_levels(scenario)[: model.order], context)
+        x = jnp.stack([q, dq, *levels_on_reference(scenario, t)[2 : model.order]])
+        f_hat = jnp.zeros(model.estimate_shape, q.dtype)
+        found = command_of(law, t, x, f_hat, context, state)[0]
+        return found.tau, found.alpha, found.V1
+
+    infinite = _infinite_in_e2(findings, scenario, command)
+    everywhere = _swept(findings, scenario, command, "xi", infinite)
     if not has_speed_limits(scenario):
         return everywhere
-    return _swept(findings, scenario, "xi of the velocity", infinite) and everywhere
+    of_velocity = _swept(findings, scenario, command, "xi of the velocity", infinite)
+    return of_velocity and everywhere
 
 
-def _command(
-    scenario: Scenario, law: Any, q: jax.Array, dq: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Torque, alpha and V1 without a disturbance; further levels are those on the reference."""
-    context, t, model = scenario.context, jnp.asarray(TIME), scenario.loop.model
-    of_x = law_of_x(law)
-    state = of_x.init(start_levels(scenario)[: model.order], context)
-    x = jnp.stack([q, dq, *levels_on_reference(scenario, t)[2 : model.order]])
-    f_hat = jnp.zeros(model.estimate_shape, q.dtype)
-    command = of_x.command(t, x, f_hat, context, state)[0]
-    return command.tau, command.alpha, command.V1
+AtPoint = Callable[..., tuple[jax.Array, jax.Array, jax.Array]]
+"""Torque, alpha and V1, of (scenario, law, q, dq)."""
 
 
-def _infinite_in_e2(findings: Findings, scenario: Scenario) -> bool:
+def _infinite_in_e2(findings: Findings, scenario: Scenario, command: AtPoint) -> bool:
     """Whether the slope of the torque grows without limit as e2 approaches 0; a finding if so."""
 
     @jax.jit
@@ -73,9 +82,9 @@ def _infinite_in_e2(findings: Findings, scenario: Scenario) -> bool:
         law, tube = scenario.controller, scenario.context.tube(jnp.asarray(TIME))
         q = tube.q_d + 0.3 * tube.k_u
         dq = levels_on_reference(scenario, jnp.asarray(TIME))[1]
-        alpha = _command(scenario, law, q, dq)[1]
+        alpha = command(scenario, law, q, dq)[1]
         one = jnp.ones_like(alpha)
-        return jax.jvp(lambda dq: _command(scenario, law, q, dq)[0], (alpha + e2,), (one,))[1]
+        return jax.jvp(lambda dq: command(scenario, law, q, dq)[0], (alpha + e2,), (one,))[1]
 
     near, nearer = (
         float(np.max(np.abs(slope(scenario, jnp.asarray(e2))))) for e2 in (NEAR, NEARER)
@@ -91,13 +100,15 @@ def _infinite_in_e2(findings: Findings, scenario: Scenario) -> bool:
     return True
 
 
-def _swept(findings: Findings, scenario: Scenario, axis: str, infinite_in_e2: bool) -> bool:
+def _swept(
+    findings: Findings, scenario: Scenario, command: AtPoint, axis: str, infinite_in_e2: bool
+) -> bool:
     """Requires finite results inside the bounds along the positions ("xi") or the velocities.
 
     Returns:
       Whether the results are finite beyond the bounds, too.
     """
-    found, xi = _at_points(scenario, axis), np.asarray(XI)
+    found, xi = _at_points(scenario, command, axis), np.asarray(XI)
     beyond = np.zeros(xi.size, bool)
     remedy = (
         "Near the bound limit the slope (iblf_jax.barriers.guarded_error); a failed run must stay"
@@ -140,7 +151,7 @@ def _listed(xi: np.ndarray) -> str:
     return ", ".join(f"{x:g}" for x in xi)
 
 
-def _at_points(scenario: Scenario, axis: str) -> Points:
+def _at_points(scenario: Scenario, command: AtPoint, axis: str) -> Points:
     """The law at all XI along an axis."""
 
     @jax.jit
@@ -153,11 +164,11 @@ def _at_points(scenario: Scenario, axis: str) -> Points:
             if axis == "xi":
                 q = tube.q_d + xi * jnp.where(xi > 0, tube.k_u, tube.k_l)
             else:
-                alpha = _command(scenario, law, q, dq)[1]
+                alpha = command(scenario, law, q, dq)[1]
                 dq = alpha + xi * jnp.where(xi > 0, limits[1] - alpha, alpha - limits[0])
 
             def functions(law, q, dq):
-                return _command(scenario, law, q, dq)
+                return command(scenario, law, q, dq)
 
             point = (law, q, dq)
             values, forward = jax.jvp(functions, point, jax.tree.map(jnp.ones_like, point))

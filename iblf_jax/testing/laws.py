@@ -90,18 +90,23 @@ def check_law(
         x = jnp.stack([tube.q_d + 0.3 * tube.k_u, dq - 0.2, *others])[: model.order]
         f_hat = jnp.broadcast_to(jnp.linspace(0.1, 0.2, base.n), model.estimate_shape)
 
+        # JAX keeps what it has traced of a command; all checks transform that.
+        @jax.jit
+        def command_of(law, *arguments):
+            return law_of_x(law).command(*arguments)
+
         def outputs(law, t, x, f_hat, context):
-            of_x = law_of_x(law)
-            command, rate = of_x.command(t, x, f_hat, context, of_x.init(x, context))
+            state = law_of_x(law).init(x, context)
+            command, rate = command_of(law, t, x, f_hat, context, state)
             rates = leaves_by_name("its state's rate", rate)
             found = {"tau": command.tau, "alpha": command.alpha, "V1": command.V1}
             return found | leaves_by_name("input", command.input) | rates
 
         arguments = (t, x, f_hat, base.context)
-        check_function(findings, outputs, base.controller, arguments)
-        _declarations(findings, outputs, base.controller, arguments)
+        compiled = check_function(findings, outputs, base.controller, arguments)
+        _declarations(findings, compiled, base.controller, arguments)
         check_claims(findings, base)
-        is_defined_beyond = check_at_the_bounds(findings, base)
+        is_defined_beyond = check_at_the_bounds(findings, base, command_of)
         findings.stop_if_any()
         _closed_loop(findings, in_dtype(base, "float32"), is_defined_beyond)
     return tuple(findings.remarks)
@@ -109,7 +114,7 @@ def check_law(
 
 def _declarations(
     findings: Findings,
-    outputs: Callable[..., dict[str, jax.Array]],
+    outputs: Callable[[Any], dict[str, jax.Array]],
     law: TrackingLaw,
     arguments: tuple[Any, ...],
 ) -> None:
@@ -129,8 +134,8 @@ def _declarations(
     if law.uses_observer:
         return
     t, x, f_hat, context = arguments
-    with_estimate = outputs(law, t, x, f_hat, context)
-    without = outputs(law, t, x, jnp.zeros_like(f_hat), context)
+    with_estimate = outputs((law, t, x, f_hat, context))
+    without = outputs((law, t, x, jnp.zeros_like(f_hat), context))
     changed = [name for name, x in with_estimate.items() if not jnp.array_equal(x, without[name])]
     findings.require(
         not changed,

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -25,6 +26,7 @@ from iblf_jax.testing._contract import (
     leaves_by_name,
     same_structure,
     shape_of,
+    traced_methods,
 )
 from iblf_jax.testing.joints import (
     arm_of,
@@ -77,16 +79,28 @@ def check_observer(
         x = jnp.asarray(rng.uniform(-1, 1, (plant.order, plant.n)))
         u = jnp.asarray(rng.uniform(-1, 1, plant.n))
         in_both_types(findings, _structure, fitted, t, x, u, plant)
+        method = traced_methods()
+        derivative, estimate = method("derivative"), method("estimate")
 
         def outputs(observer, t, x, u, plant):
             of_x = observer_of_x(observer)
             state = of_x.init(_slower(x), plant)
-            rate = of_x.derivative(t, x, u, plant, state)
-            estimate = of_x.estimate(t, x, plant, state)
-            return {"estimate": estimate} | leaves_by_name("derivative", rate)
+            rate = derivative(of_x, t, x, u, plant, state)
+            found = {"estimate": estimate(of_x, t, x, plant, state)}
+            return found | leaves_by_name("derivative", rate)
+
+        def scan(findings, observer, t, x, u, plant):
+            of_x = observer_of_x(observer)
+
+            def step(state, _):
+                rate = derivative(of_x, t, x, u, plant, state)
+                state = jax.tree.map(lambda value, slope: value + 1e-3 * slope, state, rate)
+                return state, estimate(of_x, t, x, plant, state)
+
+            _stays_finite(findings, lambda: jax.lax.scan(step, of_x.init(x, plant), length=100))
 
         check_function(findings, outputs, fitted, (t, x, u, plant))
-        in_both_types(findings, _scan, fitted, t, x, u, plant)
+        in_both_types(findings, scan, fitted, t, x, u, plant)
 
 
 def _slower(x: jax.Array) -> jax.Array:
@@ -117,17 +131,15 @@ def _structure(findings: Findings, observer, t, x, u, plant) -> None:
         same_structure(findings, label, after, state)
 
 
-def _scan(findings: Findings, observer, t, x, u, plant) -> None:
-    """Requires that the state keeps its structure and stays finite at a standstill."""
-    of_x = observer_of_x(observer)
+def _stays_finite(findings: Findings, run: Callable[[], tuple[Any, Any]]) -> None:
+    """Requires that the state keeps its structure and stays finite at a standstill.
 
-    def step(state, _):
-        rate = of_x.derivative(t, x, u, plant, state)
-        state = jax.tree.map(lambda value, slope: value + 1e-3 * slope, state, rate)
-        return state, of_x.estimate(t, x, plant, state)
-
+    Args:
+      findings: receives the problems.
+      run: a scan, which returns the last state and the estimates.
+    """
     try:
-        state, estimates = jax.jit(lambda: jax.lax.scan(step, of_x.init(x, plant), length=100))()
+        state, estimates = jax.jit(run)()
     except TypeError as error:
         findings.add(f"its state does not keep its type in a scan ({first_line(error)})")
         return

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from typing import Any
@@ -24,6 +25,7 @@ from iblf_jax.testing._contract import (
     in_both_types,
     in_dtype,
     shape_of,
+    traced_methods,
 )
 from iblf_jax.world import plants
 from iblf_jax.world.plants import Plant
@@ -65,12 +67,14 @@ def check_plant(plant: Plant, *, x: ArrayLike | None = None) -> None:
         plant = fit_joints(in_dtype(plant, "float64"), plant.n, "plant")
         points = _points(plant, x)
         t = jnp.asarray(0.7)
-        in_both_types(findings, _shapes, plant, t, points[0])
-        _structure(findings, plant, t, points)
+        method = traced_methods()
+        in_both_types(findings, partial(_shapes, method=method), plant, t, points[0])
+        _structure(findings, method, plant, t, points)
         rng = np.random.default_rng(2)
         vectors = jnp.asarray(rng.normal(size=(2, plant.n)))
-        check_function(findings, _functions, plant, (t, points[0]))
-        found = jax.jit(jax.vmap(_identities, in_axes=(None, None, 0, None, None)))
+        check_function(findings, partial(_functions, method), plant, (t, points[0]))
+        identities = partial(_identities, method)
+        found = jax.jit(jax.vmap(identities, in_axes=(None, None, 0, None, None)))
         # Optional members must agree with drift and gain.
         for name, difference in found(plant, t, points, *vectors).items():
             problem, remedy = REMEDIES[name]
@@ -93,24 +97,30 @@ def _points(plant: Plant, x: ArrayLike | None) -> jax.Array:
     return points
 
 
-def _shapes(findings: Findings, plant: Plant, t: jax.Array, x: jax.Array) -> None:
+Method = Callable[..., Callable[..., Any]]
+"""name -> a method of a plant, of (plant, ...), as JAX has traced it."""
+
+
+def _shapes(
+    findings: Findings, plant: Plant, t: jax.Array, x: jax.Array, *, method: Method
+) -> None:
     """Requires the shapes of drift, gain and the optional members."""
     order, n = x.shape
-    call_has_shape(findings, "drift(t, x)", plant.drift, (t, x), (order, n))
-    gain = shape_of(findings, "gain(t, x)", plant.gain, t, x)
+    call_has_shape(findings, "drift(t, x)", method("drift"), (plant, t, x), (order, n))
+    gain = shape_of(findings, "gain(t, x)", method("gain"), plant, t, x)
     problem = f"gain(t, x) has shape {gain.shape}"
     remedy = f"It must be {(order, n, n)}, or {(order, n)} for diagonal gains"
     findings.require(gain.shape in ((order, n), (order, n, n)), problem, remedy)
     v = x[0]
-    optional: dict[str, tuple[Any, tuple[Any, ...], tuple[int, ...]]] = {
-        "weights": (plant.weights, (x,), (order, n)),
-        "steady_levels": (plant.steady_levels, (v, v), (order - 2, n)),
-        "steady_input": (plant.steady_input, (v,), (n,)),
-        "joint_torque": (plant.joint_torque, (x, v), (n,)),
+    optional: dict[str, tuple[tuple[jax.Array, ...], tuple[int, ...]]] = {
+        "weights": ((x,), (order, n)),
+        "steady_levels": ((v, v), (order - 2, n)),
+        "steady_input": ((v,), (n,)),
+        "joint_torque": ((x, v), (n,)),
     }
-    for name, (method, args, shape) in optional.items():
+    for name, (args, shape) in optional.items():
         with suppress(StoppedCheckError):
-            found = shape_of(findings, name, method, *args)
+            found = shape_of(findings, name, method(name), plant, *args)
             if found is not None:
                 has_shape(findings, name, found, shape)
     arguments = {
@@ -118,9 +128,9 @@ def _shapes(findings: Findings, plant: Plant, t: jax.Array, x: jax.Array) -> Non
         "level_input": (t, x, v, 0.0),
         "transposed_gain": (t, x, v),
     }
-    for name, method in _own_by_level(plant).items():
+    for name, of_level in _own_by_level(plant).items():
         for level in range(1, order + 1):
-            at_level = partial(method, level)
+            at_level = partial(of_level, level)
             call_has_shape(findings, f"{name}({level}, ...)", at_level, arguments[name], (n,))
 
 
@@ -143,13 +153,19 @@ def _dependence(findings: Findings, plant: Plant, t: jax.Array, points: jax.Arra
         findings.stop(str(error).removesuffix("."))
 
 
-def _structure(findings: Findings, plant: Plant, t: jax.Array, points: jax.Array) -> None:
+def _structure(
+    findings: Findings, method: Method, plant: Plant, t: jax.Array, points: jax.Array
+) -> None:
     """Requires rows that depend on no later level, except for the model of a law with filters;
     invertible gains, and finite derivatives.
     """
     if not plant.needs_filters:
         _dependence(findings, plant, t, points)
-    gains = np.asarray(jax.vmap(lambda x: plant.gain(t, x))(points))
+
+    def of_state(x):
+        return method("gain")(plant, t, x), _derivatives_along(method, plant, t, x)
+
+    gains, slopes = map(np.asarray, jax.jit(jax.vmap(of_state))(points))
     finite = np.isfinite(gains).reshape(*gains.shape[:2], -1).all(axis=-1)
     if not finite.all():
         point, row = np.argwhere(~finite)[0]
@@ -165,39 +181,38 @@ def _structure(findings: Findings, plant: Plant, t: jax.Array, points: jax.Array
         problem = f"row {i} of gain(t, x) is singular"
         findings.require(invertible, problem, "Every level must act on the level below it")
     findings.stop_if_any()
-    slopes = jax.jit(jax.vmap(lambda x: _derivatives_along(plant, t, x)))(points)
     problem = f"a derivative of order up to {plant.order - 1} of drift or gain is not finite"
     remedy = f"Laws differentiate them that often: look at roots, norms and divisions. {PART}"
-    findings.require(np.isfinite(np.asarray(slopes)).all(), problem, remedy)
+    findings.require(np.isfinite(slopes).all(), problem, remedy)
 
 
-def _derivatives_along(plant: Plant, t: jax.Array, x: jax.Array) -> jax.Array:
+def _derivatives_along(method: Method, plant: Plant, t: jax.Array, x: jax.Array) -> jax.Array:
     """The Taylor coefficients of drift and gain along a straight line, all in one vector."""
     constant = [(jnp.zeros_like(t), jnp.zeros_like(x))] * (plant.order - 2)
     curve = [(t, x), (jnp.ones_like(t), jnp.ones_like(x)), *constant]
-    found = taylor.along(lambda t, x: (plant.drift(t, x), plant.gain(t, x)), curve)
+    drift, gain = method("drift"), method("gain")
+    found = taylor.along(lambda t, x: (drift(plant, t, x), gain(plant, t, x)), curve)
     return jnp.concatenate([jnp.ravel(value) for value in jax.tree.leaves(found)])
 
 
-def _functions(plant: Plant, t: jax.Array, x: jax.Array) -> Numbers:
+def _functions(method: Method, plant: Plant, t: jax.Array, x: jax.Array) -> Numbers:
     """The functions of a plant whose derivatives are tested."""
-    values = {"drift(t, x)": plant.drift(t, x), "gain(t, x)": plant.gain(t, x)}
-    stated = {
-        "weights": plant.weights(x),
-        "steady_input": plant.steady_input(x[0]),
-        "joint_torque": plant.joint_torque(x, x[-1]),
-    }
+    values = {f"{name}(t, x)": method(name)(plant, t, x) for name in ("drift", "gain")}
+    arguments = {"weights": (x,), "steady_input": (x[0],), "joint_torque": (x, x[-1])}
     if plant.order > 2:
-        stated["steady_levels"] = plant.steady_levels(x[0], x[1])
+        arguments["steady_levels"] = (x[0], x[1])
+    stated = {name: method(name)(plant, *given) for name, given in arguments.items()}
     return values | {name: value for name, value in stated.items() if value is not None}
 
 
-def _identities(plant: Plant, t: jax.Array, x: jax.Array, v: jax.Array, s: jax.Array) -> Numbers:
+def _identities(
+    method: Method, plant: Plant, t: jax.Array, x: jax.Array, v: jax.Array, s: jax.Array
+) -> Numbers:
     """The differences between optional members and what follows from drift and gain, one array a
     member, relative to its size.
     """
     found: Numbers = {}
-    drift, gain = plant.drift(t, x), plant.gain(t, x)
+    drift, gain = method("drift")(plant, t, x), method("gain")(plant, t, x)
     matrices = gain if gain.ndim == 3 else gain[:, None, :] * jnp.eye(plant.n)
     levels = range(1, plant.order + 1)
     rates = jnp.stack([drift[i] + matrices[i] @ v for i in range(plant.order)])
@@ -211,10 +226,11 @@ def _identities(plant: Plant, t: jax.Array, x: jax.Array, v: jax.Array, s: jax.A
     if "transposed_gain" in own_methods:
         own = jnp.stack([plant.transposed_gain(i, t, x, s) for i in levels])
         found["transposed_gain"] = _relative(own, jnp.swapaxes(matrices, 1, 2) @ s)
-    weights, rest = plant.weights(x), jnp.zeros_like(x[0])
+    weights, rest = method("weights")(plant, x), jnp.zeros_like(x[0])
     if weights is not None:
         found["weights"] = jnp.maximum(-weights, 0.0)
-    steady_levels, steady_input = plant.steady_levels(x[0], rest), plant.steady_input(x[0])
+    steady_levels = method("steady_levels")(plant, x[0], rest)
+    steady_input = method("steady_input")(plant, x[0])
     if steady_levels is not None and steady_input is not None:
         state = jnp.concatenate([jnp.stack([x[0], rest]), steady_levels])
         rate = plants.flow(plant, t, state, steady_input)

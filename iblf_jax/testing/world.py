@@ -10,6 +10,7 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.testing._contract import (
+    GRID,
     Findings,
     abstract_shape,
     call_has_shape,
@@ -52,18 +53,22 @@ def _smooth_in_time(
 ) -> None:
     """Requires on [0, duration] a finite value, rate and second rate, the first two continuous."""
     names = (label, f"the rate of {label}", f"the second rate of {label}")
-    times = jnp.linspace(0.0, duration, 401)
-    found = jax.jit(jax.vmap(lambda t: rates(function, t)))(times)
-    for name, numbers in zip(names, found, strict=True):
-        finite = np.isfinite(np.asarray(numbers).reshape(times.size, -1)).all(axis=1)
+    at_times = jax.jit(jax.vmap(lambda t: rates(function, t)))
+    times = np.linspace(0.0, duration, GRID)
+    for name, numbers in zip(names, at_times(times), strict=True):
+        finite = np.isfinite(np.asarray(numbers).reshape(GRID, -1)).all(axis=1)
         if not finite.all():
             findings.add(
-                f"{name} is not finite at t = {float(times[np.argmin(finite)]):g} s",
+                f"{name} is not finite at t = {times[np.argmin(finite)]:g} s",
                 "The law differentiates it twice; look at sqrt, division and clip",
             )
     findings.stop_if_any()
     for part, name in enumerate(names[:2]):
-        jump = find_jump(lambda t, part=part: rates(function, t)[part], 0.0, duration)
+
+        def values(times, part=part):
+            return at_times(times)[part]
+
+        jump = find_jump(values, 0.0, duration)
         if jump is not None:
             remedy = "It must be twice differentiable: blend the pieces smoothly"
             findings.add(f"{name} jumps at t = {jump:.6g} s", remedy)
@@ -268,7 +273,8 @@ def check_disturbance(
         remedy = "Return finite times, or an empty array"
         findings.require(np.all(np.isfinite(times)), f"jump_times() has {times}", remedy)
         findings.stop_if_any()
-        jump = find_jump(lambda t: fitted.torque(t, *arguments[1:]), 0.0, duration, tuple(times))
+        at_times = jax.jit(jax.vmap(lambda t: fitted.torque(t, *arguments[1:])))
+        jump = find_jump(at_times, 0.0, duration, tuple(times))
         if jump is not None:
             remedy = "Return that time in jump_times(): steps of a run are divided there"
             problem = f"the torque jumps at t = {jump:.6g} s, which is not one of jump_times()"

@@ -46,7 +46,7 @@ from iblf_jax.engine.loops import program_of
 from iblf_jax.engine.time_step import TimeStep
 from iblf_jax.kernels import written_out
 from iblf_jax.simulation import metrics
-from iblf_jax.simulation.scenario import canonical, with_history
+from iblf_jax.simulation.scenario import with_history
 
 FILE = TESTS / "data" / "steps.json"
 DT, STEPS = 4e-3, 5
@@ -153,14 +153,14 @@ def record(folds: Any, found: Any) -> Any:
 def steps_of(scenario: ij.Scenario, method: str) -> tuple[Any, Any, list[Any], list[Any]]:
     """Carry and record of a step, as trees of shapes, and the numbers of both: of the carry after
     the last step, and of the records of all steps."""
-    scenario = with_history(canonical(scenario), DT)
+    scenario = with_history(ij.astype(scenario, "float64"), DT)
     method = "heun" if scenario.actuator.input_delay is not None else method
     method = "euler_maruyama" if scenario.process_noise is not None else method
     request = RunRequest.of(scenario, steps=STEPS, method=method)
     folds = metrics.as_folds(None, jnp.float64, scenario)
     inputs = inputs_of(scenario, folds, jnp.asarray(DT), request, jnp.arange(4.0))
     batch = Batch.of(inputs, {"initial.dq": scenario.initial.dq[None]}, request.constants)
-    carry = carry_without_linearization(batch, method)
+    carry = jax.jit(lambda: carry_without_linearization(batch, method))()
     step, records = program_of(TimeStep(method, record), batch, carry)
     program = written_out(step)
     x = carry.state.x

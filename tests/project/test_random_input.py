@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import functools
 import itertools
 import json
 import math
@@ -118,14 +119,14 @@ def test_anything_in_the_place_of_any_argument(entry, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     place = list(entry_cases.entries()).index(entry)
     eighth = {label: NASTY[label] for label in list(NASTY)[place % 8 :: 8]}
-    for name in entry_cases.arguments_of(entry):
-        if name == "progress":
-            continue
-        is_first = FIRST[name] == entry
-        with without_runs():
-            call = lambda **given: entry_cases.call(entry, **given)  # noqa: E731
+    call = functools.partial(entry_cases.call, entry)
+    with without_runs():
+        for name in entry_cases.arguments_of(entry):
+            if name == "progress":
+                continue
+            is_first = FIRST[name] == entry
             count = refusals(call, name, NASTY if is_first else eighth)
-        assert count or not is_first or f"{entry} {name}" in ACCEPTED, name
+            assert count or not is_first or f"{entry} {name}" in ACCEPTED, name
     assert depth_left()
 
 
@@ -136,9 +137,9 @@ OF_INDICES = {"-1": -1, "half": 0.5, "true": True, "slice": slice(0, 1), "far": 
 @pytest.mark.filterwarnings("ignore")
 def test_anything_in_the_place_of_the_arguments_of_a_method(method, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    for name in entry_cases.methods()[method]:
-        with without_runs():
-            call = lambda **given: entry_cases.call_method(method, **given)  # noqa: E731
+    call = functools.partial(entry_cases.call_method, method)
+    with without_runs():
+        for name in entry_cases.methods()[method]:
             assert refusals(call, name, NASTY | OF_INDICES | {"pair": (1, 2)}), name
 
 
@@ -150,9 +151,8 @@ WORDS = [
     *("missing.toml", "missing/x.nc", "empty.toml", "loop.toml", "pipe.toml"),
     *("controller.K2=nan", "controller.K2=" + "[" * 5000, "plant.mass[999999999999]=1"),
 ]
-(COMMANDS,) = (
-    x.choices for x in cli.build_parser()._actions if isinstance(x, argparse._SubParsersAction)
-)
+PARSER = cli.build_parser()
+(COMMANDS,) = (x.choices for x in PARSER._actions if isinstance(x, argparse._SubParsersAction))
 FINE_WORDS = {
     "reproduce": ["--out", "out"],
     "compare": ["zhang_yan_2024", "--duration", "0.01"],
@@ -175,6 +175,7 @@ def test_any_word_in_the_place_of_any_other_on_the_command_line(
         sys.modules, "distributed", types.SimpleNamespace(Client=entry_cases.entered)
     )
     monkeypatch.setattr("iblf_jax.cli.prepare_jax", lambda: None)
+    monkeypatch.setattr("iblf_jax.cli.build_parser", lambda: PARSER)
     for name in ("study", "failure", "sweep", "tune"):
         shutil.copy(ROOT / "examples" / f"{name}.toml", tmp_path)
     for name in ("folder.toml", "folder.nc"):
@@ -194,18 +195,18 @@ def test_any_word_in_the_place_of_any_other_on_the_command_line(
         if action.nargs != 0:
             lines.append([*fine, f"{option}={second}"])
     codes = set()
-    for line in lines:
-        with without_runs():
+    with without_runs():
+        for line in lines:
             try:
                 code = cli.main([command, *line])
             except Entered:
                 code = None
-        codes.add(code)
-        said = capsys.readouterr().err
-        assert code in (0, 2, None), line
-        if code == 2:
-            assert said.startswith("iblf-jax: error: ") and said.count("\n") == 1, line
-            assert len(said) < 1500, line
+            codes.add(code)
+            said = capsys.readouterr().err
+            assert code in (0, 2, None), line
+            if code == 2:
+                assert said.startswith("iblf-jax: error: ") and said.count("\n") == 1, line
+                assert len(said) < 1500, line
     assert 2 in codes and (codes - {2} or command in NEED_FILES)
 
 

@@ -125,6 +125,13 @@ class Torque:
         return jnp.zeros(0)
 
 
+@pytest.fixture
+def unchecked_start(monkeypatch):
+    """The values at the start, which every other function would compile anew, are not checked."""
+    monkeypatch.setattr("iblf_jax.proofs.arms.canonical", lambda scenario: scenario)
+
+
+@pytest.mark.usefixtures("unchecked_start")
 @pytest.mark.parametrize("name", JUMPS)
 def test_disturbances_that_jump_or_have_own_derivatives_are_refused(name):
     scenario = pendulum(disturbance=Torque(JUMPS[name]))
@@ -210,6 +217,7 @@ SMOOTH = {
 }
 
 
+@pytest.mark.usefixtures("unchecked_start")
 @pytest.mark.parametrize("name", SMOOTH)
 def test_continuous_disturbances_are_admitted(name):
     arm_problem(pendulum(disturbance=Torque(SMOOTH[name])), {}, duration=2.0)
@@ -399,6 +407,7 @@ STEPS = {
 }
 
 
+@pytest.mark.usefixtures("unchecked_start")
 @pytest.mark.parametrize("name", STEPS)
 def test_references_and_bounds_that_jump_and_declare_nothing_are_refused(name):
     words = "select a case or have a kink|does not know"
@@ -537,6 +546,7 @@ def with_barrier(barrier):
     return pendulum(controller=ij.controllers.Backstepping(**LAW, barrier=barrier))
 
 
+@pytest.mark.usefixtures("unchecked_start")
 @pytest.mark.parametrize("name", BARRIERS)
 def test_barriers_with_lengths_jumps_or_wrong_slopes_are_refused(name):
     fields, words = BARRIERS[name]
