@@ -5,6 +5,8 @@ They are found by their signatures and docstrings: a new function, argument or m
 without a new line here, with None where no value of the argument's name is listed.
 """
 
+from __future__ import annotations
+
 import contextlib
 import dataclasses
 import datetime
@@ -21,13 +23,18 @@ import members
 import numpy as np
 from conftest import SHORT
 from made_up_runs import made_up
-from stored_results import stored
 from test_public_api import NAMES, public
 
 import iblf_jax as ij
 from iblf_jax.core.status import Status
 from iblf_jax.engine import CompiledBatch
 from iblf_jax.engine.plan import ExecutionPlan
+from iblf_jax.simulation.results import Metrics
+from iblf_jax.studies.options import RunOptions
+from iblf_jax.studies.study_setup import prepare
+from iblf_jax.tuning.parameters import layout
+from iblf_jax.tuning.result import TuneSetup
+from iblf_jax.tuning.robust import as_risk
 
 WEAK = ij.presets.zhang_yan_2024()
 HELD = dataclasses.replace(WEAK, sampling=ij.Sampling(period=1e-3, observer="poles"))
@@ -92,6 +99,7 @@ tuning.on_slice
 
 
 def with_a_design(kind="random", points=4):
+    """A sweep over random gains."""
     grid = {"controller.K2": ij.uniform(1.0, 2.0)}
     return ij.sweep(WEAK, grid, design=ij.studies.Design(kind, points), duration=0.01)
 
@@ -177,9 +185,48 @@ def call(entry: str, **changed: Any) -> Any:
 
 @functools.cache
 def results() -> dict[str, Any]:
-    """One result of every kind: a run that no simulator made, and what is in files."""
-    found = {kind: stored(f"{cls.__name__}_0") for kind, cls in KINDS.items() if kind != "run"}
-    return found | {"run": made_up(WEAK.plant, duration=0.1)}
+    """One result of every kind, which no simulator made."""
+    run = made_up(WEAK.plant, duration=0.1)
+    options = RunOptions(duration=0.01, dt=1e-3, method="rk4", backend="vmap", runs=4, seed=0)
+    ways = {"controller.K2": ij.factor(ij.uniform(0.9, 1.1))}
+    with without_runs():
+        setup = prepare(WEAK, ways, options, metrics=None)
+    values = {"margin": np.full((4, 2), 0.1), "rmse": np.full((4, 2), 0.01)}
+    found = Metrics(values, (("margin", "rad"), ("rmse", "rad")))
+    samples = {"controller.K2": np.full((4, 2), 20.0)}
+    study = ij.Study(WEAK, found, np.zeros(4, np.int32), np.ones(4), samples, setup)
+    history = {
+        "valid": np.ones((1, 1), bool),
+        "x": np.full((1, 1, 2), 20.0),
+        "objective": np.ones((1, 1)),
+        "evaluations": np.ones(1, int),
+    }
+    setup = TuneSetup(
+        duration=0.01,
+        perturbations={},
+        risk=as_risk("mean"),
+        objective=TRACKING,
+        report=ij.tuning.Report(runs=4, seed=1),
+        limits=((1.0, 100.0), (1.0, 100.0)),
+    )
+    names = ("controller.K2[0]", "controller.K2[1]")
+    best = {"controller.K2": np.full(2, 20.0)}
+    words = ("done", "newton", "forward", 1.0)
+    tuned = ij.TuneResult(WEAK, WEAK, best, names, history, 0, *words, setup)
+    vars(tuned)["nominal"] = (run, run)
+    twos, (blocks, _) = np.ones((2, 2)), layout(WEAK, ["controller.K2"], 1e-3, "rk4")
+    return {
+        "run": run,
+        "study": study,
+        "tuning": tuned,
+        "front": ij.ParetoFront(
+            ("a", "b"), twos, twos, names, twos, twos[0], WEAK, blocks, twos, 1.0
+        ),
+        "attack": ij.WorstCase(
+            *(WEAK, {}, 0.1, 0.1, 0, twos, 4, {"duration": 0.01, "dt": 1e-3, "method": "rk4"})
+        ),
+        "comparison": ij.Comparison({"log": run}, {}, {}, {}, {"log": "K2 = 20"}),
+    }
 
 
 OF_METHODS = {
@@ -214,6 +261,7 @@ def methods() -> dict[str, list[str]]:
 
 
 def call_method(method: str, **changed: Any) -> Any:
+    """Calls a method of a result with arguments that are fine, except for what is changed."""
     kind, _, name = method.partition(".")
     function = getattr(results()[kind], name)
     needed = [x for x in inspect.signature(function).parameters.values() if x.default is x.empty]
@@ -229,6 +277,8 @@ for _ in range(5000):
 
 
 class Broken:
+    """Nothing can be asked of it."""
+
     def __bool__(self):
         raise RuntimeError
 
