@@ -1,8 +1,6 @@
 """Arms that several test files look at: real ones from tests/data/arms, random chains, and the same
 chains as MuJoCo's MJCF."""
 
-from __future__ import annotations
-
 import numpy as np
 from conftest import ROOT
 
@@ -24,10 +22,8 @@ def random_inertia(rng) -> np.ndarray:
 def random_arm(n: int, seed: int, prismatic: float = 0.3, **fields) -> ij.robots.Arm:
     """A chain of n links with nothing aligned, and a load at its tip."""
     rng = np.random.default_rng(seed)
-    kinds = tuple(
-        "prismatic" if x < prismatic else "revolute"
-        for x in np.random.default_rng(n).uniform(size=n)
-    )  # compiled once for an n
+    is_prismatic = np.random.default_rng(n).uniform(size=n) < prismatic  # compiled once for an n
+    kinds = tuple("prismatic" if x else "revolute" for x in is_prismatic)
     carried = ij.robots.Payload(
         mass=rng.uniform(0.1, 1), centre=rng.normal(size=3) * 0.1, inertia=random_inertia(rng)
     )
@@ -51,6 +47,10 @@ def _words(values) -> str:
     return " ".join(repr(float(x)) for x in np.ravel(values))
 
 
+def _place(position, rotation) -> str:
+    return f'pos="{_words(position)}" quat="{_words(rotation)}"'
+
+
 def _inertial(mass, centre, inertia) -> str:
     place = f'pos="{_words(centre)}" mass="{_words(mass)}"'
     return f'<inertial {place} fullinertia="{_words(inertia)}"/>'
@@ -58,10 +58,7 @@ def _inertial(mass, centre, inertia) -> str:
 
 def as_mjcf(arm: ij.robots.Arm) -> str:
     """The same arm, written by hand for MuJoCo, what it carries as a body of its own."""
-    carried, tip = (
-        arm.carried,
-        f'pos="{_words(arm.tip_position)}" quat="{_words(arm.tip_rotation)}"',
-    )
+    carried, tip = arm.carried, _place(arm.tip_position, arm.tip_rotation)
     inner = f'<site name="tip" {tip}/>'
     if carried.mass > 0.0:
         inertial = _inertial(carried.mass, carried.centre, carried.inertia)
@@ -73,13 +70,11 @@ def as_mjcf(arm: ij.robots.Arm) -> str:
             f' armature="{_words(arm.armature[i])}" damping="{_words(arm.damping[i])}"'
             f' frictionloss="{_words(arm.friction[i])}"/>'
         )
-        place = f'pos="{_words(arm.position[i])}" quat="{_words(arm.rotation[i])}"'
+        place = _place(arm.position[i], arm.rotation[i])
         inertial = _inertial(arm.mass[i], arm.centre[i], arm.inertia[i])
         inner = f'<body name="{arm.links[i]}" {place}>{joint}{inertial}{inner}</body>'
-    return (
-        '<mujoco><compiler angle="radian"/><option'
-        f' gravity="{_words(arm.g)}"/><worldbody>{inner}</worldbody></mujoco>'
-    )
+    options = f'<compiler angle="radian"/><option gravity="{_words(arm.g)}"/>'
+    return f"<mujoco>{options}<worldbody>{inner}</worldbody></mujoco>"
 
 
 def without_constraints(model):
@@ -106,17 +101,19 @@ def dynamics_of(model, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.nda
     return M, data.qfrc_bias.copy()
 
 
+def light_loop() -> ij.Scenario:
+    """The paper's arm under a law that compiles sooner than the paper's."""
+    law, observer = ij.controllers.PDGravity(Kp=60.0, Kd=20.0), ij.observers.NoObserver()
+    return ij.with_parts(ij.presets.zhang_yan_2024(), controller=law, observer=observer)
+
+
 def loop_on(arm, law, **parts) -> ij.Scenario:
     """A law on the arm of an `independent.Loop`, which follows a sinusoid inside wide bounds."""
     numbers = arm.mass, arm.length, arm.centre, arm.inertia
     plant = ij.robots.TwoLink(*numbers, g=arm.g)
-    values = {"initial": ij.Initial(q=[0.45, 0.2], dq=[0.1, 0.2])} | parts
-    return canonical(
-        ij.Scenario(
-            plant=plant,
-            reference=ij.references.Sinusoid(0.3, 0.2, 1.5, phase=[0.0, 0.4]),
-            bounds=ij.Bounds(lower=ij.bounds.Constant(-0.5), upper=ij.bounds.Constant(1.5)),
-            controller=law,
-            **values,
-        )
-    )
+    values = {
+        "reference": ij.references.Sinusoid(0.3, 0.2, 1.5, phase=[0.0, 0.4]),
+        "bounds": ij.Bounds(lower=ij.bounds.Constant(-0.5), upper=ij.bounds.Constant(1.5)),
+        "initial": ij.Initial(q=[0.45, 0.2], dq=[0.1, 0.2]),
+    }
+    return canonical(ij.Scenario(plant=plant, controller=law, **(values | parts)))

@@ -1,7 +1,5 @@
 """Scalar programs that NumPy runs, operation by operation: no compiler is needed."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any

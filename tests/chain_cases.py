@@ -1,10 +1,9 @@
 """The scenarios of iblf_jax that describe the closed loops of `independent_chains`."""
 
-from __future__ import annotations
-
 import independent_chains as other
 import jax
 import jax.numpy as jnp
+from loops_of_plants import MotorPendulum
 
 import iblf_jax as ij
 from iblf_jax import barriers, bounds, controllers, disturbances, plants, references
@@ -17,7 +16,6 @@ BARRIERS = {
 
 
 def _side(side):
-    """A side of the independent program in the package's terms."""
     kind = bounds.Sinusoid if isinstance(side, other.Sine) else bounds.Funnel
     return kind(**vars(side))
 
@@ -27,44 +25,21 @@ def bounds_of(case: other.Case) -> tuple:
     return tuple(pair and ij.Bounds(*map(_side, pair)) for pair in case.bounds)
 
 
-def _table_drift(t, x):
+def _waves(coefficients, t, x):
     z = jnp.concatenate([jnp.stack([jnp.ones_like(t), t]), x.reshape(-1)])
-    return other.DRIFT_SIZE * jnp.sin(jnp.sum(other.DRIFT_WAVE * z, axis=-1))
+    return jnp.sin(jnp.sum(coefficients * z, axis=-1))
+
+
+def _table_drift(t, x):
+    return other.DRIFT_SIZE * _waves(other.DRIFT_WAVE, t, x)
 
 
 def _table_gain(t, x):
-    z = jnp.concatenate([jnp.stack([jnp.ones_like(t), t]), x.reshape(-1)])
-    waves = jnp.sin(jnp.sum(other.GAIN_WAVE * z, axis=-1))
-    return other.GAIN_CENTRE + other.GAIN_SIZE * waves
+    return other.GAIN_CENTRE + other.GAIN_SIZE * _waves(other.GAIN_WAVE, t, x)
 
 
-@ij.component
-class Pendulum:
-    """x1' = x2,  D x2' = x3 - B x2 - N sin x1,  M x3' = u - H x3 - Km x2."""
-
-    D: ij.Leaf = ij.leaf("kg m^2", shape="scalar", sign="positive")
-    B: ij.Leaf = ij.leaf("N m s/rad", shape="scalar")
-    N: ij.Leaf = ij.leaf("N m", shape="scalar")
-    M: ij.Leaf = ij.leaf("s", shape="scalar", sign="positive")
-    H: ij.Leaf = ij.leaf("1", shape="scalar")
-    Km: ij.Leaf = ij.leaf("N m s/rad", shape="scalar")
-    n = 1
-    order = 3
-
-    def drift(self, t: jax.Array, x: jax.Array) -> jax.Array:
-        """f_1, f_2, f_3."""
-        second = -(self.B * x[1] + self.N * jnp.sin(x[0])) / self.D
-        third = -(self.H * x[2] + self.Km * x[1]) / self.M
-        return jnp.stack([jnp.zeros_like(x[0]), second, third])
-
-    def gain(self, t: jax.Array, x: jax.Array) -> jax.Array:
-        """G_1, G_2, G_3, diagonal."""
-        return jnp.stack([jnp.ones(()), 1.0 / self.D, 1.0 / self.M])[:, None]
-
-
-def pendulum() -> Pendulum:
-    """The pendulum with a motor of the independent program."""
-    return Pendulum(D=other.D, B=other.B, N=other.N, M=other.M, H=other.H, Km=other.KM)
+def pendulum() -> MotorPendulum:
+    return MotorPendulum(D=other.D, B=other.B, N=other.N, M=other.M, H=other.H, Km=other.KM)
 
 
 PLANTS = {
@@ -80,20 +55,14 @@ PLANTS = {
 }
 
 
-def _sinusoids(rows):
-    return disturbances.Sinusoids(**rows)
-
-
 def _disturbance(name: str):
     if name == "flexible":
-        return _sinusoids(vars(other.JOINT_TORQUE))
-    if name == "pendulum":
-        rows = vars(other.PENDULUM_DISTURBANCE)
-        parts = [_sinusoids({key: [value[i]] for key, value in rows.items()}) for i in (0, 1)]
-        return disturbances.Levels((None, *parts))
-    rows = other.COUPLED_DISTURBANCE
-    levels = ({key: value[i] for key, value in rows.items()} for i in range(3))
-    return disturbances.Levels(tuple(_sinusoids(level) for level in levels))
+        return disturbances.Sinusoids(**vars(other.JOINT_TORQUE))
+    is_pendulum = name == "pendulum"
+    rows = vars(other.PENDULUM_DISTURBANCE) if is_pendulum else other.COUPLED_DISTURBANCE
+    levels = [dict(zip(rows, numbers, strict=True)) for numbers in zip(*rows.values(), strict=True)]
+    parts = [disturbances.Sinusoids(**level) for level in levels]
+    return disturbances.Levels((None, *parts) if is_pendulum else tuple(parts))
 
 
 @jax.jit

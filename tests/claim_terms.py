@@ -1,7 +1,5 @@
 """The terms of all claims about a scenario at one of its states."""
 
-from __future__ import annotations
-
 import jax
 
 from iblf_jax.certificates.claims import claims_of

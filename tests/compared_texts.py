@@ -1,7 +1,5 @@
 """Texts whose words must be equal, and whose numbers may differ by rounding."""
 
-from __future__ import annotations
-
 import math
 import re
 
@@ -33,15 +31,10 @@ def same_number(found: str, stored: str, digits: int | None) -> bool:
     if size < ROUNDING:
         return True
     if digits is None:
-        digits = max(3, *(_significant(x) for x in (found, stored)))
+        mantissas = (x.split("e")[0].lstrip("+-").replace(".", "") for x in (found, stored))
+        digits = max(3, *(len(x.lstrip("0")) for x in mantissas))
     last = 10.0 ** (math.floor(math.log10(size)) + 1 - digits)
     return abs(a - b) <= 1.01 * last + ROUNDING * 1e-3
-
-
-def _significant(number: str) -> int:
-    """How many digits of a number are printed, from the first one that is not 0."""
-    mantissa = number.split("e")[0].lstrip("+-")
-    return len(mantissa.replace(".", "").lstrip("0"))
 
 
 def same_text(found: str, stored: str, digits: int | None = None) -> bool:
@@ -68,6 +61,5 @@ def same_row(found: str, stored: str) -> bool:
 
 
 def _is_rounding(cell: str) -> bool:
-    """Whether a cell of a table is a number that is rounding only."""
     number = NUMBER.match(cell)
     return number is not None and abs(float(number.group())) < ROUNDING

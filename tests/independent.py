@@ -6,8 +6,6 @@ barrier and either variant, its observer.  alpha' is derived by hand here, and b
 differentiation there.  Programs of other laws take the arm, the bounds and alpha from here.
 """
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import dataclass, field
 from typing import NamedTuple

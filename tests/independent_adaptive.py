@@ -5,8 +5,6 @@ hand, and so are the rates of all weights.  Bounds, reference and alpha are thos
 `independent.Loop`.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

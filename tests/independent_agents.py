@@ -18,8 +18,6 @@ mu beta' = alpha - beta, and beta and (d_i + b_i) in the place of alpha and H^T.
 alpha' is the imaginary part of one complex step, which is exact to rounding.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 ADJACENCY = np.array([[0, 0, 0.5, 0], [1, 0, 0, 0], [0, 0.8, 0, 0.3], [0, 0, 1.2, 0]], float)
@@ -39,7 +37,6 @@ W1 = np.array([1.0, 0.7, 1.2, 0.4])
 W2 = np.array([0.9, 1.1, 1.0, 1.3])
 MU = np.array([0.02, 0.03, 0.025, 0.015])
 P0 = np.array([0.2, 0.3, 0.1, 0.25])
-
 M = INERTIA + MASS * CENTRE**2
 
 
@@ -61,28 +58,21 @@ def first_level(t, y):
 
 
 def input_with_graph(t, y, v):
-    """u and alpha of the law that knows the graph."""
+    """u of the law that knows the graph."""
     h = 1e-30
 
     def alpha(t, y):
         return np.linalg.solve(H, first_level(t, y)[0])
 
-    now = alpha(t, y)
     dalpha = alpha(t + 1j * h, y + 1j * h * (H @ v)).imag / h
-    s = first_level(t, y)[1]
-    rate = dalpha - K2 * (v - now) - H.T @ (W1 * s) / W2
-    return M * rate + gravity(np.linalg.solve(H, y)), now
-
-
-def distributed_alpha(t, y, v):
-    """(a_i + sum_j a_ij v_j)/(d_i + b_i)."""
-    return (first_level(t, y)[0] + ADJACENCY @ v) / DEGREES
+    rate = dalpha - K2 * (v - alpha(t, y)) - H.T @ (W1 * first_level(t, y)[1]) / W2
+    return M * rate + gravity(np.linalg.solve(H, y))
 
 
 def distributed_input(t, y, v, beta):
     """u and beta' of the distributed law."""
-    dbeta = (distributed_alpha(t, y, v) - beta) / MU
-    s = first_level(t, y)[1]
+    a, s = first_level(t, y)
+    dbeta = ((a + ADJACENCY @ v) / DEGREES - beta) / MU
     rate = dbeta - K2 * (v - beta) - DEGREES * W1 * s / W2
     return M * rate + gravity(np.linalg.solve(H, y)), dbeta
 
@@ -93,6 +83,6 @@ def field(t, state, distributed):
     if distributed:
         u, dbeta = distributed_input(t, y, v, state[8:])
     else:
-        u, dbeta = input_with_graph(t, y, v)[0], np.zeros(0)
+        u, dbeta = input_with_graph(t, y, v), np.zeros(0)
     acceleration = (u - gravity(np.linalg.solve(H, y))) / M
     return np.concatenate([H @ v, acceleration, dbeta])

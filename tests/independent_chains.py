@@ -19,9 +19,6 @@ Shapes, with T times: x, d_hat and alpha are (T, r, n), where alpha_r = u; beta 
 present for the dynamic surface only; u is (T, n); V = sum w_i V_i is (T,).
 """
 
-from __future__ import annotations
-
-import cmath
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -42,15 +39,14 @@ HALF_PI = math.pi / 2
 class Series:
     """A truncated power series in time, c[0] + c[1] h + c[2] h^2 + ...
 
-    The coefficients are real, complex, or numbers of mpmath.  An operation on two series keeps the
-    terms that both have; a plain number is a series without an end.
+    The coefficients are arrays of one shape, of real, complex or mpmath's numbers.  An operation on
+    two series keeps the terms that both have; an array is a series without an end.
     """
 
     __array_ufunc__ = None
-    __slots__ = ("c",)
 
     def __init__(self, coefficients):
-        self.c = list(coefficients)
+        self.c = np.asarray(coefficients)
 
     def rate(self):
         """The derivative in time, which has one term less."""
@@ -60,13 +56,30 @@ class Series:
         """The integral over time that begins at `start`; it has one term more."""
         return Series([start, *(c / (k + 1) for k, c in enumerate(self.c))])
 
-    def __add__(self, other):
+    def sum(self, axis):
+        return Series(self.c.sum(axis))
+
+    @property
+    def T(self):
+        return Series(np.swapaxes(self.c, -1, -2))
+
+    def __len__(self):
+        return self.c.shape[1]
+
+    def __getitem__(self, i):
+        return Series(self.c[:, i])
+
+    def _terms(self, other):
+        """The coefficients of an operand."""
         if isinstance(other, Series):
-            return Series([a + b for a, b in zip(self.c, other.c, strict=False)])
-        return Series([self.c[0] + other, *self.c[1:]])
+            return other.c
+        return [other, *[0.0 * other] * (len(self.c) - 1)]
+
+    def __add__(self, other):
+        return Series([a + b for a, b in zip(self.c, self._terms(other), strict=False)])
 
     def __neg__(self):
-        return Series([-a for a in self.c])
+        return Series(-self.c)
 
     def __sub__(self, other):
         return self + (-other)
@@ -75,33 +88,30 @@ class Series:
         return (-self) + other
 
     def __mul__(self, other):
-        if not isinstance(other, Series):
-            return Series([a * other for a in self.c])
-        a, b = self.c, other.c
-        return Series([_product_term(a, b, k) for k in range(min(len(a), len(b)))])
+        a, b = self.c, self._terms(other)
+        shorter = range(min(len(a), len(b)))
+        return Series([sum(a[j] * b[k - j] for j in range(k + 1)) for k in shorter])
 
     def __truediv__(self, other):
-        if not isinstance(other, Series):
-            return Series([a / other for a in self.c])
-        quotient = []
-        for k in range(min(len(self.c), len(other.c))):
-            known = sum(quotient[j] * other.c[k - j] for j in range(k))
-            quotient.append((self.c[k] - known) / other.c[0])
+        quotient, b = [], self._terms(other)
+        for k, a in enumerate(self.c[: len(b)]):
+            quotient.append((a - sum(quotient[j] * b[k - j] for j in range(k))) / b[0])
         return Series(quotient)
 
     def __rtruediv__(self, other):
-        return Series([other] + [0.0] * (len(self.c) - 1)) / self
+        return Series(self._terms(other)) / self
 
     __radd__ = __add__
     __rmul__ = __mul__
 
 
-def _product_term(a, b, k):
-    """Coefficient k of a product of two series."""
-    total = a[0] * b[k]
-    for j in range(1, k + 1):
-        total = total + a[j] * b[k - j]
-    return total
+def stack(parts):
+    """The array of numbers, or the series, of nested lists of these."""
+    parts = [stack(x) if isinstance(x, list) else x for x in parts]
+    if not isinstance(parts[0], Series):
+        return np.array(parts)
+    terms = min(len(x.c) for x in parts)
+    return Series(np.stack([x.c[:terms] for x in parts], axis=1))
 
 
 def clock(t, terms):
@@ -110,10 +120,10 @@ def clock(t, terms):
 
 
 def _elementary(name, x):
-    """An elementary function of a real, a complex or an mpmath number."""
-    if isinstance(x, mpmath.mpf):
-        return getattr(mpmath, name)(x)
-    return getattr(cmath if isinstance(x, complex) else math, name)(x)
+    """An elementary function of real, complex or mpmath's numbers."""
+    if np.asarray(x).dtype == object:
+        return np.frompyfunc(getattr(mpmath, name), 1, 1)(x)
+    return getattr(np, name)(x)
 
 
 def sin_cos(x):
@@ -122,9 +132,8 @@ def sin_cos(x):
         return _elementary("sin", x), _elementary("cos", x)
     sines, cosines = [_elementary("sin", x.c[0])], [_elementary("cos", x.c[0])]
     for k in range(1, len(x.c)):
-        known = [(j * x.c[j], sines[k - j], cosines[k - j]) for j in range(1, k + 1)]
-        sines.append(sum(v * c for v, _, c in known) / k)
-        cosines.append(-sum(v * s for v, s, _ in known) / k)
+        sines.append(sum(j * x.c[j] * cosines[k - j] for j in range(1, k + 1)) / k)
+        cosines.append(-sum(j * x.c[j] * sines[k - j] for j in range(1, k + 1)) / k)
     return Series(sines), Series(cosines)
 
 
@@ -150,28 +159,19 @@ def log(x):
     """ln x, the integral of x'/x."""
     if not isinstance(x, Series):
         return _elementary("log", x)
-    start = _elementary("log", x.c[0])
-    return (x.rate() / x).integral(start) if len(x.c) > 1 else Series([start])
-
-
-# --- Small matrices, as lists of rows -------------------------------------------------------------
+    return (x.rate() / x).integral(_elementary("log", x.c[0]))
 
 
 def times(matrix, vector):
-    return [sum(a * b for a, b in zip(row, vector, strict=True)) for row in matrix]
-
-
-def transpose(matrix):
-    return [list(column) for column in zip(*matrix, strict=True)]
+    return (matrix * vector).sum(-1)
 
 
 def solve(matrix, vector):
     """The solution of a linear system of one or two equations, by Cramer's rule."""
-    if len(vector) == 1:
-        return [vector[0] / matrix[0][0]]
+    if len(matrix) == 1:
+        return vector / matrix[0]
     (a, b), (c, d) = matrix
-    det = a * d - b * c
-    return [(d * vector[0] - b * vector[1]) / det, (a * vector[1] - c * vector[0]) / det]
+    return stack([d * vector[0] - b * vector[1], a * vector[1] - c * vector[0]]) / (a * d - b * c)
 
 
 # --- Signals --------------------------------------------------------------------------------------
@@ -179,38 +179,36 @@ def solve(matrix, vector):
 
 @dataclass(frozen=True)
 class Sine:
-    """offset + amplitude sin(frequency t + phase), each field one number per component."""
+    """offset + amplitude sin(frequency t + phase), each field a number, or one per component."""
 
-    offset: tuple
-    amplitude: tuple
-    frequency: tuple
-    phase: tuple
+    offset: tuple | float
+    amplitude: tuple | float
+    frequency: tuple | float
+    phase: tuple | float
 
     def at(self, t, reference=None):
-        """The values at a time or a series of time."""
-        rows = zip(self.offset, self.amplitude, self.frequency, self.phase, strict=True)
-        return [a + b * sin(c * t + d) for a, b, c, d in rows]
+        offset, amplitude, frequency, phase = map(np.array, vars(self).values())
+        return offset + amplitude * sin(frequency * t + phase)
 
 
 @dataclass(frozen=True)
 class Funnel:
     """The reference plus (initial - final) exp(-rate t) + final, with signed distances."""
 
-    initial: tuple
-    final: tuple
-    rate: tuple
+    initial: float
+    final: float
+    rate: float
 
     def at(self, t, reference):
-        """The values at a time or a series of time."""
-        rows = zip(reference, self.initial, self.final, self.rate, strict=True)
-        return [r + (a - b) * exp(-c * t) + b for r, a, b, c in rows]
+        initial, final, rate = map(np.array, vars(self).values())
+        return reference + (initial - final) * exp(-rate * t) + final
 
 
 # --- Barriers -------------------------------------------------------------------------------------
 
 
 class Tube(NamedTuple):
-    """One component of a level: its error, the motion of alpha, and the distances to its bounds."""
+    """One level: its error, the motion of alpha, and the distances to its bounds."""
 
     e: Any
     dalpha: Any
@@ -226,7 +224,6 @@ class Terms(NamedTuple):
     V: Any
     s: Any
     a: Any
-    decay: Any
     ratio: Any
     """e/s; None for a barrier that is used on level 1 only."""
 
@@ -239,8 +236,7 @@ def mapping(tube, k):
     z = e * z_over_e
     z_e = k_l * k_u * (k_l * k_u + e * e) / (room * room)
     z_t = z * e * (dk_l / (k_l * (k_l + e)) - dk_u / (k_u * (k_u - e)))
-    a = dalpha - (k * z + z_t) / z_e
-    return Terms(0.5 * z * z, z * z_e, a, k * z * z, 1.0 / (z_over_e * z_e))
+    return Terms(0.5 * z * z, z * z_e, dalpha - (k * z + z_t) / z_e, 1.0 / (z_over_e * z_e))
 
 
 def prescribed_performance(tube, k):
@@ -251,13 +247,12 @@ def prescribed_performance(tube, k):
     eps_l = 0.5 * (1.0 / (k_l + e) - 1.0 / k_l)
     eps_u = 0.5 * (1.0 / k_u - 1.0 / (k_u - e))
     a = dalpha - (k * eps + eps_l * dk_l + eps_u * dk_u) / eps_e
-    return Terms(0.5 * eps * eps, eps * eps_e, a, k * eps * eps, None)
+    return Terms(0.5 * eps * eps, eps * eps_e, a, None)
 
 
 def quadratic(tube, k):
     """V = 1/2 e^2, for a level without bounds."""
-    e, dalpha = tube.e, tube.dalpha
-    return Terms(0.5 * e * e, e, dalpha - k * e, k * e * e, 1.0)
+    return Terms(0.5 * tube.e * tube.e, tube.e, tube.dalpha - k * tube.e, 1.0)
 
 
 # --- The law --------------------------------------------------------------------------------------
@@ -265,12 +260,12 @@ def quadratic(tube, k):
 
 @dataclass(frozen=True)
 class Case:
-    """One closed loop.  Rows of k, w and x0 are the levels, columns the n components."""
+    """One closed loop.  Entries of k, w and x0 are the levels, and n numbers each, or one."""
 
     order: int
     n: int
     drift: Callable
-    """(i, t, x) -> f_{i+1}, n numbers or series; i counts from 0."""
+    """(i, t, x) -> f_{i+1}, n numbers or a series of them; i counts from 0."""
     gain: Callable
     """(i, t, x) -> G_{i+1}, n rows of n."""
     disturbance: Callable
@@ -294,78 +289,47 @@ class Case:
 
 def model_rate(case, i, t, x, d_hat):
     """f_i + G_i x_{i+1} + d_hat_i, without the last level."""
-    flow = times(case.gain(i, t, x), x[i + 1])
-    return [f + g + d for f, g, d in zip(case.drift(i, t, x), flow, d_hat[i], strict=True)]
+    return case.drift(i, t, x) + times(case.gain(i, t, x), x[i + 1]) + d_hat[i]
 
 
 def model_series(case, t, x, d_hat, levels):
     """The first states as series along the model's flow: level i has `levels` - i + 1 terms."""
-    series = [[Series([value]) for value in row] for row in x]
+    series = [Series([row]) for row in x]
     for terms in range(1, levels):
         now = clock(t, terms)
         rates = [model_rate(case, i, now, series, d_hat) for i in range(levels - terms)]
-        for i, rate in enumerate(rates):
-            series[i] = [p.integral(start) for p, start in zip(rate, x[i], strict=True)]
+        series[: len(rates)] = [p.integral(row) for p, row in zip(rates, x, strict=False)]
     return series
 
 
-def tubes_of(x, alpha, dalpha, sides):
-    """The tubes of one level's components; `sides` holds (lower, lower', upper, upper')."""
+def tube_of(x, alpha, dalpha, sides):
+    """The tube of a level; `sides` are the lower and the upper one, or None."""
     if sides is None:
-        return [Tube(q - a, da, *[None] * 4) for q, a, da in zip(x, alpha, dalpha, strict=True)]
-    return [
-        Tube(q - a, da, a - low, up - a, da - dlow, dup - da)
-        for q, a, da, low, dlow, up, dup in zip(x, alpha, dalpha, *sides, strict=True)
-    ]
+        return Tube(x - alpha, dalpha, *[None] * 4)
+    low, up = sides
+    return Tube(x - alpha, dalpha, alpha - low, up - alpha, dalpha - low.rate(), up.rate() - dalpha)
 
 
-def level(case, i, t, x, d_hat, tubes, below):
-    """alpha_{i+1} and the terms of its barriers; `below` are those of the level below."""
-    barrier = case.barriers[i]
-    gains = case.k[i]
+def level(case, i, t, x, d_hat, tube, below):
+    """alpha_{i+1} and the terms of its barrier; `below` are those of the level below."""
+    barrier, k = case.barriers[i], np.array(case.k[i])
     if case.decays is not None:
-        values = [barrier(tube, k).V for tube, k in zip(tubes, gains, strict=True)]
-        gains = [k + case.decays[i].gain(t, V) for k, V in zip(gains, values, strict=True)]
-    terms = [barrier(tube, k) for tube, k in zip(tubes, gains, strict=True)]
-    wanted = [p.a - case.c[i] * p.s for p in terms]
+        k = k + case.decays[i].gain(t, barrier(tube, k).V)
+    terms = barrier(tube, k)
+    wanted = terms.a - case.c[i] * terms.s
     if below is not None:
-        weighted = [w * p.s for w, p in zip(case.w[i - 1], below, strict=True)]
-        exchange = times(transpose(case.gain(i - 1, t, x)), weighted)
-        wanted = [
-            a - p.ratio / w * g
-            for a, p, w, g in zip(wanted, terms, case.w[i], exchange, strict=True)
-        ]
-    known = [f + d for f, d in zip(case.drift(i, t, x), d_hat[i], strict=True)]
-    rest = [a - b for a, b in zip(wanted, known, strict=True)]
-    return solve(case.gain(i, t, x), rest), terms
+        exchange = times(case.gain(i - 1, t, x).T, np.array(case.w[i - 1]) * below.s)
+        wanted = wanted - terms.ratio / np.array(case.w[i]) * exchange
+    return solve(case.gain(i, t, x), wanted - (case.drift(i, t, x) + d_hat[i])), terms
 
 
 class Control(NamedTuple):
-    """The law at one state; lists over the levels, then over the components."""
+    """The law at one state; lists over the levels of arrays of the components."""
 
     alpha: list
     V: Any
     """sum w_i V_i."""
     s: list
-    decay: Any
-    """sum w_i decay_i + sum c_i w_i s_i^2."""
-
-
-def sides_of(case, i, now, reference):
-    """Lower and upper side of a level with their rates, as `tubes_of` wants them."""
-    if case.bounds[i] is None:
-        return None
-    lower, upper = (side.at(now, reference) for side in case.bounds[i])
-    return lower, [p.rate() for p in lower], upper, [p.rate() for p in upper]
-
-
-def shifted(tubes, shift):
-    """The tubes of the last level with lambda and its assumed rate in the error only."""
-    values, rates = shift
-    return [
-        tube._replace(e=tube.e - value, dalpha=tube.dalpha + rate)
-        for tube, value, rate in zip(tubes, values, rates, strict=True)
-    ]
 
 
 def law(case, t, x, d_hat, beta=None, levels=None, shift=None):
@@ -376,136 +340,87 @@ def law(case, t, x, d_hat, beta=None, levels=None, shift=None):
     arguments.
     """
     levels = case.order if levels is None else levels
-    now = clock(t, levels + 1)
-    if case.filter is None:
-        states = model_series(case, t, x, d_hat, levels)
-    else:
-        states = [[Series([value]) for value in row] for row in x]
+    now, d_hat = clock(t, levels + 1), np.array(d_hat)
+    # The filters take the derivatives of the virtual controls: the states need no rates.
+    states = model_series(case, t, x, d_hat, levels if case.filter is None else 1)
     reference = case.reference.at(now)
-    alpha, dalpha, terms = reference, [p.rate() for p in reference], None
-    alphas, slopes, V, decay = [], [], 0.0, 0.0
+    alpha, dalpha, terms = reference, reference.rate(), None
+    alphas, slopes, V = [], [], 0.0
     for i in range(levels):
-        tubes = tubes_of(states[i], alpha, dalpha, sides_of(case, i, now, reference))
+        sides = case.bounds[i] and [side.at(now, reference) for side in case.bounds[i]]
+        tube = tube_of(states[i], alpha, dalpha, sides)
         if shift is not None and i == case.order - 1:
-            tubes = shifted(tubes, shift)
-        alpha, terms = level(case, i, now, states, d_hat, tubes, terms)
-        alphas.append([p.c[0] for p in alpha])
-        slopes.append([p.s.c[0] for p in terms])
-        for w, p in zip(case.w[i], terms, strict=True):
-            V = V + w * p.V.c[0]
-            decay = decay + w * (p.decay.c[0] + case.c[i] * p.s.c[0] * p.s.c[0])
+            tube = tube._replace(e=tube.e - shift[0], dalpha=tube.dalpha + shift[1])
+        alpha, terms = level(case, i, now, states, d_hat, tube, terms)
+        alphas.append(alpha.c[0])
+        slopes.append(terms.s.c[0])
+        V = V + (np.array(case.w[i]) * terms.V.c[0]).sum()
         if i == levels - 1:
             break
         if case.filter is None:
-            dalpha = [p.rate() for p in alpha]
+            dalpha = alpha.rate()
         else:
-            alpha = [Series([b]) for b in beta[i]]
-            dalpha = [Series([r]) for r in filter_rate(case, i, alphas[i], beta[i])]
-    return Control(alphas, V, slopes, decay)
+            alpha, dalpha = Series([beta[i]]), Series([filter_rate(case, i, alphas[i], beta[i])])
+    return Control(alphas, V, slopes)
 
 
 def filter_rate(case, i, alpha, beta):
     """beta' = (alpha - beta)/mu of the dynamic surface."""
-    return [(a - b) / case.filter[i] for a, b in zip(alpha, beta, strict=True)]
-
-
-def filter_start(case, t, x, d_hat):
-    """The filters' outputs at the virtual controls of the law without filters."""
-    return law(replace(case, filter=None), t, x, d_hat).alpha[:-1]
+    return (alpha - beta) / case.filter[i]
 
 
 # --- The closed loop ------------------------------------------------------------------------------
 
 
 def unpack(case, y):
-    """x, eta and beta from the state of the loop; beta is empty without filters."""
-    rows = [y[j : j + case.n] for j in range(0, len(y), case.n)]
-    return rows[: case.order], rows[case.order : 2 * case.order], rows[2 * case.order :]
-
-
-def estimates(case, x, eta):
-    """d_hat_j = eta_j + kappa_j x_j."""
-    return [
-        [p + kappa * q for p, q in zip(rows, values, strict=True)]
-        for rows, values, kappa in zip(eta, x, case.kappa, strict=True)
-    ]
+    """x, d_hat_j = eta_j + kappa_j x_j and beta from the state of the loop; beta is empty without
+    filters."""
+    x, eta, beta = np.split(y.reshape(-1, case.n), [case.order, 2 * case.order])
+    return x, eta + np.array(case.kappa)[:, None] * x, beta
 
 
 def flow(case, t, x, u):
     """f_i + G_i x_{i+1} of every level."""
-    zero = [[0.0] * case.n] * case.order
-    chain = [*x, u]
-    return [model_rate(case, i, t, chain, zero) for i in range(case.order)]
-
-
-def add(a, b, scale=1.0):
-    """a + scale b, for rows of numbers."""
-    return [
-        [p + scale * q for p, q in zip(rows, others, strict=True)]
-        for rows, others in zip(a, b, strict=True)
-    ]
+    chain, zero = [Series([row]) for row in (*x, u)], np.zeros(case.order)
+    return np.array([model_rate(case, i, t, chain, zero).c[0] for i in range(case.order)])
 
 
 def loop_rate(case, t, y):
-    """The rate of (x, eta, beta)."""
-    x, eta, beta = unpack(case, y)
-    d_hat = estimates(case, x, eta)
+    x, d_hat, beta = unpack(case, y)
     alpha = law(case, t, x, d_hat, beta).alpha
     known = flow(case, t, x, alpha[-1])
-    dx = add(known, case.disturbance(t, x))
-    deta = [
-        [-kappa * (p + d) for p, d in zip(rows, estimate, strict=True)]
-        for rows, estimate, kappa in zip(known, d_hat, case.kappa, strict=True)
-    ]
+    deta = -np.array(case.kappa)[:, None] * (known + d_hat)
     dbeta = [filter_rate(case, i, alpha[i], b) for i, b in enumerate(beta)]
-    return [v for row in dx + deta + dbeta for v in row]
+    return np.concatenate([known + case.disturbance(t, x), deta, dbeta], axis=None)
 
 
 def start(case):
-    """(x, eta, beta) at t = 0, with d_hat = 0 and beta = alpha."""
-    x = [list(row) for row in case.x0]
-    eta = [[-kappa * q for q in row] for row, kappa in zip(x, case.kappa, strict=True)]
-    beta = []
-    if case.filter is not None:
-        beta = filter_start(case, 0.0, x, [[0.0] * case.n] * case.order)
-    return [v for row in x + eta + beta for v in row]
+    """(x, eta, beta) at t = 0, with d_hat = 0 and beta = alpha of the law without filters."""
+    x = np.array(case.x0)
+    exact_law = law(replace(case, filter=None), 0.0, x, np.zeros_like(x))
+    beta = [] if case.filter is None else exact_law.alpha[:-1]
+    return np.concatenate([x, -np.array(case.kappa)[:, None] * x, beta], axis=None)
 
 
-def integrate(case, times, y, rtol=1e-11):
-    """The loop's states at these times from state y at the first of them, (T, ...)."""
-    span = float(times[0]), float(times[-1])
+def record(case, states):
+    """What the reference file stores of states (t, x, d_hat, beta): name -> (T, ...)."""
+    controls = [law(case, *state) for state in states]
+    arrays = dict(zip(("t", "x", "d_hat", "beta"), zip(*states, strict=True), strict=True))
+    arrays |= {"alpha": [c.alpha for c in controls], "V": [c.V for c in controls]}
+    arrays["u"] = [c.alpha[-1] for c in controls]
+    names = arrays.keys() - ({"beta"} if case.filter is None else ())
+    return {name: np.array(arrays[name], dtype=float) for name in names}
+
+
+def run(case, duration=4.0, step=0.01, rtol=1e-11):
+    """What the reference file stores along the loop."""
+    times = np.round(np.arange(round(duration / step) + 1) * step, 12)
     how = {"method": "DOP853", "t_eval": times, "rtol": rtol, "atol": 0.01 * rtol}
-    found = solve_ivp(lambda t, y: loop_rate(case, float(t), y.tolist()), span, y, **how)
+    found = solve_ivp(lambda t, y: loop_rate(case, t, y), (0.0, times[-1]), start(case), **how)
     if not found.success:
         raise RuntimeError(found.message)
-    return found.y.T
-
-
-def record(case, times, states):
-    """What the reference file stores of these states of the loop: name -> (T, ...)."""
-    rows = []
-    for t, y in zip(times, states, strict=True):
-        x, eta, beta = unpack(case, [float(v) for v in y])
-        rows.append(entry(case, float(t), x, estimates(case, x, eta), beta))
-    return collect(case, rows)
-
-
-def entry(case, t, x, d_hat, beta):
-    """What the reference file stores of one state."""
-    control = law(case, t, x, d_hat, beta)
-    values = {"t": t, "x": x, "d_hat": d_hat, "alpha": control.alpha}
-    return {**values, "beta": beta, "u": control.alpha[-1], "V": control.V}
-
-
-def collect(case, rows):
-    """Arrays of the entries; beta only where there are filters."""
-    names = [name for name in rows[0] if name != "beta" or case.filter is not None]
-    return {name: np.array([row[name] for row in rows], dtype=float) for name in names}
-
-
-def run(case, duration=4.0, step=0.01):
-    times = np.round(np.arange(round(duration / step) + 1) * step, 12)
-    return record(case, times, integrate(case, times, start(case)))
+    states = zip(times, found.y.T, strict=True)
+    return record(case, [(t, *unpack(case, y)) for t, y in states])
 
 
 # --- Random states --------------------------------------------------------------------------------
@@ -520,7 +435,7 @@ def random_states(case, spread, noise, count=20, seed=1):
     found = []
     while len(found) < count:
         t = float(rng.uniform(0.0, 4.0))
-        d_hat = [(size * rng.uniform(-1.0, 1.0, case.n)).tolist() for size in noise]
+        d_hat = [size * rng.uniform(-1.0, 1.0, case.n) for size in noise]
         state = random_state(case, rng, t, d_hat, spread)
         if state is not None:
             found.append((t, state[0], d_hat, state[1]))
@@ -530,44 +445,34 @@ def random_states(case, spread, noise, count=20, seed=1):
 def random_state(case, rng, t, d_hat, spread):
     """x and beta at this time, or None if a virtual control came near its bounds."""
     x, beta = [], []
-    reference = case.reference.at(t)
-    centre = reference
+    reference = centre = case.reference.at(t)
     for i in range(case.order):
-        draw = rng.uniform(-1.0, 1.0, case.n).tolist()
+        draw = rng.uniform(-1.0, 1.0, case.n)
         if case.bounds[i] is None:
-            x.append([a + spread[i] * b for a, b in zip(centre, draw, strict=True)])
+            x.append(centre + spread[i] * draw)
         else:
             lower, upper = (side.at(t, reference) for side in case.bounds[i])
-            room = zip(lower, centre, upper, strict=True)
-            if any(min(a - low, up - a) < 0.15 * (up - low) for low, a, up in room):
+            below, above = centre - lower, upper - centre
+            if np.any(np.minimum(below, above) < 0.15 * (upper - lower)):
                 return None
-            x.append(
-                [
-                    a + 0.7 * b * ((up - a) if b > 0 else (a - low))
-                    for low, a, up, b in zip(lower, centre, upper, draw, strict=True)
-                ]
-            )
+            x.append(centre + 0.7 * draw * np.where(draw > 0, above, below))
         if i < case.order - 1:
             centre = law(case, t, x, d_hat, beta, levels=i + 1).alpha[i]
             if case.filter is not None:
-                lag = rng.uniform(-0.1, 0.1, case.n).tolist()
-                centre = [a + b for a, b in zip(centre, lag, strict=True)]
+                centre = centre + rng.uniform(-0.1, 0.1, case.n)
                 beta.append(centre)
     return x, beta
 
 
-def exact(values):
-    """The same rows in numbers of mpmath."""
-    return [[mpmath.mpf(v) for v in row] for row in values]
+exact = np.vectorize(mpmath.mpf, otypes=[object])
+"""The same numbers in those of mpmath."""
 
 
 def points(case, spread, noise):
     """The law at random states, evaluated with 50 digits."""
-    rows = []
     with mpmath.workdps(50):
-        for t, x, d_hat, beta in random_states(case, spread, noise):
-            rows.append(entry(case, mpmath.mpf(t), exact(x), exact(d_hat), exact(beta)))
-    return collect(case, rows)
+        states = random_states(case, spread, noise)
+        return record(case, [(mpmath.mpf(t), *map(exact, rest)) for t, *rest in states])
 
 
 # --- Case 1: coupled gains, and case 4: the same plant with a dynamic surface ---------------------
@@ -583,10 +488,8 @@ def spread_numbers(shape, seed):
 
 def only_known_levels(wave):
     """Sets to zero what level i must not depend on: x_{i+1} and above."""
-    wave = wave.copy()
-    for i in range(LEVELS):
-        wave[i, ..., 2 + WIDTH * (i + 1) :] = 0.0
-    return wave
+    is_known = np.arange(8) < 2 + WIDTH * np.arange(1, LEVELS + 1)[:, None]
+    return wave * np.expand_dims(is_known, tuple(range(1, wave.ndim - 1)))
 
 
 # With z = (1, t, x_1, x_2, x_3), 8 numbers: f_i = DRIFT_SIZE_i * sin(DRIFT_WAVE_i z), component by
@@ -600,8 +503,6 @@ GAIN_SIZE = np.array(
     [[[0.3, 0.2], [0.15, 0.25]], [[0.2, 0.3], [0.2, 0.2]], [[0.3, 0.2], [0.3, 0.25]]]
 )
 GAIN_WAVE = only_known_levels(spread_numbers((LEVELS, WIDTH, WIDTH, 8), seed=101))
-DRIFT_LISTS = DRIFT_SIZE.tolist(), DRIFT_WAVE.tolist()
-GAIN_LISTS = GAIN_CENTRE.tolist(), GAIN_SIZE.tolist(), GAIN_WAVE.tolist()
 COUPLED_DISTURBANCE = {
     "amplitude": ((0.05, 0.04), (0.3, 0.25), (0.8, 0.6)),
     "frequency": ((1.3, 0.7), (2.1, 1.6), (0.9, 2.7)),
@@ -609,32 +510,26 @@ COUPLED_DISTURBANCE = {
 }
 
 
-def wave_sum(row, t, x):
-    """sin of a row of coefficients times (1, t, x_1, x_2, x_3)."""
-    phase = row[0] + row[1] * t
-    for j in range(2, len(row)):
-        if row[j] != 0.0:
-            phase = phase + row[j] * x[(j - 2) // WIDTH][(j - 2) % WIDTH]
+def waves(wave, i, t, x):
+    """sin of rows of coefficients times (1, t, x_1 .. x_{i+1})."""
+    phase = wave[..., 0] + wave[..., 1] * t
+    for j in range(i + 1):
+        phase = phase + times(wave[..., 2 + WIDTH * j : 2 + WIDTH * (j + 1)], x[j])
     return sin(phase)
 
 
 def table_drift(i, t, x):
-    size, wave = (table[i] for table in DRIFT_LISTS)
-    return [a * wave_sum(row, t, x) for a, row in zip(size, wave, strict=True)]
+    return DRIFT_SIZE[i] * waves(DRIFT_WAVE[i], i, t, x)
 
 
 def table_gain(i, t, x):
-    centre, size, wave = (table[i] for table in GAIN_LISTS)
-    return [
-        [a + b * wave_sum(row, t, x) for a, b, row in zip(*rows, strict=True)]
-        for rows in zip(centre, size, wave, strict=True)
-    ]
+    return GAIN_CENTRE[i] + GAIN_SIZE[i] * waves(GAIN_WAVE[i], i, t, x)
 
 
 def table_disturbance(t, x):
     """Sinusoids on every level and component."""
-    rows = zip(*COUPLED_DISTURBANCE.values(), strict=True)
-    return [[a * sin(b * t + c) for a, b, c in zip(*row, strict=True)] for row in rows]
+    amplitude, frequency, phase = map(np.array, COUPLED_DISTURBANCE.values())
+    return amplitude * sin(frequency * t + phase)
 
 
 COUPLED = Case(
@@ -674,9 +569,8 @@ MASS, LENGTH, GRAVITY = (2.0, 0.85), (0.35, 0.31), 9.81
 CENTRE = tuple(length / 2 for length in LENGTH)
 INERTIA = tuple(m * length**2 / 4 for m, length in zip(MASS, LENGTH, strict=True))
 STIFFNESS, MOTOR_INERTIA, MOTOR_DAMPING = 300.0, 0.02, 0.01
-JOINT_TORQUE = Sine((0.0, 0.0), (0.5, 0.3), (1.0, 1.7), (0.0, HALF_PI))
+JOINT_TORQUE = Sine(0.0, (0.5, 0.3), (1.0, 1.7), (0.0, HALF_PI))
 """The disturbance, a torque on the links [N m]."""
-
 P1 = MASS[0] * CENTRE[0] ** 2 + MASS[1] * LENGTH[0] ** 2 + INERTIA[0]
 P2 = MASS[1] * CENTRE[1] ** 2 + INERTIA[1]
 P3 = MASS[1] * LENGTH[0] * CENTRE[1]
@@ -687,83 +581,58 @@ P5 = MASS[1] * CENTRE[1]
 def arm_inertia(q):
     c = cos(q[1])
     coupling = P2 + P3 * c
-    return [[P1 + P2 + 2.0 * P3 * c, coupling], [coupling, P2]]
+    return stack([[P1 + P2 + 2.0 * P3 * c, coupling], [coupling, P2 + 0.0 * c]])
 
 
 def arm_gravity(q):
     outer = P5 * GRAVITY * cos(q[0] + q[1])
-    return [P4 * GRAVITY * cos(q[0]) + outer, outer]
+    return stack([P4 * GRAVITY * cos(q[0]) + outer, outer])
 
 
 def arm_bias(q, v):
     """C(q, v) v + G(q)."""
     s = P3 * sin(q[1])
-    coriolis = [-s * (2.0 * v[0] * v[1] + v[1] * v[1]), s * v[0] * v[0]]
-    return [c + g for c, g in zip(coriolis, arm_gravity(q), strict=True)]
+    return arm_gravity(q) + stack([-s * (2.0 * v[0] * v[1] + v[1] * v[1]), s * v[0] * v[0]])
 
 
 def joint_drift(i, t, x):
     """f of level i + 1 of (q, q', theta, theta')."""
-    if i in (0, 2):
-        return [0.0, 0.0]
     if i == 1:
-        bias = arm_bias(x[0], x[1])
-        torque = [-(b + STIFFNESS * q) for b, q in zip(bias, x[0], strict=True)]
-        return solve(arm_inertia(x[0]), torque)
-    rows = zip(x[0], x[2], x[3], strict=True)
-    return [-(MOTOR_DAMPING * v + STIFFNESS * (th - q)) / MOTOR_INERTIA for q, th, v in rows]
+        return solve(arm_inertia(x[0]), -(arm_bias(x[0], x[1]) + STIFFNESS * x[0]))
+    if i == 3:
+        return -(MOTOR_DAMPING * x[3] + STIFFNESS * (x[2] - x[0])) / MOTOR_INERTIA
+    return np.zeros(2)
 
 
 def joint_gain(i, t, x):
+    """G of level i + 1; STIFFNESS M^-1 is symmetric."""
     if i == 1:
-        columns = [
-            solve(arm_inertia(x[0]), column) for column in ([STIFFNESS, 0.0], [0.0, STIFFNESS])
-        ]
-        return transpose(columns)
-    size = 1.0 if i != 3 else 1.0 / MOTOR_INERTIA
-    return [[size, 0.0], [0.0, size]]
+        return stack([solve(arm_inertia(x[0]), column) for column in STIFFNESS * np.eye(2)])
+    return np.eye(2) if i != 3 else np.eye(2) / MOTOR_INERTIA
 
 
 def joint_disturbance(t, x):
     """d_2 = M^-1 times the torque on the links."""
-    zero = [0.0, 0.0]
-    return [zero, solve(arm_inertia(x[0]), JOINT_TORQUE.at(t)), zero, zero]
+    zero = np.zeros(2)
+    return np.array([zero, solve(arm_inertia(x[0]), JOINT_TORQUE.at(t)), zero, zero])
 
 
-ARM_START = (0.8, 0.8)
-_INERTIA_0 = arm_inertia(ARM_START)
+ARM_START = np.array([0.8, 0.8])
+INERTIA_0 = np.diag(arm_inertia(ARM_START))
 FLEXIBLE = Case(
     order=4,
     n=2,
     drift=joint_drift,
     gain=joint_gain,
     disturbance=joint_disturbance,
-    reference=Sine((0.5, 0.5), (0.14, 0.14), (1.0, 1.0), (0.0, HALF_PI)),
-    bounds=(
-        (
-            Sine((0.2, 0.2), (0.14, 0.14), (1.0, 1.0), (HALF_PI, 0.0)),
-            Sine((0.9, 0.9), (0.14, 0.14), (1.0, 1.0), (HALF_PI, 0.0)),
-        ),
-        None,
-        None,
-        None,
-    ),
+    reference=Sine(0.5, 0.14, 1.0, (0.0, HALF_PI)),
+    bounds=(tuple(Sine(x, 0.14, 1.0, (HALF_PI, 0.0)) for x in (0.2, 0.9)), None, None, None),
     barriers=(mapping, quadratic, quadratic, quadratic),
-    k=((3.0, 3.0), (20.0, 20.0), (60.0, 60.0), (150.0, 150.0)),
-    w=(
-        (10.0 * _INERTIA_0[0][0], 10.0 * _INERTIA_0[1][1]),
-        (_INERTIA_0[0][0], _INERTIA_0[1][1]),
-        (STIFFNESS, STIFFNESS),
-        (MOTOR_INERTIA, MOTOR_INERTIA),
-    ),
+    k=(3.0, 20.0, 60.0, 150.0),
+    w=(10.0 * INERTIA_0, INERTIA_0, STIFFNESS, MOTOR_INERTIA),
     c=(0.1, 0.5, 1.0, 2.0),
     kappa=(0.0, 20.0, 0.0, 20.0),
-    x0=(
-        ARM_START,
-        (0.0, 0.0),
-        tuple(q + g / STIFFNESS for q, g in zip(ARM_START, arm_gravity(ARM_START), strict=True)),
-        (0.0, 0.0),
-    ),
+    x0=(ARM_START, (0.0, 0.0), ARM_START + arm_gravity(ARM_START) / STIFFNESS, (0.0, 0.0)),
 )
 """Levels 1 and 3 have no disturbance, so their d_hat stays 0 whatever their observers' gains."""
 
@@ -778,19 +647,18 @@ PENDULUM_DISTURBANCE = Sine((0.0, 0.0), (0.8, 5.0), (1.4, 2.3), (0.0, 0.5))
 
 def pendulum_drift(i, t, x):
     if i == 0:
-        return [0.0]
+        return np.zeros(1)
     if i == 1:
-        return [-(B * x[1][0] + N * sin(x[0][0])) / D]
-    return [-(H * x[2][0] + KM * x[1][0]) / M]
+        return -(B * x[1] + N * sin(x[0])) / D
+    return -(H * x[2] + KM * x[1]) / M
 
 
 def pendulum_gain(i, t, x):
-    return [[(1.0, 1.0 / D, 1.0 / M)[i]]]
+    return np.array([[(1.0, 1.0 / D, 1.0 / M)[i]]])
 
 
 def pendulum_disturbance(t, x):
-    second, third = PENDULUM_DISTURBANCE.at(t)
-    return [[0.0], [second], [third]]
+    return np.array([0.0, *PENDULUM_DISTURBANCE.at(t)])[:, None]
 
 
 PENDULUM_START = 0.75
@@ -800,15 +668,15 @@ PENDULUM = Case(
     drift=pendulum_drift,
     gain=pendulum_gain,
     disturbance=pendulum_disturbance,
-    reference=Sine((0.6,), (0.3,), (1.0,), (0.0,)),
+    reference=Sine(0.6, 0.3, 1.0, 0.0),
     bounds=(
-        (Funnel((-0.3,), (-0.06,), (1.5,)), Funnel((0.4,), (0.08,), (1.2,))),
-        (Sine((-0.7,), (0.1,), (0.8,), (0.2,)), Sine((0.55,), (0.08,), (1.1,), (1.0,))),
-        (Sine((1.5,), (0.5,), (0.7,), (0.0,)), Sine((10.0,), (0.8,), (1.2,), (0.6,))),
+        (Funnel(-0.3, -0.06, 1.5), Funnel(0.4, 0.08, 1.2)),
+        (Sine(-0.7, 0.1, 0.8, 0.2), Sine(0.55, 0.08, 1.1, 1.0)),
+        (Sine(1.5, 0.5, 0.7, 0.0), Sine(10.0, 0.8, 1.2, 0.6)),
     ),
     barriers=(prescribed_performance, mapping, mapping),
-    k=((2.0,), (6.0,), (12.0,)),
-    w=((0.2,), (1.0,), (0.05,)),
+    k=(2.0, 6.0, 12.0),
+    w=(0.2, 1.0, 0.05),
     c=(0.0002, 0.2, 0.3),
     kappa=(0.0, 12.0, 20.0),
     x0=((PENDULUM_START,), (0.0,), (N * math.sin(PENDULUM_START),)),

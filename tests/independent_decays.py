@@ -11,13 +11,11 @@ numbers and for the power series of `independent_chains`, whose cases may have o
 with alpha' by complex steps along (1, q').
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import independent
 import numpy as np
-from independent_chains import Series, exp, log
+from independent_chains import Series, Sine, Tube, clock, exp, log, mapping
 
 
 @dataclass(frozen=True)
@@ -28,7 +26,6 @@ class Powers:
     delta: float
 
     def gain(self, t, V):
-        """The gain at a value of V; numbers or series."""
         total = 0.0
         for size, power in self.terms:
             total = total + size * exp((power - 1.0) / 2.0 * log(2.0 * V + self.delta**2))
@@ -44,7 +41,6 @@ class Prescribed:
     cap: float
 
     def gain(self, t, V):
-        """The gain at a time; numbers or series."""
         now = t.c[0] if isinstance(t, Series) else t
         width, rest = 2.0 * self.order / self.cap, self.T - t
         if np.real(self.T - now) >= width:
@@ -69,40 +65,20 @@ class Arm(independent.Loop):
 
     def tube(self, t):
         """x_d, lower and upper at a real or complex time, and their rates."""
-        return [_sine_at(parts, t) for parts in (self.reference, self.lower, self.upper)]
+        sides = (self.reference, self.lower, self.upper)
+        return [Sine(*side).at(clock(t, 2)).c for side in sides]
 
-    def mapped(self, t, q):
-        """z, dz/dq and the rate of z at fixed e1."""
+    def first_level(self, t, q):
+        """The terms of the barrier, of which a is the virtual velocity."""
         (x_d, dx_d), (low, dlow), (up, dup) = self.tube(t)
-        e, k_l, k_u = q - x_d, x_d - low, up - x_d
-        dk_l, dk_u = dx_d - dlow, dup - dx_d
-        room = (k_l + e) * (k_u - e)
-        z = e * k_l * k_u / room
-        z_e = k_l * k_u * (k_l * k_u + e**2) / room**2
-        z_t = z * (dk_l / k_l + dk_u / k_u - dk_l / (k_l + e) - dk_u / (k_u - e))
-        return z, z_e, z_t, dx_d
-
-    def alpha(self, t, q):
-        """The virtual velocity."""
-        z, z_e, z_t, dx_d = self.mapped(t, q)
-        gain = self.k1 + np.array([self.first.gain(t, 0.5 * x * x) for x in z])
-        return dx_d - (gain * z + z_t) / z_e
+        tube = Tube(q - x_d, dx_d, x_d - low, up - x_d, dx_d - dlow, dup - dx_d)
+        return mapping(tube, self.k1 + self.first.gain(t, mapping(tube, self.k1).V))
 
     def torque(self, t, q, dq):
-        """The command."""
         step = 1e-30
-        alpha = self.alpha(t, q)
-        dalpha = self.alpha(t + 1j * step, q + 1j * step * dq).imag / step
+        _, s, alpha, _ = self.first_level(t, q)
+        dalpha = self.first_level(t + 1j * step, q + 1j * step * dq).a.imag / step
         M, C, G, _ = self.arm(q)
-        z, z_e, _, _ = self.mapped(t, q)
         e2 = dq - alpha
-        W = 0.5 * e2 @ M @ e2
-        tau = C(dq) @ alpha + G + M @ dalpha - self.K2 * e2 - z * z_e
-        return tau - self.second.gain(t, W) * (M @ e2)
-
-
-def _sine_at(parts, t):
-    """A sinusoid of the arm at a real or complex time, and its rate."""
-    offset, amplitude, frequency, phase = (np.asarray(x, float) * np.ones(2) for x in parts)
-    angle = frequency * t + phase
-    return offset + amplitude * np.sin(angle), amplitude * frequency * np.cos(angle)
+        tau = C(dq) @ alpha + G + M @ dalpha - self.K2 * e2 - s
+        return tau - self.second.gain(t, 0.5 * e2 @ M @ e2) * (M @ e2)

@@ -11,8 +11,6 @@ x_r - lambda in the place of x_r in its tube.  `triggered_chain` holds the input
 differs by more than delta |u_held| + m from it.
 """
 
-from __future__ import annotations
-
 import itertools
 
 import independent_chains as chains
@@ -44,17 +42,10 @@ def limited_arm(loop: Loop, limit, k, t, y):
 
 def limited_chain(case, limit, k, t, x, d_hat, aux):
     """The input, its limited value, and lambda' of a chain; rows of x are the levels."""
-    shift = ([float(a) for a in aux], [-k * float(a) for a in aux])
-    control = chains.law(case, t, x, d_hat, shift=shift)
-    u = np.array(control.alpha[-1], float)
+    control = chains.law(case, t, x, d_hat, shift=(aux, -k * aux))
+    u = control.alpha[-1]
     applied = np.clip(u, -limit, limit)
-    gain = np.array(case.gain(case.order - 1, t, x), float)
-    return u, applied, -k * np.asarray(aux) + gain @ (applied - u), control
-
-
-def fires(u, held, delta, m):
-    """Whether a command is sent: one component is beyond its threshold."""
-    return bool(np.any(np.abs(u - held) > delta * np.abs(held) + m))
+    return u, applied, -k * aux + case.gain(case.order - 1, t, x) @ (applied - u), control
 
 
 def compensated(z, v, delta, m_bar, epsilon):
@@ -65,45 +56,34 @@ def compensated(z, v, delta, m_bar, epsilon):
 
 
 def triggered_chain(case, period, delta, m, count, adjust=None):
-    """`count` periods of a chain without an estimate under the event trigger.
+    """`count` periods of a chain without an estimate under the event trigger with delta and m;
+    `adjust` changes the command by the input and by G_r^T w_r s_r.
 
-    Args:
-      case: an `independent_chains.Case`.
-      period: between two checks [s].
-      delta, m: of the trigger.
-      count: number of periods.
-      adjust: function of the input and of G_r^T w_r s_r that changes the command.
-
-    Returns:
-      States at the checks, (count + 1, r, n); commands held, (count, n); numbers of the checks at
-      which one was sent.
+    Returns the states at the checks, (count + 1, r, n), the commands held, (count, n), and the
+    numbers of the checks at which one was sent.
     """
-    nothing = [[0.0] * case.n for _ in range(case.order)]
-    x, held, sent = [list(row) for row in case.x0], None, []
-    states, commands = [np.array(x, float)], []
+    x, held, sent = np.array(case.x0), None, []
+    states, commands = [x], []
     for index in range(count):
         t = index * period
-        control = chains.law(case, t, x, nothing)
-        u = np.array(control.alpha[-1], float)
+        control = chains.law(case, t, x, np.zeros_like(x))
+        u = control.alpha[-1]
         if adjust is not None:
-            gain = np.array(case.gain(case.order - 1, t, x), float)
-            z = gain.T @ (np.array(case.w[-1]) * np.array(control.s[-1], float))
+            z = case.gain(case.order - 1, t, x).T @ (np.array(case.w[-1]) * control.s[-1])
             u = adjust(z, u)
-        if held is None or fires(u, held, delta, m):
+        if held is None or np.any(np.abs(u - held) > delta * np.abs(held) + m):
             held = u
             sent.append(index)
 
         def rate(t, y, held=held):
-            rows = y.reshape(case.order, case.n).tolist()
-            return np.array(chains.flow(case, t, rows, held.tolist()), float).ravel()
+            return chains.flow(case, t, y.reshape(case.order, case.n), held).ravel()
 
         found = solve_ivp(rate, (t, t + period), np.ravel(x), "DOP853", rtol=1e-11, atol=1e-13)
-        x = found.y[:, -1].reshape(case.order, case.n).tolist()
-        states.append(np.array(x))
+        x = found.y[:, -1].reshape(case.order, case.n)
+        states.append(x)
         commands.append(held)
     return np.array(states), np.array(commands), sent
 
 
 def intervals(sent, period):
-    """The times between consecutive events [s]."""
     return [period * (b - a) for a, b in itertools.pairwise(sent)]

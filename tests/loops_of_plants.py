@@ -1,8 +1,6 @@
 """Scenarios of plants in strict-feedback form: a flexible joint, a motor-driven arm with bounds on
 all levels, a user's two functions and a user's class."""
 
-from __future__ import annotations
-
 import jax.numpy as jnp
 
 import iblf_jax as ij
@@ -12,7 +10,6 @@ ROBOT = ij.robots.TwoLink(mass=[1.2, 0.9], length=[0.4, 0.3], centre=[0.2, 0.15]
 
 
 def band(low, high) -> bounds.Bounds:
-    """Constant bounds."""
     return bounds.Bounds(lower=bounds.Constant(low), upper=bounds.Constant(high))
 
 
@@ -64,23 +61,19 @@ class MotorPendulum:
     order = 3
 
     def drift(self, t, x):
-        """f, (3, 1)."""
         load = self.B * x[1] + self.N * jnp.sin(x[0])
         return jnp.stack([0.0 * x[0], -load / self.D, -(self.H * x[2] + self.Km * x[1]) / self.M])
 
     def gain(self, t, x):
-        """The diagonal of G, (3, 1)."""
         one = jnp.ones_like(x[0])
         return jnp.stack([one, one / self.D, one / self.M])
 
 
 def pendulum_drift(t, x):
-    """f of a `MotorPendulum`, with its default numbers."""
     return MotorPendulum().drift(t, x)
 
 
 def pendulum_gain(t, x):
-    """G of a `MotorPendulum` as full matrices."""
     return MotorPendulum().gain(t, x)[..., None]
 
 
@@ -93,20 +86,14 @@ PENDULUM = {
 
 
 def user_class(**parts) -> ij.Scenario:
-    """Order 3, one component: a user's class."""
     return ij.Scenario(**({"plant": MotorPendulum()} | PENDULUM | parts))
 
 
 def user_functions(**parts) -> ij.Scenario:
-    """The same from two functions."""
     plant = ij.plants.StrictFeedback(pendulum_drift, pendulum_gain, n=1, order=3)
     return ij.Scenario(**({"plant": plant} | PENDULUM | parts))
 
 
-CASES = {
-    "flexible joint": flexible_joint,
-    "electric drive": electric_drive,
-    "user class": user_class,
-    "user functions": user_functions,
-}
+LOOPS = (flexible_joint, electric_drive, user_class, user_functions)
+CASES = {make.__name__.replace("_", " "): make for make in LOOPS}
 """Name -> scenario; all laws are `BarrierBackstepping`."""

@@ -64,7 +64,6 @@ class Holder:
 
     @property
     def loop(self) -> SimpleNamespace:
-        """The plant itself is the model."""
         plant = ij.plants.as_plant(self.plant)
         return SimpleNamespace(plant=plant, model=plant)
 
@@ -101,17 +100,10 @@ def made_up(plant, *, duration=4.0, dt=0.01, shift=0.0, status=0):
         "V": np.exp(-2 * t),
     }
     arrays = {name: jnp.asarray(x) for name, x in arrays.items()}
-    return ij.Rollout(
-        scenario=Holder(plant),
-        controller_state=(),
-        observer_state=(),
-        metrics=ij.Metrics({}, ()),
-        status=jnp.int32(status),
-        fastest_mode=jnp.asarray(10.0),
-        dt=jnp.asarray(dt),
-        method="rk4",
-        **arrays,
-    )
+    arrays |= {"fastest_mode": jnp.asarray(10.0), "dt": jnp.asarray(dt)}
+    others = {"controller_state": (), "observer_state": (), "status": jnp.int32(status)}
+    others |= {"metrics": ij.Metrics({}, ()), "method": "rk4"}
+    return ij.Rollout(scenario=Holder(plant), **others, **arrays)
 
 
 def runaway(plant, at=150):

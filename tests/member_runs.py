@@ -8,8 +8,6 @@ it is an error.  With `--apart`, each line gets a process of its own; it starts 
 imported, and with nothing computed or compiled.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import pickle
@@ -35,7 +33,6 @@ def fitting(scenario: ij.Scenario, method: str) -> str:
 
 
 def answer(folder: Path, line: str) -> None:
-    """Runs the scenario that a line names and prints where it ends."""
     backend, method, name = line.strip().split(" ", 2)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -48,7 +45,6 @@ def answer(folder: Path, line: str) -> None:
 
 
 def serve(folder: Path, apart: bool) -> None:
-    """Answers the lines of the input."""
     for line in sys.stdin:
         if not apart:
             answer(folder, line)

@@ -1,7 +1,5 @@
 """Parts with a network as a field, which several test files look at."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import jax.numpy as jnp

@@ -2,8 +2,6 @@
 in the plane whose components have different units.
 """
 
-from __future__ import annotations
-
 from typing import Any, ClassVar
 
 import jax
@@ -37,7 +35,6 @@ PENDULUM = ij.plants.StrictFeedback(
 
 
 def symmetric(size: Any) -> Bounds:
-    """Constant bounds at the same distance on both sides of 0."""
     return Bounds(lower=Constant(-jnp.asarray(size)), upper=Constant(size))
 
 
@@ -46,9 +43,7 @@ ANGLES = symmetric(1.0)
 
 
 def pendulum(**parts: Any) -> ij.Scenario:
-    """A pendulum that follows a sinusoid, with bounds and barriers on all levels; parts replace its
-    own.
-    """
+    """It follows a sinusoid, with bounds and barriers on all levels; parts replace its own."""
     disturbance = ij.disturbances.Sinusoids(amplitude=0.3, frequency=1.0)
     own: dict[str, Any] = {
         "plant": PENDULUM,
@@ -76,17 +71,13 @@ class Body:
     input_name: ClassVar[str] = "force"
 
     def rotation(self, x1: jax.Array) -> jax.Array:
-        """R, (3, 3)."""
-        c, s, zero = jnp.cos(x1[2]), jnp.sin(x1[2]), jnp.zeros_like(x1[2])
-        rows = [[c, -s, zero], [s, c, zero], [zero, zero, zero + 1.0]]
-        return jnp.stack([jnp.stack(row) for row in rows])
+        c, s = jnp.cos(x1[2]), jnp.sin(x1[2])
+        return jnp.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
     def drift(self, t: jax.Array, x: jax.Array) -> jax.Array:
-        """F, (2, 3)."""
         return jnp.stack([jnp.zeros_like(x[0]), -0.5 * x[1]])
 
     def gain(self, t: jax.Array, x: jax.Array) -> jax.Array:
-        """G, (2, 3, 3)."""
         return jnp.stack([self.rotation(x[0]), jnp.diag(1.0 / self.mass)])
 
     def outline(self, x1: jax.Array) -> jax.Array:
@@ -96,7 +87,6 @@ class Body:
 
 
 def body(**parts: Any) -> ij.Scenario:
-    """A body that follows an ellipse; parts replace its own."""
     own: dict[str, Any] = {
         "plant": Body(mass=[20.0, 20.0, 3.0]),
         "reference": ij.references.Sinusoid(

@@ -1,7 +1,5 @@
 """A pendulum with the paper's reference and bounds of its first joint."""
 
-from __future__ import annotations
-
 import math
 
 import iblf_jax as ij

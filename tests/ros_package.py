@@ -1,7 +1,5 @@
 """A generated ROS 2 package, built and installed as colcon does it for packages of ament_python."""
 
-from __future__ import annotations
-
 import os
 import random
 import subprocess
@@ -35,18 +33,15 @@ class Package(NamedTuple):
 
     @property
     def modules(self) -> Path:
-        """The folder that contains the Python package."""
         return site_packages(self.prefix)
 
 
 def site_packages(prefix: Path) -> Path:
-    """The folder of Python packages of a prefix."""
     version = f"python{sys.version_info.major}.{sys.version_info.minor}"
     return prefix / "lib" / version / "site-packages"
 
 
 def install(source: Path, prefix: Path) -> None:
-    """Builds and installs a package with the commands of colcon."""
     base = prefix.parent / f"build_{prefix.name}"
     base.mkdir()
     command = [sys.executable, "setup.py", "-q", "egg_info", "--egg-base", str(base)]
@@ -64,20 +59,14 @@ def law_scenario() -> ij.Scenario:
 
 
 def made_package(folder: Path) -> Package:
-    """The package of a law with three gains, in a folder."""
     scenario = law_scenario()
     source, prefix = folder / "src" / NAME, folder / "install"
-    ij.export(
-        scenario,
-        source,
-        target="ros2",
-        name=NAME,
-        torque_limits=[40.0, 15.0],
-        gains=[
-            ij.tunable("controller.K2", [1.0, 1.5], [4.0, 3.5]),
-            ij.tunable("controller.k1", 0.5, 4.0, tied=True),
-            ij.tunable("observer.kf[1]", 2.0, 8.0),
-        ],
-    )
+    gains = [
+        ij.tunable("controller.K2", [1.0, 1.5], [4.0, 3.5]),
+        ij.tunable("controller.k1", 0.5, 4.0, tied=True),
+        ij.tunable("observer.kf[1]", 2.0, 8.0),
+    ]
+    options = {"target": "ros2", "name": NAME, "torque_limits": [40.0, 15.0], "gains": gains}
+    ij.export(scenario, source, **options)
     install(source, prefix)
     return Package(scenario, source, prefix)

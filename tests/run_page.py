@@ -70,15 +70,10 @@ def _is_unknown(dotted: str, aliases: set[str], package: types.ModuleType) -> bo
     for name in rest:
         if not isinstance(thing, types.ModuleType | type):
             return False
-        if not hasattr(thing, name):
-            return not _is_field(thing, name)
+        if not hasattr(thing, name):  # only instances of a class have its fields
+            return name not in getattr(thing, "__annotations__", {})
         thing = getattr(thing, name)
     return False
-
-
-def _is_field(thing: Any, name: str) -> bool:
-    """Whether a class has a field of this name, which only its instances have as an attribute."""
-    return name in getattr(thing, "__annotations__", {})
 
 
 if __name__ == "__main__":

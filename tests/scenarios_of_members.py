@@ -1,7 +1,5 @@
 """A scenario for every member of every family: the member in a loop into which it fits."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from functools import partial
@@ -16,6 +14,7 @@ PAPER = ij.presets.zhang_yan_2024(variant="corrected")
 CHAIN = ij.presets.motor_driven_two_link()
 FLEXIBLE = ij.presets.flexible_joint_two_link()
 VESSEL = ij.presets.vessel()
+LAW = partial(ij.controllers.Backstepping, k1=2.0, K2=20.0)
 SAMPLING = ij.Sampling(period=2e-3)
 WIDE = ij.Bounds(lower=ij.bounds.Constant(-4.0), upper=ij.bounds.Constant(4.0))
 FAR = ij.Bounds(lower=ij.bounds.Constant(-20.0), upper=ij.bounds.Constant(20.0))
@@ -25,27 +24,25 @@ def with_velocity_bounds(law: Any) -> ij.Scenario:
     return ij.with_parts(PAPER, controller=law, bounds=(PAPER.bounds[0], WIDE))
 
 
-def of_robot(robot: Any) -> ij.Scenario:
-    n = robot.n
-    return ij.Scenario(
-        plant=robot,
-        reference=ij.references.Sinusoid(offset=0.5, amplitude=0.1, frequency=1.0, phase=0.0),
-        bounds=ij.Bounds(lower=ij.bounds.Constant(0.0), upper=ij.bounds.Constant(1.0)),
-        controller=ij.controllers.Backstepping(k1=2.0, K2=20.0),
-        initial=ij.Initial(q=jnp.full(n, 0.45), dq=jnp.zeros(n)),
-    )
-
-
-def of_plant(plant: Any) -> ij.Scenario:
-    n, order = plant.n, plant.order
-    x = jnp.zeros((order, n)).at[0].set(0.45)
+def inside(plant: Any, controller: Any, initial: ij.Initial) -> ij.Scenario:
+    """A loop whose bounds are 0 and 1."""
     return ij.Scenario(
         plant=plant,
         reference=ij.references.Sinusoid(offset=0.5, amplitude=0.1, frequency=1.0, phase=0.0),
         bounds=ij.Bounds(lower=ij.bounds.Constant(0.0), upper=ij.bounds.Constant(1.0)),
-        controller=ij.controllers.BarrierBackstepping(k=tuple([2.0] * order)),
-        initial=ij.Initial(x=x),
+        controller=controller,
+        initial=initial,
     )
+
+
+def of_robot(robot: Any) -> ij.Scenario:
+    initial = ij.Initial(q=jnp.full(robot.n, 0.45), dq=jnp.zeros(robot.n))
+    return inside(robot, LAW(), initial)
+
+
+def of_plant(plant: Any) -> ij.Scenario:
+    law = ij.controllers.BarrierBackstepping(k=(2.0,) * plant.order)
+    return inside(plant, law, ij.Initial(x=jnp.zeros((plant.order, plant.n)).at[0].set(0.45)))
 
 
 FITTING: dict[str, Callable[[Any], ij.Scenario]] = {
@@ -58,14 +55,9 @@ FITTING: dict[str, Callable[[Any], ij.Scenario]] = {
     "region": lambda part: ij.with_parts(PAPER, regions=(part,)),
     "disturbance": lambda part: ij.with_parts(PAPER, disturbance=part),
     "process_noise": lambda part: ij.with_parts(CHAIN, process_noise=part),
-    "barrier": lambda part: ij.with_parts(
-        PAPER, controller=ij.controllers.Backstepping(k1=2.0, K2=20.0, barrier=part)
-    ),
+    "barrier": lambda part: ij.with_parts(PAPER, controller=LAW(barrier=part)),
     "decay": lambda part: ij.with_parts(
-        PAPER,
-        controller=ij.controllers.Backstepping(
-            k1=2.0, K2=20.0, barrier=ij.barriers.TransformedError(), decays=(part, part)
-        ),
+        PAPER, controller=LAW(barrier=ij.barriers.TransformedError(), decays=(part, part))
     ),
     "observer": lambda part: ij.with_parts(PAPER, observer=part),
     "sensor": lambda part: ij.with_parts(PAPER, sensor=part, sampling=SAMPLING),
@@ -85,6 +77,10 @@ def estimated(part: Any) -> ij.Scenario:
     return sampled(PAPER, sensor=part, observer=observer, controller=law)
 
 
+def in_space(region: Any) -> ij.Scenario:
+    return ij.with_parts(of_robot(members.ROBOTS["arm"]), regions=(region,))
+
+
 SPECIAL: dict[str, Callable[[Any], ij.Scenario]] = {
     "plant neighbour_model": lambda part: ij.with_parts(
         of_plant(members.PAIR),
@@ -92,12 +88,8 @@ SPECIAL: dict[str, Callable[[Any], ij.Scenario]] = {
         controller=ij.controllers.BarrierBackstepping(k=(2.0, 2.0), filter=0.01),
     ),
     "reference ellipse": lambda part: ij.with_parts(VESSEL, reference=part, bounds=FAR),
-    "region half_space_of_the_elbow": lambda part: ij.with_parts(
-        of_robot(members.ROBOTS["arm"]), regions=(dataclasses.replace(part, offset=-2.0),)
-    ),
-    "region sphere_inside": lambda part: ij.with_parts(
-        of_robot(members.ROBOTS["arm"]), regions=(part,)
-    ),
+    "region half_space_of_the_elbow": lambda part: in_space(dataclasses.replace(part, offset=-2.0)),
+    "region sphere_inside": in_space,
     "observer level": lambda part: ij.with_parts(CHAIN, observer=part),
     "observer state_observer": lambda part: ij.with_parts(FLEXIBLE, observer=part),
     "observer state_observer_two_encoders": lambda part: ij.with_parts(FLEXIBLE, observer=part),
@@ -112,10 +104,8 @@ SPECIAL: dict[str, Callable[[Any], ij.Scenario]] = {
 
 
 def scenarios() -> dict[str, Callable[[], ij.Scenario]]:
-    """Name of a member -> function that makes its scenario."""
-    found = {}
-    for family, make in FITTING.items():
-        for name, part in members.FAMILIES[family][0].items():
-            fitting = SPECIAL.get(f"{family} {name}", make)
-            found[f"{family} {name}"] = partial(fitting, part)
-    return found
+    return {
+        f"{family} {name}": partial(SPECIAL.get(f"{family} {name}", make), part)
+        for family, make in FITTING.items()
+        for name, part in members.FAMILIES[family][0].items()
+    }

@@ -29,7 +29,6 @@ FOLDER = TESTS / "data" / "results"
 
 
 def stored(name: str) -> Any:
-    """The result in a file."""
     return ij.load(FOLDER / f"{name}.result")
 
 
@@ -46,7 +45,6 @@ def identified_without_friction() -> ij.Identification:
 
 
 def makers() -> dict[str, Callable[[], Any]]:
-    """Name -> what makes a result."""
     from test_results import EXAMPLES
 
     found = {
@@ -56,7 +54,6 @@ def makers() -> dict[str, Callable[[], Any]]:
 
 
 def main() -> None:
-    """Writes the files."""
     warnings.simplefilter("ignore")
     made = makers()
     for name in sys.argv[1:] or made:

@@ -16,6 +16,8 @@ import threading
 import tomllib
 import traceback
 from pathlib import Path
+from subprocess import PIPE
+from typing import Any
 
 import numpy as np
 
@@ -39,7 +41,6 @@ GRID = {"controller.K2": [10.0, 20.0, 40.0], "observer.kf": [10.0, 20.0]}
 RUNS = 500
 """3000 cases: 12 blocks of 256."""
 UNIT = 256
-
 STUDY = """
 preset = "zhang_yan_2024"
 [run]
@@ -52,20 +53,17 @@ initial.q = { offset = "normal", std = 0.05 }
 runs = 300
 seed = 3
 """
-SWEEP = (
-    STUDY.replace("[study]", "[sweep]")
-    + """
+AXES = """
 unit = 256
 [grid]
 "controller.K2" = [10.0, 20.0, 40.0]
 observer.kf = [10.0, 20.0]
 """
-)
+SWEEP = STUDY.replace("[study]", "[sweep]") + AXES
 """The same for the command line, with the standard metrics."""
 
 
 def from_file(text, **more):
-    """The sweep of a file, in this process."""
     import iblf_jax as ij
     from iblf_jax.files import study as study_file
 
@@ -78,9 +76,8 @@ def from_file(text, **more):
 def study(runs=600, ways=None, **more):
     import iblf_jax as ij
 
-    return ij.monte_carlo(
-        ij.presets.zhang_yan_2024(), ways or perturbations(), runs=runs, **options() | more
-    )
+    paper = ij.presets.zhang_yan_2024()
+    return ij.monte_carlo(paper, ways or perturbations(), runs=runs, **options() | more)
 
 
 def table(store=None, unit=UNIT, scenario=None, **more):
@@ -89,14 +86,8 @@ def table(store=None, unit=UNIT, scenario=None, **more):
 
     if store is not None and not isinstance(store, ij.studies.StoreOptions):
         store = ij.studies.StoreOptions(store, unit)
-    return ij.sweep(
-        scenario or ij.presets.zhang_yan_2024(),
-        GRID,
-        perturbations=perturbations(),
-        runs=RUNS,
-        store=store,
-        **options() | more,
-    )
+    given = {"perturbations": perturbations(), "runs": RUNS, "store": store} | options() | more
+    return ij.sweep(scenario or ij.presets.zhang_yan_2024(), GRID, **given)
 
 
 def arrays(dataset):
@@ -105,18 +96,15 @@ def arrays(dataset):
 
 def named(found):
     """The arrays of a study, by names that no sweep has."""
-    return {
-        f"study {name}": np.asarray(x)
-        for name, x in (dict(found.metrics) | found.samples | {"status": found.status}).items()
-    }
+    values = dict(found.metrics) | found.samples | {"status": found.status}
+    return {f"study {name}": np.asarray(x) for name, x in values.items()}
 
 
 def same(a, b):
     """Whether two mappings of arrays have the same names and bits."""
+    pairs = [(np.asarray(a[k]), np.asarray(b[k])) for k in a.keys() & b.keys()]
     return set(a) == set(b) and all(
-        np.asarray(a[k]).dtype == np.asarray(b[k]).dtype
-        and np.array_equal(a[k], b[k], equal_nan=True)
-        for k in a
+        x.dtype == y.dtype and np.array_equal(x, y, equal_nan=True) for x, y in pairs
     )
 
 
@@ -138,42 +126,23 @@ def environment(cache: Path, **more: str) -> dict[str, str]:
 
 
 def start(cache: Path, *words: str, **more: str) -> subprocess.Popen:
-    """Starts this file as a script."""
     return start_python(cache, __file__, *words, **more)
 
 
-def start_python(cache: Path, *words: str, **more: str) -> subprocess.Popen:
-    """Starts Python with these words."""
-    command = [sys.executable, *words]
-    return subprocess.Popen(
-        command,
-        env=environment(cache, **more),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+def start_python(cache: Path, *words: str, stderr: Any = PIPE, **more: str) -> subprocess.Popen:
+    """Starts Python with these words; its input, output and errors can be read and written."""
+    pipes: dict[str, Any] = {"stdin": PIPE, "stdout": PIPE, "stderr": stderr, "text": True}
+    return subprocess.Popen([sys.executable, *words], env=environment(cache, **more), **pipes)
 
 
 class Forks:
     """Many processes of this script, each forked from one that has imported everything and started
-    nothing: half of a start is imports.
-
-    Args:
-      cache: folder of compiled programs.
-      errors: file for what they say on stderr.
-    """
+    nothing: half of a start is imports.  They share a folder of compiled programs, and a file for
+    what they say on stderr."""
 
     def __init__(self, cache: Path, errors: Path):
         with errors.open("w") as file:
-            command = [sys.executable, __file__, "--serve"]
-            self.server = subprocess.Popen(
-                command,
-                env=environment(cache),
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=file,
-                text=True,
-            )
+            self.server = start_python(cache, __file__, "--serve", stderr=file)
 
     def __enter__(self) -> Forks:
         return self
@@ -241,16 +210,15 @@ def main() -> None:
     parser.add_argument("--shared", action="store_true", help="of a store for several processes")
     parser.add_argument("--slow", type=float, default=0.0, help="sleep so long after each unit")
     parser.add_argument("--die-after", type=int, help="kill this process after so many units")
-    parser.add_argument(
-        "--study", action="store_true", help="the study, beside the sweep if there is a store"
-    )
+    parser.add_argument("--study", action="store_true", help="beside the sweep, if with a store")
     args = parser.parse_args()
     import jax
 
     jax.config.update("jax_num_cpu_devices", args.devices)
     import iblf_jax as ij
 
-    _hinder(args)
+    if args.slow or args.die_after is not None:
+        _hinder(args)
     data = {}
     if args.store:
         store = ij.studies.StoreOptions(args.store, UNIT, shared=args.shared)
@@ -264,7 +232,6 @@ def main() -> None:
 
 
 def _hinder(args) -> None:
-    """Makes writing slow, or deadly."""
     import signal
     import time
 
@@ -280,8 +247,7 @@ def _hinder(args) -> None:
         if args.die_after is not None and len(written) >= args.die_after:
             os.kill(os.getpid(), signal.SIGKILL)
 
-    if args.slow or args.die_after is not None:
-        Store.write = write
+    Store.write = write
 
 
 if __name__ == "__main__":

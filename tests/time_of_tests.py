@@ -6,8 +6,6 @@
 The first line writes one file for each worker; the second one reads them and prints tables.
 """
 
-from __future__ import annotations
-
 import collections
 import json
 import os
@@ -20,23 +18,15 @@ from typing import Any
 
 import pytest
 
-TRACING = "tracing"
-XLA = "XLA"
-COMPILER = "C++"
-PROCESSES = "processes"
-REST = "rest"
-CAUSES = (TRACING, XLA, COMPILER, PROCESSES, REST)
+CAUSES = TRACING, XLA, COMPILER, PROCESSES, REST = ("tracing", "XLA", "C++", "processes", "rest")
 """`rest` is computation, and Python outside of JAX; `processes` are those that a test starts,
 except for the compiler."""
-
 EVENTS = {
     "/jax/core/compile/jaxpr_trace_duration": TRACING,
     "/jax/core/compile/jaxpr_to_mlir_module_duration": TRACING,
     "/jax/core/compile/backend_compile_duration": XLA,
 }
-
 COMPILERS = ("quick_compiler", "c++", "g++", "clang++")
-
 STARTS = "(start of a worker)"
 
 
@@ -110,7 +100,6 @@ class Times:
             self.write(item.nodeid, processor_s() - before)
 
     def write(self, test: str, total: float) -> None:
-        """A line of the file."""
         rest = max(0.0, total - sum(self.spent.values()))
         line = {"test": test, "s": total, **self.spent, REST: rest}
         self.file.write(json.dumps(line) + "\n")
@@ -130,21 +119,16 @@ def table(title: str, rows: dict[str, collections.Counter[str]], most: int) -> N
 
 
 def main(folder: Path) -> None:
-    """Tables by folder, by file and by function of tests."""
-    by_folder: dict[str, collections.Counter[str]] = collections.defaultdict(collections.Counter)
-    by_file: dict[str, collections.Counter[str]] = collections.defaultdict(collections.Counter)
-    by_test: dict[str, collections.Counter[str]] = collections.defaultdict(collections.Counter)
+    most = {"folder": 40, "file": 60, "function": 80}
+    tables: dict[str, Any] = {title: collections.defaultdict(collections.Counter) for title in most}
     for path in sorted(folder.glob("*.jsonl")):
         for line in map(json.loads, path.read_text().splitlines()):
-            test = line.pop("test")
-            function = test.split("[")[0]
+            function = line.pop("test").split("[")[0].removeprefix("tests/")
             file = function.split("::")[0]
-            by_test[function.removeprefix("tests/")].update(line)
-            by_file[file.removeprefix("tests/")].update(line)
-            by_folder[str(Path(file).parent)].update(line)
-    table("folder", by_folder, 40)
-    table("file", by_file, 60)
-    table("function", by_test, 80)
+            for title, name in zip(most, (str(Path(file).parent), file, function), strict=True):
+                tables[title][name].update(line)
+    for title, rows in tables.items():
+        table(title, rows, most[title])
 
 
 if __name__ == "__main__":

@@ -1,8 +1,6 @@
 """What a type checker knows of what users get: `mypy` reads this file beside the package, and
 nothing runs it."""
 
-from __future__ import annotations
-
 from typing import ClassVar, assert_type
 
 import jax
@@ -16,7 +14,6 @@ Tube = ij.bounds.Tube
 
 
 def of_a_run(scenario: ij.Scenario) -> None:
-    """The signals of a run and its metrics are arrays."""
     run = ij.simulate(scenario, duration=1.0)
     assert_type(run.q, Array)
     assert_type(run.disturbance_estimate, Array)
@@ -26,8 +23,6 @@ def of_a_run(scenario: ij.Scenario) -> None:
 
 @ij.component
 class Drive(ij.actuators.Actuator):
-    """An actuator of a user's, with the public types that its methods return."""
-
     gain: ij.Leaf = ij.leaf("1", sign="positive")
 
     def init(self, tau: Array) -> ij.actuators.State:
@@ -39,8 +34,6 @@ class Drive(ij.actuators.Actuator):
 
 @ij.component
 class Wrapping(ij.controllers.Law):
-    """A law of a user's that wraps another."""
-
     law: ij.controllers.TrackingLaw
 
     def init(self, x: Array, context: ij.controllers.LawContext) -> ij.controllers.State:
@@ -59,8 +52,6 @@ class Wrapping(ij.controllers.Law):
 
 @ij.component
 class Barrier(ij.barriers.Barrier):
-    """A barrier of a user's."""
-
     guard: float = ij.static(default=1e-3)
     uses_o: ClassVar[bool] = False
     value_unit: ClassVar[str] = "1"
@@ -90,8 +81,6 @@ class Barrier(ij.barriers.Barrier):
 
 @ij.component
 class Observer(ij.observers.RobotObserver):
-    """An observer of a user's."""
-
     gain: ij.Leaf = ij.leaf("1/s", sign="positive")
 
     def init(self, q: Array, dq: Array, model: Robot) -> State:
@@ -108,8 +97,6 @@ class Observer(ij.observers.RobotObserver):
 
 @ij.component
 class Push(ij.disturbances.Disturbance):
-    """A disturbance of a user's."""
-
     size: ij.Leaf = ij.leaf("N m")
 
     def torque(self, t: Array, q: Array, dq: Array, plant: Robot, model: Robot) -> Array:
@@ -121,8 +108,6 @@ class Push(ij.disturbances.Disturbance):
 
 @ij.component
 class Sensor(ij.sensors.RobotSensor):
-    """A sensor of a user's."""
-
     draws: ClassVar[int] = 0
 
     def init(self, q: Array, dq: Array, period: Array) -> ij.sensors.State:
@@ -136,8 +121,6 @@ class Sensor(ij.sensors.RobotSensor):
 
 @ij.component
 class Plant(ij.plants.Plant):
-    """A plant of a user's."""
-
     n: ClassVar[int] = 1
     order: ClassVar[int] = 2
     units: ClassVar[tuple[ij.plants.Units, ...]] = ("m", "m/s", "N")
@@ -151,8 +134,6 @@ class Plant(ij.plants.Plant):
 
 @ij.component
 class Largest(ij.metrics.Fold):
-    """A metric of a user's."""
-
     units: ClassVar[dict[str, str]] = {"largest": "rad"}
 
     def init(self, sample: ij.metrics.Sample) -> Array:
@@ -166,7 +147,6 @@ class Largest(ij.metrics.Fold):
 
 
 def of_own_parts(scenario: ij.Scenario, sample: ij.metrics.Sample, tube: Tube) -> None:
-    """Parts of a user's own fit where the package's do."""
     actuator: ij.actuators.Actuator = Drive(gain=3.0)
     law: ij.controllers.Law = Wrapping(law=scenario.controller)
     barrier: ij.barriers.Barrier = Barrier()

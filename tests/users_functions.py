@@ -1,7 +1,5 @@
 """Functions that users write for plants and noises; by their names, which a pickle needs."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 

@@ -1,7 +1,5 @@
 """Former public names are refused with what to write in their place."""
 
-from __future__ import annotations
-
 import dataclasses
 import importlib
 import re
@@ -25,15 +23,12 @@ def test_a_former_name_is_refused_with_the_present_one(module, former, present):
 
 def test_a_former_argument_is_refused_with_the_present_one():
     scenario = ij.presets.zhang_yan_2024()
-    with pytest.raises(TypeError, match=r"Write variant=\.\.\. in its place"):
-        ij.presets.zhang_yan_2024(reading="corrected")
-    with pytest.raises(TypeError, match=r"Write variant=\.\.\. in its place"):
-        ij.controllers.Backstepping(k1=2.0, K2=20.0, reading="corrected")
+    for call in (ij.presets.zhang_yan_2024, ij.controllers.Backstepping):
+        with pytest.raises(TypeError, match=r"Write variant=\.\.\. in its place"):
+            call(reading="corrected")
     with pytest.raises(ValueError, match=r"Write bounds=\(positions, velocities\) in its place"):
         ij.with_parts(scenario, velocity_bounds=scenario.bounds[0])
-
-
-def test_an_argument_is_a_former_one_only_where_the_present_one_is_known():
+    # An argument is a former one only where the present one is known.
     with pytest.raises(TypeError, match="reading") as error:
         ij.presets.zhang_yan_2024_full_state(reading="corrected")
     assert "in its place" not in str(error.value)

@@ -1,7 +1,5 @@
 """Limits of an input that are not symmetric, beside those that are."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import jax.numpy as jnp
@@ -11,12 +9,10 @@ import pytest
 import iblf_jax as ij
 from iblf_jax.core.input_limits import is_beyond, lower_or_opposite
 
-INPUTS = np.array([-3.0, -1.5, -0.5, 0.5, 1.5, 3.0])
-
 
 @pytest.mark.parametrize("lower", [None, -1.0, -2.0, 0.0, 1.0])
 def test_an_input_is_beyond_its_limits_where_clipping_changes_it(lower):
-    x, upper = jnp.asarray(INPUTS), 2.0
+    x, upper = jnp.array([-3.0, -1.5, -0.5, 0.5, 1.5, 3.0]), 2.0
     least = -upper if lower is None else lower
     assert lower_or_opposite(lower, upper) == least
     np.testing.assert_array_equal(is_beyond(x, lower, upper), np.clip(x, least, upper) != x)

@@ -1,7 +1,5 @@
 """Programs that a later process reads: the same bits, and no trace."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import pickle
@@ -74,19 +72,34 @@ def results(case):
 printed(cases, results, {"_execute"})
 """
 """The second study draws another parameter, and the third one has code of a user."""
+TUNE = """
+goal = ij.objectives.tracking(scale=1.0) + 0.3 * ij.objectives.effort(scale=1.0)
+sampled = ij.with_parts(paper, sampling=ij.Sampling(period=2e-3))
+effort = ij.tuning.Effort(values=4, starts=2, iterations=2)
+cases = [
+    (sampled, "controller.K2"),
+    (ij.with_parameters(sampled, {"controller.k1": 3.0}), "controller.K2"),
+    (sampled, "controller.K2[0]"),
+]
+def tuned(case):
+    scenario, path = case
+    options = {"duration": 0.04, "dt": 2e-3, "effort": effort, "progress": False}
+    best = ij.tune(scenario, [path], goal, **options)
+    return digest((best.values, best.objective, best.report.peak_torque))
+names = {"forward_derivatives", "_initialize", "_all_steps", "_finalize"}
+printed(cases, tuned, names)
+"""
+"""The second case has other numbers, and the third one tunes another part of the leaf."""
 
 
-def printed(script, folder, **variables):
+def printed(script, folder, *, kept=True, **variables):
     """What a script prints in a process of its own: values, and what was traced for each."""
     environment = os.environ | {"XDG_CACHE_HOME": str(folder), **variables}
+    environment["JAX_ENABLE_COMPILATION_CACHE"] = str(int(kept))
     command = [sys.executable, "-c", LISTEN + script]
     found = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
     rows = [line.split(",") for line in found.stdout.splitlines()]
     return [row[0] for row in rows], [row[1:] for row in rows]
-
-
-KEPT = {"JAX_ENABLE_COMPILATION_CACHE": "1"}
-NOTHING_KEPT = {"JAX_ENABLE_COMPILATION_CACHE": "0"}
 
 
 def damage(folder):
@@ -102,43 +115,52 @@ def damage(folder):
 @pytest.mark.slow
 def test_a_second_process_traces_nothing_and_a_damaged_entry_is_made_again(tmp_path):
     everything = ["_all_steps", "_finalized", "_initial_values", "_initialize"]
-    digest, traced = printed(RUN, tmp_path, **KEPT)
+    digest, traced = printed(RUN, tmp_path)
     assert traced == [everything]
-    assert printed(RUN, tmp_path, **KEPT) == (digest, [[]])
+    assert printed(RUN, tmp_path) == (digest, [[]])
     # Other options are another environment.
-    assert printed(RUN, tmp_path, **KEPT, IBLF_JAX_THREADS="3") == (digest, traced)
+    assert printed(RUN, tmp_path, IBLF_JAX_THREADS="3") == (digest, traced)
     assert damage(tmp_path) == 10
-    assert printed(RUN, tmp_path, **KEPT) == (digest, traced)
+    assert printed(RUN, tmp_path) == (digest, traced)
     # Without its kernels, a program is compiled again.
     for kernel in (tmp_path / "iblf_jax").glob("*.so"):
         kernel.unlink()
-    found, (traced,) = printed(RUN, tmp_path, **KEPT)
+    found, (traced,) = printed(RUN, tmp_path)
     assert found == digest
     assert "_all_steps" in traced
 
 
+LOOP = ["_maps", "_sampled_jacobians", "_sampled_states"]
+
+
 @pytest.mark.slow
-def test_the_search_for_a_period_reads_its_programs(tmp_path):
-    """Only the kernel of the Jacobians depends on the constants that are compiled in."""
-    everything = ["_maps", "_sampled_jacobians", "_sampled_states"]
-    expected, traced = printed(RADII, tmp_path, **NOTHING_KEPT)
-    assert len(set(expected)) == 4
-    assert traced == [everything, everything, ["_sampled_jacobians"], everything]
-    assert printed(RADII, tmp_path, **KEPT) == (expected, traced)
-    assert printed(RADII, tmp_path, **KEPT) == (expected, [[], [], [], everything])
+@pytest.mark.parametrize(
+    ("script", "first", "again"),
+    [
+        # Only the kernel of the Jacobians depends on the constants that are compiled in.
+        (RADII, [LOOP, LOOP, ["_sampled_jacobians"], LOOP], [[], [], [], LOOP]),
+        (STUDIES, [["_execute"]] * 3, [[], [], ["_execute"]]),
+    ],
+    ids=["the search for a period", "a study and its bands"],
+)
+def test_programs_are_read_and_a_damaged_entry_is_made_again(script, first, again, tmp_path):
+    expected, traced = printed(script, tmp_path, kept=False)
+    assert len(set(expected)) == len(first)
+    assert traced == first
+    assert printed(script, tmp_path) == (expected, traced)
+    assert printed(script, tmp_path) == (expected, again)
     assert damage(tmp_path)
-    assert printed(RADII, tmp_path, **KEPT) == (expected, traced)
+    assert printed(script, tmp_path) == (expected, traced)
 
 
 @pytest.mark.slow
-def test_a_study_and_its_bands_read_their_programs(tmp_path):
-    expected, traced = printed(STUDIES, tmp_path, **NOTHING_KEPT)
+def test_a_tuning_reads_its_programs(tmp_path):
+    expected, traced = printed(TUNE, tmp_path, kept=False)
     assert len(set(expected)) == 3
-    assert traced == [["_execute"]] * 3
-    assert printed(STUDIES, tmp_path, **KEPT) == (expected, traced)
-    assert printed(STUDIES, tmp_path, **KEPT) == (expected, [[], [], ["_execute"]])
-    assert damage(tmp_path)
-    assert printed(STUDIES, tmp_path, **KEPT) == (expected, traced)
+    assert traced[:2] == [["_all_steps", "_finalize", "_initialize", "forward_derivatives"], []]
+    assert "forward_derivatives" in traced[2]
+    assert printed(TUNE, tmp_path) == (expected, traced)
+    assert printed(TUNE, tmp_path) == (expected, [[]] * 3)
 
 
 @pytest.fixture
@@ -168,37 +190,6 @@ def test_a_damaged_value_is_not_read(folder):
         assert kept_programs.read("one") is None
     kept_programs.keep("one", (1, 2.0))
     assert kept_programs.read("one") == (1, 2.0)
-
-
-TUNE = """
-goal = ij.objectives.tracking(scale=1.0) + 0.3 * ij.objectives.effort(scale=1.0)
-sampled = ij.with_parts(paper, sampling=ij.Sampling(period=2e-3))
-effort = ij.tuning.Effort(values=4, starts=2, iterations=2)
-cases = [
-    (sampled, "controller.K2"),
-    (ij.with_parameters(sampled, {"controller.k1": 3.0}), "controller.K2"),
-    (sampled, "controller.K2[0]"),
-]
-def tuned(case):
-    scenario, path = case
-    options = {"duration": 0.04, "dt": 2e-3, "effort": effort, "progress": False}
-    best = ij.tune(scenario, [path], goal, **options)
-    return digest((best.values, best.objective, best.report.peak_torque))
-names = {"forward_derivatives", "_initialize", "_all_steps", "_finalize"}
-printed(cases, tuned, names)
-"""
-"""The second case has other numbers, and the third one tunes another part of the leaf."""
-
-
-@pytest.mark.slow
-def test_a_tuning_reads_its_programs(tmp_path):
-    expected, traced = printed(TUNE, tmp_path, **NOTHING_KEPT)
-    assert len(set(expected)) == 3
-    everything = ["_all_steps", "_finalize", "_initialize", "forward_derivatives"]
-    assert traced[:2] == [everything, []]
-    assert "forward_derivatives" in traced[2]
-    assert printed(TUNE, tmp_path, **KEPT) == (expected, traced)
-    assert printed(TUNE, tmp_path, **KEPT) == (expected, [[]] * 3)
 
 
 def test_a_program_that_falls_back_is_not_kept(folder, monkeypatch):

@@ -1,7 +1,5 @@
 """Digests of programs: equal ones compute the same."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -37,14 +35,8 @@ def with_rule(factor):
     return jax.grad(square)
 
 
-def changed(table):
-    table = table.copy()
-    table[1000] += 1e-12
-    return table
-
-
 CASES = {
-    "a table": (looked_up(TABLE), looked_up(changed(TABLE))),
+    "a table": (looked_up(TABLE), looked_up(TABLE + 1e-12 * (np.arange(2000) == 1000))),
     "a number in a loop": (scaled(2.0), scaled(2.0 + 1e-15)),
     "the sign of a zero": (lambda x: jnp.arctan2(0.0, x), lambda x: jnp.arctan2(-0.0, x)),
     "a rule of differentiation": (with_rule(2.0), with_rule(3.0)),
@@ -91,15 +83,10 @@ def digest_of_a_run() -> str:
 
 @pytest.mark.slow
 def test_two_processes_agree():
-    done = subprocess.run(
-        [sys.executable, __file__],
-        env={**os.environ, "PYTHONHASHSEED": "1", "JAX_ENABLE_X64": "1"},
-        check=True,
-        capture_output=True,
-        text=True,
-    )
-    assert done.stdout.strip() == digest_of_a_run()
-    assert len(digest_of_a_run()) == 64
+    environment = os.environ | {"PYTHONHASHSEED": "1", "JAX_ENABLE_X64": "1"}
+    command = [sys.executable, __file__]
+    done = subprocess.run(command, env=environment, check=True, capture_output=True, text=True)
+    assert len(done.stdout.strip()) == 64 and done.stdout.strip() == digest_of_a_run()
 
 
 if __name__ == "__main__":

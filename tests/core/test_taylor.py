@@ -1,7 +1,5 @@
 """Taylor arithmetic against nested forward differentiation, and against series that are known."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,19 +24,21 @@ FUNCTIONS = {
 
 
 def curve(seed=0, size=3):
-    """Positive values of two arguments, and derivatives of any sign."""
     rng = np.random.default_rng(seed)
     start = tuple(jnp.asarray(rng.uniform(0.4, 1.5, size)) for _ in range(2))
     return [start, *[tuple(jnp.asarray(rng.normal(size=(2, size)))) for _ in range(ORDER)]]
 
 
+def assert_close(found, expected, tolerance):
+    for x, y in zip(found, expected, strict=True):
+        np.testing.assert_allclose(x, y, rtol=tolerance, atol=tolerance)
+
+
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_equal_to_nested_forward_differentiation(name):
     found = taylor.along(FUNCTIONS[name], curve())
-    expected = taylor._by_nested_jvp(FUNCTIONS[name], curve())
     assert len(found) == ORDER + 1
-    for x, y in zip(found, expected, strict=True):
-        np.testing.assert_allclose(x, y, rtol=1e-10, atol=1e-10)
+    assert_close(found, taylor._by_nested_jvp(FUNCTIONS[name], curve()), 1e-10)
 
 
 def test_a_function_without_a_rule_is_differentiated_by_nested_jvp():
@@ -47,10 +47,8 @@ def test_a_function_without_a_rule_is_differentiated_by_nested_jvp():
 
     with pytest.raises(taylor.NoRuleError):
         taylor._by_taylor_arithmetic(with_condition, curve())
-    found = taylor.along(with_condition, curve())
     expected = taylor.along(lambda x, y: x * y, curve())
-    for x, y in zip(found, expected, strict=True):
-        np.testing.assert_allclose(x, y, rtol=1e-12)
+    assert_close(taylor.along(with_condition, curve()), expected, 1e-12)
 
 
 @pytest.mark.slow
@@ -59,13 +57,10 @@ def test_solutions_of_equations(solver):
     """Functions with a derivative rule of first order (`jax.custom_jvp`) are written out."""
 
     def solution(x, y):
-        matrix = jnp.diag(2.0 + x**2) + 0.3 * jnp.outer(y, y)
-        return solver(matrix, x * y)
+        return solver(jnp.diag(2.0 + x**2) + 0.3 * jnp.outer(y, y), x * y)
 
     found = taylor.along(solution, curve())
-    expected = taylor._by_nested_jvp(solution, curve())
-    for x, y in zip(found, expected, strict=True):
-        np.testing.assert_allclose(x, y, rtol=1e-9, atol=1e-9)
+    assert_close(found, taylor._by_nested_jvp(solution, curve()), 1e-9)
 
 
 def test_derivatives_in_time():

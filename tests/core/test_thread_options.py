@@ -1,7 +1,5 @@
 """Options of JAX of a thread: the threads and workers of a study take those of their caller."""
 
-from __future__ import annotations
-
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
@@ -29,16 +27,9 @@ VALUES = {
 }
 """Two values of each option that is not a truth value."""
 NOT_TRANSFERRED = {
-    "allow_f16_reductions",
-    "array_garbage_collection_guard",
-    "auto_pcast",
-    "enable_custom_prng",
-    "jax2tf_associative_scan_reductions",
-    "legacy_prng_key",
-    "no_execution",
-    "no_tracing",
-    "remove_size_one_mesh_axis_from_type",
-    "thread_guard",
+    *("allow_f16_reductions", "array_garbage_collection_guard", "auto_pcast"),
+    *("enable_custom_prng", "jax2tf_associative_scan_reductions", "legacy_prng_key"),
+    *("no_execution", "no_tracing", "remove_size_one_mesh_axis_from_type", "thread_guard"),
 }
 """Public options that change no result of this package, or that forbid work in other threads."""
 
@@ -66,15 +57,9 @@ def seen(monkeypatch):
     return found
 
 
-def another_value(name: str):
-    """A value of an option that differs from that of the process."""
-    process_value = getattr(jax.config, name)
-    return next(value for value in VALUES.get(name, (False, True)) if value != process_value)
-
-
 @pytest.mark.parametrize("name", thread_options.OPTIONS)
 def test_threads_that_run_blocks_have_the_options_of_the_caller(name, seen):
-    value = another_value(name)
+    value = next(x for x in VALUES.get(name, (False, True)) if x != getattr(jax.config, name))
     with thread_options.OPTIONS[name](value):
         list(blocks.run_blocks(Prepared(), range(3)))
     threads = {thread for thread, _ in seen}
@@ -114,9 +99,8 @@ class ForgetfulExecutor(ThreadPoolExecutor):
 @pytest.mark.slow
 def test_workers_have_the_options_of_the_client(monkeypatch):
     found = []
-    run_spans = workers.run_spans_here
 
-    def recorded(*args):
+    def recorded(*args, run_spans=workers.run_spans_here):
         found.append(jax.config.jax_default_matmul_precision)
         return run_spans(*args)
 

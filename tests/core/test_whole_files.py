@@ -1,7 +1,5 @@
 """A file that is written whole holds the old content or the new one, whoever else writes it."""
 
-from __future__ import annotations
-
 import os
 
 import pytest
@@ -14,7 +12,8 @@ def path(tmp_path):
     """A file with the greatest length of a name, which exists."""
     path = tmp_path / ("n" * 255)
     path.write_bytes(b"old")
-    return path
+    yield path
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_the_content_is_on_the_disk_before_it_is_in_its_place(path, monkeypatch):
@@ -29,7 +28,6 @@ def test_the_content_is_on_the_disk_before_it_is_in_its_place(path, monkeypatch)
         file.write(b"the new content")
     assert synchronised == [15]
     assert path.read_bytes() == b"the new content"
-    assert list(path.parent.iterdir()) == [path]
 
 
 def test_two_writers_do_not_mix(path):
@@ -37,7 +35,6 @@ def test_two_writers_do_not_mix(path):
         one.write(b"one")
         other.write(b"the other")
     assert path.read_bytes() == b"one"
-    assert list(path.parent.iterdir()) == [path]
 
 
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
@@ -50,7 +47,6 @@ def test_a_failed_write_leaves_what_was_there(path, error):
     with pytest.raises(error):
         write()
     assert path.read_bytes() == b"old"
-    assert list(path.parent.iterdir()) == [path]
 
 
 def test_a_new_file_has_the_permissions_of_the_user(tmp_path):

@@ -1,14 +1,13 @@
 """Reverse mode by kernels: its gradients are those of the scan and of tangents, whatever the
 segments, the other runs and the threads, and its memory does not grow with the steps."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from arm_cases import light_loop
 
 import iblf_jax as ij
 from iblf_jax.core.status import Status
@@ -22,7 +21,6 @@ from iblf_jax.simulation.scenario import canonical
 from iblf_jax.tuning.quantities import Peak, Quantities, TimeIntegral
 
 pytestmark = pytest.mark.skipif(native.unavailable() is not None, reason="no C++ compiler")
-
 GAINS = np.array([[20.0, 20.0], [12.0, 25.0], [30.0, 8.0], [18.0, 18.0], [22.0, 9.0]])
 QUANTITIES = (TimeIntegral(), TimeIntegral("torque"), Peak(10.0))
 """Integrals, and a smooth maximum."""
@@ -49,9 +47,7 @@ class Problem:
         self.compiled = {}
 
     def function(self, backend):
-        """From the leaves to the outcome, and the gradient of the sum of all metrics of every
-        run.
-        """
+        """From the leaves to the outcome, and the gradient of the sum of all metrics."""
         request = self.request._replace(backend=backend)
 
         def gradient(varied):
@@ -96,15 +92,13 @@ def test_the_gradient_is_that_of_the_scan_and_of_tangents(problem, whole):
     outcome, gradient = whole
     by_scan, expected = problem.gradient("vmap")
     assert_close(gradient, expected, 1e-10)
-    np.testing.assert_allclose(
-        outcome.metrics["tuning_exact"], by_scan.metrics["tuning_exact"], rtol=1e-10
-    )
+    exact, others = (x.metrics["tuning_exact"] for x in (outcome, by_scan))
+    np.testing.assert_allclose(exact, others, rtol=1e-10)
     np.testing.assert_array_equal(outcome.status, by_scan.status)
     along = {"controller.K2": np.eye(4, 2), "plant.mass": np.eye(4, 2, -2)}
-    request = problem.request._replace(backend="native")
+    rest = (along, problem.folds, problem.dt, problem.request._replace(backend="native"))
     run = partial(execute.run_batch_jvp, problem.scenario)
-    tangents = jax.jit(lambda x: run(x, along, problem.folds, problem.dt, request).tangents)
-    tangents = tangents(problem.varied)
+    tangents = jax.jit(lambda x: run(x, *rest).tangents)(problem.varied)
     summed = sum(np.sum(tangents[name], axis=-1) for name in METRICS)
     found = np.concatenate([gradient["controller.K2"], gradient["plant.mass"]], axis=1)
     assert_close(found, summed, 1e-10)
@@ -115,18 +109,16 @@ def test_segments_other_runs_and_threads_change_no_bit(problem, whole, monkeypat
     monkeypatch.setattr(thresholds, "SEGMENT_BYTES", 1)
     for threads, runs in ((1, slice(0, 5)), (2, slice(1, 3))):
         monkeypatch.setattr(native, "threads", lambda threads=threads: threads)
-        varied = {path: x[runs] for path, x in problem.varied.items()}
+        varied, expected = jax.tree.map(lambda x, runs=runs: x[runs], (problem.varied, whole[1]))
         _, found = jax.jit(problem.function("native"))(varied)
-        for path, x in whole[1].items():
-            np.testing.assert_array_equal(found[path], x[runs])
+        jax.tree.map(np.testing.assert_array_equal, found, expected)
 
 
 @pytest.mark.slow
 def test_a_run_that_stops_has_the_gradient_of_the_scan(problem, whole):
     """Also where a step that is not made has no finite derivative; the other runs do not change."""
     gains = GAINS.copy()
-    gains[1] = 1e4
-    gains[3] = np.inf
+    gains[[1, 3]] = [[1e4], [np.inf]]
     varied = problem.varied | {"controller.K2": jnp.asarray(gains)}
     outcome, found = problem.gradient(varied=varied)
     by_scan, expected = problem.gradient("vmap", varied)
@@ -139,21 +131,13 @@ def test_a_run_that_stops_has_the_gradient_of_the_scan(problem, whole):
 
 
 @pytest.mark.slow
-def test_in_float32(whole):
+def test_in_float32_and_of_a_sampled_loop(whole):
     _, found = Problem(dtype="float32").gradient()
     assert found["plant.mass"].dtype == np.float32
     assert_close(found, whole[1], 2e-3)
-
-
-SAMPLED = ij.with_parts(
-    ij.with_parameters(ij.presets.zhang_yan_2024(), {"observer.kf": 4.0}),
-    sampling=ij.Sampling(period=5e-3, delay=2e-3),
-)
-
-
-@pytest.mark.slow
-def test_a_sampled_loop():
-    problem = Problem(SAMPLED, gains=0.2 * GAINS, method="heun")
+    weak = ij.with_parameters(ij.presets.zhang_yan_2024(), {"observer.kf": 4.0})
+    sampled = ij.with_parts(weak, sampling=ij.Sampling(period=5e-3, delay=2e-3))
+    problem = Problem(sampled, gains=0.2 * GAINS, method="heun")
     assert_close(problem.gradient()[1], problem.gradient("vmap")[1], 1e-10)
 
 
@@ -175,10 +159,8 @@ def programs(problem: Problem):
 @pytest.mark.slow
 def test_the_adjoint_has_at_most_three_operations_for_each_of_the_step():
     """So a gradient takes less than six values: the run, the run once more, and its adjoint."""
-    step, adjoint = (
-        sum(program.counts()[PER_RUN | TIME].values())
-        for program in programs(Problem(method="rk4"))
-    )
+    both = programs(Problem(method="rk4"))
+    step, adjoint = (sum(program.counts()[PER_RUN | TIME].values()) for program in both)
     assert 1.5 * step < adjoint < 3 * step
 
 
@@ -193,7 +175,6 @@ def largest_array(jaxpr) -> int:
 @pytest.mark.slow
 def test_the_memory_grows_as_the_square_root_of_the_steps(monkeypatch):
     monkeypatch.setattr(thresholds, "SEGMENT_BYTES", 1)
-
     small, large = (largest_array(Problem(steps=T).traced("native")) for T in (10_000, 40_000))
     assert small > 100 * len(GAINS)
     assert large < 2.05 * small
@@ -213,19 +194,13 @@ def test_a_step_whose_adjoint_does_not_lower_is_differentiated_by_the_scan(probl
         problem.traced("native")
 
 
-def simulated(scenario, backend="auto", every=7):
-    """A loss of records and metrics as a function of leaves."""
+SHORT = {"duration": 0.05, "dt": 1e-3, "method": "euler", "record_every": 7}
 
+
+def simulated(scenario, backend="auto"):
     def loss(values):
-        run = ij.simulate(
-            ij.with_parameters(scenario, values),
-            duration=0.05,
-            dt=1e-3,
-            method="euler",
-            metrics=[ij.metrics.Tracking()],
-            record_every=every,
-            backend=backend,
-        )
+        changed = ij.with_parameters(scenario, values)
+        run = ij.simulate(changed, **SHORT, metrics=[ij.metrics.Tracking()], backend=backend)
         return jnp.mean(run.e1**2) + jnp.sum(run.tau[-1]) * 1e-3 + jnp.sum(run.metrics.rmse)
 
     return loss
@@ -235,9 +210,8 @@ def simulated(scenario, backend="auto", every=7):
 def in_reverse(monkeypatch):
     """Single runs are differentiated in reverse mode by any number of leaves; counts the calls."""
     calls = []
-    original = ReverseRun.backward
 
-    def backward(run, stored, cotangents: Cotangents):
+    def backward(run, stored, cotangents: Cotangents, original=ReverseRun.backward):
         calls.append(run.runs)
         return original(run, stored, cotangents)
 
@@ -246,12 +220,7 @@ def in_reverse(monkeypatch):
     return calls
 
 
-LIGHT = ij.with_parts(
-    ij.presets.zhang_yan_2024(),
-    controller=ij.controllers.PDGravity(Kp=60.0, Kd=20.0),
-    observer=ij.observers.NoObserver(),
-)
-"""Its derivatives compile sooner than those of the paper's loop."""
+LIGHT = light_loop()
 
 
 @pytest.mark.slow
@@ -304,18 +273,10 @@ def test_a_step_reads_a_series_from_its_last_row(segment):
     runs, steps = 11, 300
     series, weight = rng.normal(size=(steps, 2, runs)), rng.normal(size=runs)
     start = pack([jnp.zeros(runs)], one, number, runs)
-    end, _ = cpu.run(
-        program,
-        jnp.zeros(0),
-        jnp.asarray(weight[None]),
-        start,
-        steps,
-        series=jnp.asarray(series),
-        build=cpu.Build(segment),
-        threads=2,
-    )
+    options = {"series": jnp.asarray(series), "build": cpu.Build(segment), "threads": 2}
+    per_run = jnp.asarray(weight[None])
+    end, _ = cpu.run(program, jnp.zeros(0), per_run, start, steps, **options)
     expected = np.zeros(runs)
-    for k in range(steps):
-        row = series[steps - 1 - k]
+    for k, row in enumerate(series[::-1]):
         expected = 0.5 * expected + weight * row[0] + row[1] * k
     np.testing.assert_allclose(end.floats[0], expected, rtol=1e-13)

@@ -1,7 +1,5 @@
 """A batch whose parts are compiled one by one: the same results, and parts that are shared."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import jax
@@ -21,17 +19,14 @@ GAINS = {"controller.K2": np.asarray([[20.0, 20.0], [5.0, 60.0], [4e3, 20.0]])}
 
 
 def sampled():
-    sensor = ij.sensors.Encoder(
-        counts=2.0**14, velocity=ij.sensors.FilteredDifference(cutoff=300.0)
-    )
-    return ij.with_parts(
-        ij.presets.zhang_yan_2024(), sampling=ij.Sampling(period=2 * DT), sensor=sensor
-    )
+    velocity = ij.sensors.FilteredDifference(cutoff=300.0)
+    parts = {"sampling": ij.Sampling(period=2 * DT)}
+    parts["sensor"] = ij.sensors.Encoder(counts=2.0**14, velocity=velocity)
+    return ij.with_parts(ij.presets.zhang_yan_2024(), **parts)
 
 
 @pytest.fixture(params=[ij.presets.zhang_yan_2024, sampled], ids=["continuous", "sampled"])
 def problem(request):
-    """Scenario, runs, metrics and time step."""
     scenario = canonical(request.param())
     dtype = scenario.initial.q.dtype
     varied = {path: jnp.asarray(x, dtype) for path, x in GAINS.items()}
@@ -72,10 +67,8 @@ def test_only_the_steps_are_compiled_for_another_number_of_steps(problem):
     half = run_batch_in_parts(*others, 0.5 * dt, request_for(problem[0], 80))
     assert np.subtract(compiled_programs(), before).tolist() == [0, 1, 0]
     batch = compile_batch(request_for(problem[0], 80), *others, 0.5 * dt)
-    by_one = jax.jit(partial(batch))
-    np.testing.assert_allclose(
-        half.metrics["rmse"], by_one(*others, 0.5 * dt).metrics["rmse"], rtol=1e-6
-    )
+    by_one = jax.jit(partial(batch))(*others, 0.5 * dt)
+    np.testing.assert_allclose(half.metrics["rmse"], by_one.metrics["rmse"], rtol=1e-6)
 
 
 @pytest.mark.slow

@@ -10,10 +10,9 @@ writes a file, in which each field is a line, so that `diff` names what moved.  
 is meant to move numbers, `tests/data/digests.json` as FILE writes the stored file anew.
 """
 
-from __future__ import annotations
-
 import functools
 import hashlib
+import itertools
 import json
 import math
 import os
@@ -58,21 +57,17 @@ def signal(values: Any) -> dict[str, Any]:
 
 
 def structure_fields(preset: str) -> dict[str, Any]:
-    """The paths of all parameters, and the scenario file."""
     scenario = ij.presets.PRESETS[preset]()
     paths = [row.path for row in ij.parameters(scenario)]
     return {"paths": paths, "file": scenario_to_toml(scenario)}
 
 
 def run_fields(preset: str) -> dict[str, Any]:
-    """Signals and metrics of the run."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ij.SimulationWarning)
+    with warnings.catch_warnings(action="ignore", category=ij.SimulationWarning):
         run = ij.simulate(ij.presets.PRESETS[preset](), duration=0.2, dt=5e-4)
-    metrics = {name: np.asarray(x) for name, x in run.metrics.items()}
-    return {name: signal(np.asarray(getattr(run, name))) for name in SIGNALS} | {
-        f"metric {name}": with_digest(x, values=x) for name, x in metrics.items()
-    }
+    signals = {name: signal(np.asarray(getattr(run, name))) for name in SIGNALS}
+    metrics = {f"metric {name}": np.asarray(x) for name, x in run.metrics.items()}
+    return signals | {name: with_digest(x, values=x) for name, x in metrics.items()}
 
 
 GROUPS = {"structure": structure_fields, "run": run_fields}
@@ -101,8 +96,8 @@ def is_same(found: Any, stored: Any, slack: float = ABSOLUTE) -> bool:
             is_same(found[key], x, slack) for key, x in stored.items() if key != "sha256"
         )
     if isinstance(stored, list):
-        pairs = zip(found, stored, strict=False)
-        return len(found) == len(stored) and all(is_same(a, b, slack) for a, b in pairs)
+        pairs = itertools.zip_longest(found, stored)
+        return all(is_same(a, b, slack) for a, b in pairs)
     if isinstance(stored, float):
         both_nan = math.isnan(stored) and math.isnan(found)
         return both_nan or math.isclose(found, stored, rel_tol=RELATIVE, abs_tol=slack)
@@ -117,7 +112,6 @@ def moved(found: dict[str, Any], stored: dict[str, Any]) -> dict[str, tuple[Any,
 
 @functools.cache
 def stored_file() -> dict[str, Any]:
-    """The stored numbers."""
     return json.loads(FILE.read_text())  # type: ignore[no-any-return]
 
 

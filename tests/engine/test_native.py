@@ -5,8 +5,6 @@ The paper's preset goes by Runge-Kutta, the others by Euler's method, which has 
 compile.
 """
 
-from __future__ import annotations
-
 from functools import partial
 
 import jax
@@ -41,8 +39,6 @@ def draws(name, scenario, dtype):
 
 
 outcome_of = partial(jax.jit, static_argnames="request")(run_batch)
-
-
 CASES = [
     *(("zhang_yan_2024", "float64"), ("zhang_yan_2024", "float32")),
     *(("zhang_yan_2024_full_state", "float64"), ("motor_driven_pendulum", "float64")),

@@ -1,8 +1,6 @@
 """Runs of plants in strict-feedback form by every executor, their derivatives, and the tools that
 choose a step or a period."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import loops_of_plants
@@ -23,9 +21,8 @@ def test_names_and_a_solution_of_scipy():
     scenario = CASES["electric drive"]()
     field = ij.vector_field(scenario)
     assert "x[2, 0]" in field.names
-    found = solve_ivp(
-        field, (0.0, 0.3), np.asarray(field.start), rtol=1e-10, atol=1e-12, method="LSODA"
-    )
+    options = {"rtol": 1e-10, "atol": 1e-12, "method": "LSODA"}
+    found = solve_ivp(field, (0.0, 0.3), np.asarray(field.start), **options)
     run = ij.simulate(scenario, **SHORT)
     np.testing.assert_allclose(found.y[: scenario.n, -1], run.q[-1], atol=1e-9)
     np.testing.assert_array_equal(field.unpack(found.y.T).x.shape[1:], run.x.shape[1:])
@@ -53,11 +50,9 @@ def test_derivatives_by_leaves_are_differences(case):
     np.testing.assert_allclose(sum(reverse.values()), forward, rtol=1e-9)
     for path, x in start.items():
         size = 1e-6 * max(1.0, float(jnp.max(jnp.abs(x))))
-        ends = (error(start | {path: x + sign * size}) for sign in (1, -1))
-        difference = next(ends) - next(ends)
-        np.testing.assert_allclose(
-            reverse[path], difference / (2.0 * size), rtol=1e-3, atol=1e-6, err_msg=path
-        )
+        ends = [error(start | {path: x + sign * size}) for sign in (1, -1)]
+        slope = (ends[0] - ends[1]) / (2.0 * size)
+        np.testing.assert_allclose(reverse[path], slope, rtol=1e-3, atol=1e-6, err_msg=path)
 
 
 @pytest.mark.slow

@@ -5,8 +5,6 @@ Where plain JAX ends is in a file, because XLA's programs of all members take lo
 `python tests/engine/test_programs_of_members.py` computes it anew.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import pickle
@@ -31,7 +29,6 @@ METHOD = "euler"
 has another (`member_runs.fitting`)."""
 ALIKE = ["barrier tan", "barrier mapping"]
 """Members whose programs differ in nothing but their operations."""
-
 pytestmark = pytest.mark.skipif(native.unavailable() is not None, reason="no C++ compiler")
 
 
@@ -44,29 +41,22 @@ def answers(lines: list[str], folder: Path, *options: str) -> dict[tuple[str, st
         "JAX_ENABLE_COMPILATION_CACHE": "1",
         "PYTHONWARNINGS": "ignore",
     }
-    done = subprocess.run(
-        [sys.executable, str(TESTS / "member_runs.py"), str(folder), *options],
-        input="\n".join(lines),
-        env=environment,
-        capture_output=True,
-        text=True,
-    )
+    command = [sys.executable, str(TESTS / "member_runs.py"), str(folder), *options]
+    text = "\n".join(lines)
+    done = subprocess.run(command, input=text, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     found = [json.loads(line) for line in done.stdout.splitlines()]
     return {(x["name"], x["backend"]): x["end"] for x in found}
 
 
 def scenarios() -> dict[str, Callable[[], ij.Scenario]]:
-    """Name of a member -> function that makes its scenario."""
     import scenarios_of_members  # it computes, and not all tests here need it
 
     return scenarios_of_members.scenarios()
 
 
 def write_pickles(names: list[str], folder: Path) -> None:
-    """Writes scenarios to files.  A process that made its scenario itself would compile the
-    operations of all others first.
-    """
+    """A process that made its scenario itself would compile the operations of all others first."""
     folder.mkdir(exist_ok=True)
     make = scenarios()
     for name in names:
@@ -74,21 +64,14 @@ def write_pickles(names: list[str], folder: Path) -> None:
 
 
 def in_any_order(lines: list[str]) -> list[str]:
-    """The lines, shuffled."""
     return random.Random(0 if os.environ.get("CI") else None).sample(lines, len(lines))
 
 
-def numbers_of(end: list) -> np.ndarray:
-    """An answer as an array."""
-    return np.concatenate(end, axis=None)
-
-
 def check_ends(found: dict[tuple[str, str], list], expected: dict[str, np.ndarray]) -> None:
-    """Compares where compiled runs end."""
     for name, end in expected.items():
-        scale = max(1.0, np.abs(end).max())
-        one = numbers_of(found[name, "native"])
-        np.testing.assert_allclose(one, end, rtol=0, atol=1e-9 * scale, err_msg=name)
+        atol = 1e-9 * max(1.0, np.abs(end).max())
+        one = np.ravel(found[name, "native"])
+        np.testing.assert_allclose(one, end, rtol=0, atol=atol, err_msg=name)
 
 
 @pytest.mark.slow
@@ -96,7 +79,7 @@ def test_laws_that_are_alike_have_their_own_programs(tmp_path):
     write_pickles(ALIKE, tmp_path)
     lines = [f"{backend} rk4 {name}" for name in ALIKE for backend in ("native", "vmap")]
     together = answers(in_any_order(lines), tmp_path)
-    check_ends(together, {name: numbers_of(together[name, "vmap"]) for name in ALIKE})
+    check_ends(together, {name: np.ravel(together[name, "vmap"]) for name in ALIKE})
     apart = answers([f"native rk4 {name}" for name in ALIKE], tmp_path, "--apart")
     assert apart == {key: end for key, end in together.items() if key[1] == "native"}
 
@@ -119,12 +102,11 @@ def test_every_member_has_its_own_program(tmp_path_factory, part):
 
 
 def write() -> None:
-    """Writes STORED by plain JAX."""
     names = sorted(scenarios())
     with tempfile.TemporaryDirectory() as folder:
         write_pickles(names, Path(folder))
         found = answers([f"vmap {METHOD} {name}" for name in names], Path(folder))
-    ends = {name: numbers_of(end).tolist() for (name, _), end in found.items()}
+    ends = {name: np.ravel(end).tolist() for (name, _), end in found.items()}
     lines = [f" {json.dumps(name)}: {json.dumps(end)}" for name, end in ends.items()]
     STORED.write_text("{\n" + ",\n".join(lines) + "\n}\n")
 

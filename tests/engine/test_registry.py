@@ -1,28 +1,19 @@
 """The registry of executors: a record that is added is used, and an unknown name is an error."""
 
-from __future__ import annotations
-
 import warnings
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from arm_cases import light_loop
 
 import iblf_jax as ij
 from iblf_jax.core import devices
 from iblf_jax.core.caches import CACHE
-from iblf_jax.engine import (
-    RunRequest,
-    check_backend,
-    compile,
-    compile_batch,
-    native,
-    plan,
-    registry,
-    single_run,
-)
+from iblf_jax.engine import RunRequest, compile, compile_batch, native, registry, single_run
 from iblf_jax.engine.period import radius_at
+from iblf_jax.engine.plan import ExecutionPlan
 from iblf_jax.kernels import StoppedError, ToolchainError, UnsupportedError
 from iblf_jax.simulation.scenario import canonical
 
@@ -32,47 +23,51 @@ SHORT = {"duration": 0.02, "dt": 1e-3, "method": "euler", "metrics": (ij.metrics
 
 @pytest.fixture(scope="module")
 def scenario():
-    return ij.with_parts(
-        ij.presets.zhang_yan_2024(),
-        controller=ij.controllers.PDGravity(Kp=60.0, Kd=20.0),
-        observer=ij.observers.NoObserver(),
-    )
+    return light_loop()
+
+
+DRAWS = {"controller.Kp": ij.factor(ij.uniform(0.9, 1.1))}
 
 
 @pytest.fixture
-def added(monkeypatch):
-    """An executor "mine", first of all for this platform; the names of its calls."""
-    for part in (single_run._initialize, single_run._all_steps, single_run._finalize):
-        part.clear_cache()  # which would hold another test's "mine"
-    calls = []
+def use(monkeypatch):
+    """Adds an executor of this platform, first of all or the only one; the names of its calls."""
 
-    def run(*arguments):
-        calls.append("run")
-        return native.run(*arguments)
+    def added(name="mine", run=native.run, build=native.build, others=()):
+        calls = []
 
-    def build(*arguments):
-        calls.append("build")
-        return native.build(*arguments)
+        def counted(call, function):
+            def called(*arguments):
+                calls.append(call)
+                return function(*arguments)
 
-    mine = registry.Executor("mine", (devices.platform(),), run, lambda: None, build)
-    monkeypatch.setattr(registry, "EXECUTORS", {"mine": mine, **registry.EXECUTORS})
-    return calls
+            return called
+
+        functions = counted("run", run), lambda: None, counted("build", build)
+        one = registry.Executor(name, (devices.platform(),), *functions)
+        monkeypatch.setattr(registry, "EXECUTORS", {name: one, **dict(others)})
+        CACHE.clear(compile.WARNINGS)
+        return calls
+
+    return added
 
 
 @pytest.mark.slow
 @needs_compiler
-def test_an_added_executor_makes_runs(scenario, added):
+def test_an_added_executor_makes_runs(scenario, use):
+    for part in (single_run._initialize, single_run._all_steps, single_run._finalize):
+        part.clear_cache()  # which would hold another test's "mine"
+    added = use(others=registry.EXECUTORS)
     expected = ij.simulate(scenario, **SHORT, backend="vmap")
     assert added == []
     found = ij.simulate(scenario, **SHORT)
     np.testing.assert_allclose(found.q, expected.q, rtol=1e-12)
     assert added == ["run"] * 3, "the start, the steps, the end"
     added.clear()
-    perturbed = {"controller.Kp": ij.factor(ij.uniform(0.9, 1.1))}
-    study = ij.monte_carlo(scenario, perturbed, runs=3, **SHORT, backend="mine")
+    study = ij.monte_carlo(scenario, DRAWS, runs=3, **SHORT, backend="mine")
     assert study.setup.program.batch.backend == "mine"
     assert (added.count("build"), added.count("run")) == (2, 3)
-    other = ij.monte_carlo(scenario, perturbed, runs=3, **SHORT, backend="vmap")
+    other = ij.monte_carlo(scenario, DRAWS, runs=3, **SHORT, backend="vmap")
     np.testing.assert_allclose(study.metrics["margin"], other.metrics["margin"], rtol=1e-12)
 
 
@@ -81,7 +76,6 @@ def test_an_unknown_name_is_an_error(scenario, backend):
     loop, varied = canonical(scenario), {"controller.Kp": jnp.ones((2, 2))}
     request = RunRequest(10, backend=backend)
     for call in (
-        lambda: check_backend(backend),
         lambda: RunRequest.of(loop, steps=10, backend=backend),
         lambda: compile_batch(request, loop, varied, (), jnp.asarray(1e-3)),
         lambda: ij.simulate(scenario, **SHORT, backend=backend),
@@ -104,9 +98,8 @@ def test_where_no_kernel_can_be_compiled_auto_runs_by_the_scan(scenario, monkeyp
     with pytest.warns(compile.BackendWarning, match=r"iblf_jax\[export\].*running on vmap"):
         found = ij.simulate(scenario, **SHORT)
     np.testing.assert_array_equal(found.q, expected.q)
-    perturbed = {"controller.Kp": ij.factor(ij.uniform(0.9, 1.1))}
     with warnings.catch_warnings(action="error"):
-        study = ij.monte_carlo(scenario, perturbed, runs=3, **SHORT)
+        study = ij.monte_carlo(scenario, DRAWS, runs=3, **SHORT)
     assert study.backend == "vmap"
 
 
@@ -122,7 +115,7 @@ def test_where_no_kernel_can_be_compiled_auto_runs_by_the_scan(scenario, monkeyp
 def test_one_place_falls_back(monkeypatch, failures, tried, result):
     """To the next executor where one is not available, to the scan where a step does not lower."""
     monkeypatch.setattr(registry, "EXECUTORS", {"one": "one", "two": "two"})
-    execution = plan.ExecutionPlan(("one", "two"), reports_unsupported=False)
+    execution = ExecutionPlan(("one", "two"), reports_unsupported=False)
     calls = []
 
     def attempt(name):
@@ -132,8 +125,7 @@ def test_one_place_falls_back(monkeypatch, failures, tried, result):
         return name
 
     CACHE.clear(compile.WARNINGS)
-    with warnings.catch_warnings(record=True) as given:
-        warnings.simplefilter("always")
+    with warnings.catch_warnings(record=True, action="always") as given:
         assert compile.first_that_works(execution, attempt, lambda: "scan") == result
     assert calls == tried
     missing = [str(x) for x in failures.values() if isinstance(x, ToolchainError)]
@@ -141,17 +133,14 @@ def test_one_place_falls_back(monkeypatch, failures, tried, result):
 
 
 @pytest.mark.parametrize("stops", [1, 2])
-def test_a_stopped_compiler_does_not_decide_the_plan_of_a_batch(scenario, monkeypatch, stops):
+def test_a_stopped_compiler_does_not_decide_the_plan_of_a_batch(scenario, use, stops):
     """One more attempt; after a second stop an error, which is not kept."""
-    calls = []
 
-    def build(*arguments):
-        calls.append("build")
+    def build(*_):
         if len(calls) <= stops:
             raise StoppedError("the compiler was stopped")
 
-    mine = registry.Executor("mine", (devices.platform(),), None, lambda: None, build)
-    monkeypatch.setattr(registry, "EXECUTORS", {"mine": mine})
+    calls = use(build=build)
     CACHE.clear()
     request = RunRequest(10, backend="mine")
     arguments = (canonical(scenario), {"controller.Kp": jnp.ones((2, 2))}, (), jnp.asarray(1e-3))
@@ -187,18 +176,9 @@ def runs_without_its_function(*arguments):
         (runs_without_its_function, "a kernel does not load: .*iblf_jax_kernel"),
     ],
 )
-def test_what_cannot_be_loaded_runs_by_the_scan(scenario, monkeypatch, run, reason):
+def test_what_cannot_be_loaded_runs_by_the_scan(scenario, use, run, reason):
     """With one warning, and one attempt in a process."""
-    calls = []
-
-    def counted(*arguments):
-        calls.append("run")
-        return run(*arguments)
-
-    broken = registry.Executor(
-        run.__name__, (devices.platform(),), counted, lambda: None, native.build
-    )
-    monkeypatch.setattr(registry, "EXECUTORS", {broken.name: broken})
+    calls = use(run.__name__, run)
     with pytest.warns(compile.BackendWarning, match=rf"{reason}.*running on vmap") as given:
         found = ij.simulate(scenario, **SHORT)
     assert [x.category for x in given] == [compile.BackendWarning]
@@ -213,38 +193,24 @@ def test_what_cannot_be_loaded_runs_by_the_scan(scenario, monkeypatch, run, reas
 
 @pytest.mark.slow
 @needs_compiler
-def test_a_study_falls_back_outside_of_its_program(scenario, monkeypatch):
+def test_a_study_falls_back_outside_of_its_program(scenario, use):
     """The program of an executor is never that of the scan, which would be kept under its name."""
-    broken = registry.Executor(
-        *("broken", (devices.platform(),), calls_what_xla_does_not_know),
-        *(lambda: None, native.build),
-    )
-    perturbed = {"controller.Kp": ij.factor(ij.uniform(0.9, 1.1))}
-    expected = ij.monte_carlo(scenario, perturbed, runs=3, **SHORT, backend="vmap")
-    monkeypatch.setattr(registry, "EXECUTORS", {broken.name: broken})
-    CACHE.clear(compile.WARNINGS)
+    expected = ij.monte_carlo(scenario, DRAWS, runs=3, **SHORT, backend="vmap")
+    use("broken", calls_what_xla_does_not_know)
     with pytest.warns(compile.BackendWarning, match=r"XLA failed: .*running on vmap"):
-        found = ij.monte_carlo(scenario, perturbed, runs=3, **SHORT)
+        found = ij.monte_carlo(scenario, DRAWS, runs=3, **SHORT)
     for name, values in expected.metrics.items():
         np.testing.assert_array_equal(found.metrics[name], values)
 
 
 @pytest.mark.slow
 @needs_compiler
-def test_jacobians_of_a_sampled_loop_fall_back_once(scenario, monkeypatch):
+def test_jacobians_of_a_sampled_loop_fall_back_once(scenario, use, monkeypatch):
     """Periods that are tried one after the other try a broken executor once."""
-    calls = []
-
-    def counted(*arguments):
-        calls.append("run")
-        return calls_what_xla_does_not_know(*arguments)
-
     sampled = canonical(ij.with_parts(scenario, sampling=ij.Sampling(period=1e-3)))
     monkeypatch.setattr(registry, "EXECUTORS", {})
     expected = radius_at(sampled, 2e-3, np.zeros(0))
-    broken = registry.Executor("broken", (devices.platform(),), counted, lambda: None, native.build)
-    monkeypatch.setattr(registry, "EXECUTORS", {broken.name: broken})
-    CACHE.clear(compile.WARNINGS)
+    calls = use("broken", calls_what_xla_does_not_know)
     with pytest.warns(compile.BackendWarning, match=r"XLA failed: .*running on vmap"):
         found = radius_at(sampled, 2e-3, np.zeros(0))
     assert calls

@@ -1,7 +1,5 @@
 """`Runs`: the shared arguments of runs as one object, in place of keywords."""
 
-from __future__ import annotations
-
 import dataclasses
 import inspect
 

@@ -1,8 +1,6 @@
 """A run says how accurate it is: its estimate against runs at a sixteenth of the step, its flags,
 and the step that is recommended."""
 
-from __future__ import annotations
-
 import dataclasses
 import warnings
 from functools import partial
@@ -164,9 +162,7 @@ def test_no_step_will_do(shaken, monkeypatch):
 @pytest.mark.slow
 def test_a_study_names_the_step_that_its_runs_need(paper):
     perturbations = {"controller.K2": ij.factor(ij.uniform(0.5, 6.0))}
-    words = (
-        r"dt = 0\.001 s is too large for \d+ of 256 runs.* Take dt=0\.000[12]; ij\.recommended_dt"
-    )
+    words = r"dt = 0\.001 s is too large for \d+ of 256 runs.* Take dt=0\.000[12]; ij\.recommend"
     with pytest.warns(UserWarning, match=words):
         ij.monte_carlo(paper, perturbations, runs=256, duration=0.1)
     dt = ij.recommended_dt(paper, duration=0.1, perturbations=perturbations)
@@ -177,36 +173,29 @@ def test_a_study_names_the_step_that_its_runs_need(paper):
     assert study.status_counts["STEP_TOO_LARGE"] == 0
 
 
-KEPT, FAILED = Status.STEP_TOO_LARGE, Status.STEP_TOO_LARGE | Status.BOUND_VIOLATED
-
-
-def studied(*runs):
-    """The arrays of a study: flags, fastest mode and error of each run."""
-    status, modes = zip(*runs, strict=True)
-    return np.array(list(map(int, status))), np.array(modes), np.zeros(len(runs))
+KEPT = int(Status.STEP_TOO_LARGE)
+FAILED = int(Status.STEP_TOO_LARGE | Status.BOUND_VIOLATED)
 
 
 @pytest.mark.parametrize(
     ("runs", "words"),
     [
         (((KEPT, 5e4), (FAILED, 1e12)), r"Take dt=2e-05;.* 1 of them left their bounds"),
-        (((FAILED, 1e12), (Status(0), 1.0)), r"Take dt=0.0001;.* 1 of them left their bounds"),
+        (((FAILED, 1e12), (0, 1.0)), r"Take dt=0.0001;.* 1 of them left their bounds"),
         (((KEPT, 5e3),), r"1 of 1 runs(?!.*left their bounds)"),
     ],
 )
 def test_failed_runs_reduce_the_step_at_most_ten_times(runs, words):
+    status, modes = map(np.array, zip(*runs, strict=True))
     with pytest.warns(UserWarning, match=words):
-        time_step.warn_of_step(*studied(*runs), 1e-3, "rk4")
+        time_step.warn_of_step(status, modes, np.zeros(len(runs)), 1e-3, "rk4")
 
 
 def test_folds_may_not_take_its_names(paper):
-    @ij.component
-    class Mine:
-        units = {RELATIVE: "1"}  # noqa: RUF012
-        init = update = finish = None
-
+    members = {"units": {RELATIVE: "1"}} | dict.fromkeys(("init", "update", "finish"))
+    mine = ij.component(type("Mine", (), members))()
     with pytest.raises(ValueError, match="every run returns"):
-        ij.simulate(paper, **SHORT, metrics=(Mine(),))
+        ij.simulate(paper, **SHORT, metrics=(mine,))
 
 
 def test_round_steps():
@@ -220,9 +209,8 @@ def test_round_steps():
 def test_solve(rng, size):
     matrix, rhs = rng.normal(size=(size, size)), rng.normal(size=(size, 3))
     matrix[0, 0] = 0.0 if size > 1 else 2.0  # so that it has to pivot
-    np.testing.assert_allclose(
-        linalg.solve(jnp.asarray(matrix), jnp.asarray(rhs)), np.linalg.solve(matrix, rhs), rtol=1e-9
-    )
+    found = linalg.solve(jnp.asarray(matrix), jnp.asarray(rhs))
+    np.testing.assert_allclose(found, np.linalg.solve(matrix, rhs), rtol=1e-9)
 
 
 @ij.component
@@ -269,11 +257,8 @@ def test_an_infinite_slope_at_one_instant_is_no_fast_mode(paper):
 SLOW = ij.with_parameters(ij.presets.zhang_yan_2024(), {"controller.K2": 4.0, "observer.kf": 4.0})
 LATE = 0.2137
 MANY = (
-    (0.0, (3.0, 1.0)),
-    (0.1, (-4.0, 2.0)),
-    (LATE, (20.0, 5.0)),
-    (0.2151, (-9.0, -3.0)),
-    (7.0, (50.0, 50.0)),
+    *((0.0, (3.0, 1.0)), (0.1, (-4.0, 2.0)), (LATE, (20.0, 5.0))),
+    *((0.2151, (-9.0, -3.0)), (7.0, (50.0, 50.0))),
 )
 """At the start, at the edge of a step, two within one step of 4 ms, and after the end."""
 
@@ -294,9 +279,8 @@ def split(steps, **fields):
 def test_jumps_cost_no_order(method):
     """The error is that of a smooth loop, and the estimate is not below it."""
     scenario, truth = with_steps(SLOW, MANY), split(MANY)
-    run = {
-        dt: ij.simulate(scenario, duration=0.4, dt=dt, method=method) for dt in (4e-3, 2e-3, 2.5e-4)
-    }
+    simulated = partial(ij.simulate, scenario, duration=0.4, method=method)
+    run = {dt: simulated(dt=dt) for dt in (4e-3, 2e-3, 2.5e-4)}
     error = {dt: np.abs(x.q[-1] - truth[:2]) for dt, x in run.items()}
     assert np.all(np.log2(error[2e-3] / error[2.5e-4]) / 3 > TABLEAUS[method].order - 0.25)
     assert np.all(run[4e-3].metrics.numerical_error > 0.3 * error[4e-3])
@@ -374,14 +358,9 @@ class Switched:
 
 MOTOR = ij.actuators.Motor(bandwidth=300.0)
 PARTS = {
-    "reference": {"reference": Switched(before=[0.7, 0.7], after=[0.72, 0.69], time=0.0537)},
-    "actuator": {
-        "actuator": ij.actuators.Chain((ij.actuators.Fault(0.8, time=0.0537), MOTOR)),
-    },
-    "plant": {
-        "plant": ij.plants.Switched(SLOW.plant, {"payload": (0.0, 0.5)}, [0.0537]),
-        "model": SLOW.plant,
-    },
+    "reference": Switched(before=[0.7, 0.7], after=[0.72, 0.69], time=0.0537),
+    "actuator": ij.actuators.Chain((ij.actuators.Fault(0.8, time=0.0537), MOTOR)),
+    "plant": ij.plants.Switched(SLOW.plant, {"payload": (0.0, 0.5)}, [0.0537]),
 }
 
 
@@ -390,49 +369,31 @@ PARTS = {
 def test_every_part_may_jump(part):
     """What is switched at 0.0537 s costs no order: the errors at 4 and 1 ms are those of a smooth
     loop."""
-    quiet = dataclasses.replace(SLOW, disturbance=ij.disturbances.Nothing(), **PARTS[part])
-    truth, coarse, fine = (
-        np.asarray(ij.simulate(quiet, duration=0.12, dt=dt).q[-1]) for dt in (1.25e-4, 4e-3, 1e-3)
-    )
-    coarse, fine = np.max(np.abs(coarse - truth)), np.max(np.abs(fine - truth))
+    parts = {"disturbance": ij.disturbances.Nothing(), "model": SLOW.plant, part: PARTS[part]}
+    quiet = dataclasses.replace(SLOW, **parts)
+    ends = [ij.simulate(quiet, duration=0.12, dt=dt).q[-1] for dt in (1.25e-4, 4e-3, 1e-3)]
+    coarse, fine = (np.max(np.abs(end - ends[0])) for end in ends[1:])
     assert fine < 1e-8
     assert np.log2(coarse / fine) / 2 > 3.5, (coarse, fine)
 
 
-@ij.component
-class NoTimes:
-    """A reference that says nonsense about its jumps."""
-
-    def position(self, t):
-        return SLOW.reference.position(t)
-
-    def jump_times(self):
-        return "never"
+def with_times(cls, times):
+    """A part whose jumps come at times that it does not say."""
+    return ij.component(type("Other", (cls,), {"jump_times": lambda self: times}))
 
 
 def test_jump_times_that_are_none_are_refused():
+    never = with_times(ij.references.Sinusoid, "never")(0.5, 0.1)
     with pytest.raises(ValueError, match=r"reference.jump_times\(\).*expected times \[s\]"):
-        ij.simulate(dataclasses.replace(SLOW, reference=NoTimes()), duration=0.01, dt=1e-3)
-
-
-@ij.component
-class Undeclared:
-    """A step that does not say when it comes."""
-
-    step: ij.disturbances.Step
-
-    def torque(self, t, q, dq, plant, model):
-        return self.step.torque(t, q, dq, plant, model)
-
-    def jump_times(self):
-        return jnp.zeros(0)
+        ij.simulate(dataclasses.replace(SLOW, reference=never), duration=0.01, dt=1e-3)
 
 
 @pytest.mark.slow
 def test_a_disturbance_that_does_not_declare_its_jump_is_still_counted():
     """The estimate sees it in the rates, as it saw every jump before."""
-    step = ij.disturbances.Step(size=[20.0, 5.0], time=LATE)
-    scenarios = (dataclasses.replace(SLOW, disturbance=x) for x in (Undeclared(step), step))
+    undeclared = with_times(ij.disturbances.Step, jnp.zeros(0))
+    steps = [cls(size=[20.0, 5.0], time=LATE) for cls in (undeclared, ij.disturbances.Step)]
+    scenarios = [dataclasses.replace(SLOW, disturbance=step) for step in steps]
     runs = [ij.simulate(x, duration=0.4, dt=1e-3) for x in scenarios]
     hidden, known = (np.max(run.metrics.numerical_error) for run in runs)
     assert hidden > 5 * known

@@ -1,7 +1,5 @@
 """Which side of a threshold is which."""
 
-from __future__ import annotations
-
 import itertools
 import math
 
@@ -10,13 +8,10 @@ import pytest
 from iblf_jax.engine import thresholds
 
 
-def test_few_numbers_are_differentiated_forward():
+def test_few_numbers_are_differentiated_forward_and_a_limit_is_within_itself():
     most = thresholds.MAX_FORWARD_NUMBERS
     forward = [thresholds.differentiates_forward(numbers) for numbers in (1, most, most + 1)]
     assert forward == [True, True, False]
-
-
-def test_no_limit_is_never_exceeded_and_a_limit_is_within_itself():
     assert [thresholds.is_within(3, limit) for limit in (None, 4, 3, 2)] == [True] * 3 + [False]
 
 
@@ -29,9 +24,8 @@ def test_short_vectors_are_for_few_runs_of_many_steps():
 @pytest.mark.parametrize("is_short", [False, True])
 def test_only_a_long_step_is_divided_into_functions(is_short):
     limit = thresholds.MAX_C_FUNCTION_NODES
-    segments, flags = zip(
-        *(thresholds.native_build(nodes, is_short) for nodes in (limit, limit + 1)), strict=True
-    )
+    builds = [thresholds.native_build(nodes, is_short) for nodes in (limit, limit + 1)]
+    segments, flags = zip(*builds, strict=True)
     assert segments == (None, thresholds.SEGMENT_NODES)
     assert all(any("VECTOR_BYTES" in flag for flag in each) == is_short for each in flags)
 

@@ -1,7 +1,5 @@
 """Every benchmark runs at its quick size and writes its table."""
 
-from __future__ import annotations
-
 import importlib
 import json
 import re
@@ -12,6 +10,7 @@ from pathlib import Path
 
 import jax
 import pytest
+from packaging.version import Version
 
 FOLDER = Path(__file__).parents[2] / "benchmarks"
 OF_THEIR_OWN = ("errors.py", "gpu.py", "monte_carlo.py", "throughput.py")
@@ -22,27 +21,19 @@ BEFORE_A_RELEASE = {
     *("robust_tuning.py", "small_levels.py", "starts.py", "throughput.py", "tuning.py"),
 }
 """Their quick sizes take more than a quarter of a minute."""
-
 NO_BENCHMARK = {"comparison.py", "losses.py", "withdrawn.py"}
 """One compares the results of the others, and `test_release.py` tests it; one compares commits, and
 `test_losses.py` tests it; one names the results that were removed."""
 NEEDED = {"ros2.py": ("mujoco", "rclpy")}
 """Benchmark -> libraries that not every environment has."""
-
-
 NOTED = {"date", "python", "jax", "jaxlib", "numpy", "iblf_jax", "commit"}
 """What every result names."""
 COMMIT = re.compile("[0-9a-f]{40}( with uncommitted changes|, which added this table; .*)?")
-CHECKS = FOLDER / "field" / "checks"
-RESULTS = sorted(
-    path
-    for folder in (FOLDER / "results", FOLDER / "field" / "results", CHECKS)
-    for path in folder.glob("*.json")
-)
+PLACES = ("results", "field/results", "field/checks")
+RESULTS = sorted(path for place in PLACES for path in (FOLDER / place).glob("*.json"))
 
 
 def benchmarks():
-    """Every benchmark, with its mark."""
     for path in sorted(set(FOLDER.glob("[a-z]*.py")) - {FOLDER / name for name in NO_BENCHMARK}):
         mark = pytest.mark.release if path.name in BEFORE_A_RELEASE else pytest.mark.slow
         yield pytest.param(path.name, marks=mark)
@@ -72,17 +63,11 @@ def test_a_result_names_its_versions_and_its_commit(path):
     assert set(machine) >= NOTED
     assert COMMIT.fullmatch(machine["commit"])
     # Tables of these versions were wrong before measurements noted their commit.
-    if version(machine["jax"]) >= (0, 11):
+    if Version(machine["jax"]) >= Version("0.11"):
         assert "which added this table" not in machine["commit"]
-
-
-def version(text):
-    return tuple(int(part) for part in text.split(".")[:2])
 
 
 def test_results_that_are_withdrawn_are_not_there(monkeypatch):
     monkeypatch.syspath_prepend(FOLDER)
-    withdrawn = importlib.import_module("withdrawn")
-    names = withdrawn.BENCHMARKS
-    assert names
-    assert not [name for name in names if (FOLDER / "results" / f"{name}.json").exists()]
+    names = importlib.import_module("withdrawn").BENCHMARKS
+    assert names and not [name for name in names if (FOLDER / "results" / f"{name}.json").exists()]

@@ -1,7 +1,5 @@
 """The page on choosing a law says what `benchmarks/laws.py` measured."""
 
-from __future__ import annotations
-
 import importlib
 import json
 import warnings
@@ -16,7 +14,6 @@ TUNED = json.loads((ROOT / "benchmarks" / "field" / "results" / "zhang_yan_2024.
 
 @pytest.fixture
 def scripts(monkeypatch):
-    """The modules `benchmarks/laws.py` and `docs/choosing.py`."""
     monkeypatch.syspath_prepend(ROOT / "benchmarks")
     monkeypatch.syspath_prepend(ROOT / "docs")
     return importlib.import_module("laws"), importlib.import_module("choosing")
@@ -65,8 +62,7 @@ def test_laws_with_the_same_budget_of_tuning_have_the_numbers_of_the_result(scri
 def test_a_row_regenerates_to_the_digits_of_the_page(scripts):
     laws, _ = scripts
     stored = STORED["rows"][0]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         found = laws.row(stored["law"])
-    digits = [[f"{x:.3g}" for x in values] for values in (found[1:], list(stored.values())[1:])]
+    digits = [[f"{x:.3g}" for x in values[1:]] for values in (found, list(stored.values()))]
     assert digits[0] == digits[1]

@@ -3,8 +3,6 @@
 It runs here in a folder in which every program that it calls is a short script.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import select
@@ -22,7 +20,6 @@ if [ "$0 $*" = "$FAILS" ]; then cat ready; echo "the reason"; exit 3; fi
 """
 """A program: it notes its call, and then waits with a child that holds a pipe, fails once that
 child runs, or succeeds."""
-
 NEWEST = "tools/newest_python"
 TESTS_OF_NEWEST = f"{NEWEST} python -m pytest -m not release and not site and (not slow or members)"
 LOSSES = ".venv-test/bin/python benchmarks/losses.py --quick --fail 15"
@@ -37,6 +34,13 @@ INSTALLATION_OF_ROS = (
     ".venv-ros/bin/pip install -q -c constraints.txt -e .[ros,robots] pytest pytest-xdist"
     " hypothesis"
 )
+STEPS = (LOSSES, TESTS_OF_NEWEST, SITE, LINT, SLOW_TESTS, INSTALLATION_OF_ROS, TESTS_OF_ROS)
+
+
+def write_program(path: Path, text: str) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+    path.chmod(0o755)
 
 
 @pytest.fixture
@@ -46,9 +50,7 @@ def folder(tmp_path: Path) -> Path:
     programs += [f".venv-test/bin/{name}" for name in ("python", "ruff", "mypy")]
     programs += [f".venv-ros/bin/{name}" for name in ("python", "pip")]
     for name in programs:
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).write_text(SCRIPT)
-        (tmp_path / name).chmod(0o755)
+        write_program(tmp_path / name, SCRIPT)
     (tmp_path / ".ci").mkdir()
     shutil.copy(ROOT / ".ci" / "run", tmp_path / ".ci" / "run")
     (tmp_path / ".ci" / "base").write_text("a_commit\n")
@@ -59,37 +61,25 @@ def folder(tmp_path: Path) -> Path:
 
 
 def ci(folder: Path, **variables: str) -> subprocess.CompletedProcess:
-    """What a run prints and returns."""
     path = os.pathsep.join([str(folder / "path"), os.environ["PATH"]])
     # The tests may run in a run of CI, which has its own.
     kept = {name: x for name, x in os.environ.items() if name not in ("BASE", "MINUTES")}
-    return subprocess.run(
-        ["bash", ".ci/run"],
-        cwd=folder,
-        env=kept | {"PATH": path, "FAILS": "", "STAYS": ""} | variables,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        timeout=60,
-    )
+    environment = kept | {"PATH": path, "FAILS": "", "STAYS": ""} | variables
+    output = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    return subprocess.run(["bash", ".ci/run"], cwd=folder, env=environment, timeout=60, **output)
 
 
 def test_every_step_is_called(folder):
     done = ci(folder)
     assert done.returncode == 0, done.stdout
-    calls = (folder / "calls").read_text().splitlines()
-    expected = (NEWEST, LOSSES, TESTS_OF_NEWEST, SITE, LINT, SLOW_TESTS)
-    for call in (*expected, INSTALLATION_OF_ROS, TESTS_OF_ROS):
-        assert call in [line.strip() for line in calls]
+    calls = {line.strip() for line in (folder / "calls").read_text().splitlines()}
+    assert calls >= {NEWEST, *STEPS}
 
 
 def test_the_slow_tests_are_those_that_the_change_reaches(folder):
-    (folder / "path" / "python3").write_text('#!/bin/sh\necho "reached by $*"\n')
-    (folder / "path" / "python3").chmod(0o755)
-    python = folder / ".venv-test" / "bin" / "python"
-    python.write_text(
-        '#!/bin/sh\n[ -z "$SLOW_MINUTES" ] || echo "$SLOW_FILES, $SLOW_MINUTES" > slow\n'
-    )
+    write_program(folder / "path" / "python3", '#!/bin/sh\necho "reached by $*"\n')
+    noted = '#!/bin/sh\n[ -z "$SLOW_MINUTES" ] || echo "$SLOW_FILES, $SLOW_MINUTES" > slow\n'
+    write_program(folder / ".venv-test" / "bin" / "python", noted)
     for variables, expected in (
         ({}, "reached by tools/select_tests.py a_commit, 38"),
         ({"BASE": "another", "MINUTES": "50"}, "reached by tools/select_tests.py another, 50"),
@@ -101,18 +91,12 @@ def test_the_slow_tests_are_those_that_the_change_reaches(folder):
 
 
 def test_a_change_may_reach_no_slow_test(folder):
-    python = folder / ".venv-test" / "bin" / "python"
-    python.write_text('#!/bin/sh\ncase "$*" in *"slow and"*) exit 5 ;; esac\n')
+    none_collected = '#!/bin/sh\ncase "$*" in *"slow and"*) exit 5 ;; esac\n'
+    write_program(folder / ".venv-test" / "bin" / "python", none_collected)
     assert ci(folder).returncode == 0
 
 
-@pytest.mark.parametrize(
-    "step",
-    [
-        *(f"{NEWEST} ", LOSSES, TESTS_OF_NEWEST, SITE, LINT, SLOW_TESTS),
-        *(INSTALLATION_OF_ROS, TESTS_OF_ROS),
-    ],
-)
+@pytest.mark.parametrize("step", [f"{NEWEST} ", *STEPS])
 def test_a_step_that_fails_is_shown(folder, step):
     (folder / "ready").unlink()
     (folder / "ready").write_text("")

@@ -1,8 +1,6 @@
 """The benchmark of the field: the format of its entries, what their pages state, the checker, and
 the programs that are written without the package."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import sys
@@ -31,7 +29,6 @@ FEWEST = 20
 
 
 def test_there_are_entries_of_each_method():
-    assert len(NAMES) >= FEWEST
     assert {entry.load(entry.ENTRIES / name).method for name in NAMES} == set(entry.METHODS)
     assert len(sorted(entry.ENTRIES.glob("*/independent.py"))) >= FEWEST
     assert len(sorted(entry.ENTRIES.glob("*/scenario.toml"))) >= 6
@@ -41,11 +38,11 @@ def test_there_are_entries_of_each_method():
 def test_the_format_of_an_entry(name):
     folder = entry.ENTRIES / name
     contents = entry.load(folder)
-    assert not check._faults_of_name(folder)
-    assert not check._faults_of_text(contents)
-    assert not check._faults_of_script(folder / "example.py")
+    found = [*check._faults_of_name(folder), *check._faults_of_text(contents)]
+    found += check._faults_of_script(folder / "example.py")
     if (folder / "scenario.toml").exists():
-        assert not check._faults_of_scenario(folder, contents)
+        found += check._faults_of_scenario(folder, contents)
+    assert found == []
 
 
 @pytest.mark.site
@@ -127,18 +124,13 @@ def zhang_yan_2024(runs, evidence):
     assert evidence["kf"] > 1.0
 
 
-FURTHER = {
-    function.__name__: function
-    for function in (
-        *(dimanidis_2018, goel_2020, shaw_cortez_2022, xernicrose_2024, zhang_yan_2024),
-    )
-}
+PAGES = (dimanidis_2018, goel_2020, shaw_cortez_2022, xernicrose_2024, zhang_yan_2024)
+FURTHER = {function.__name__: function for function in PAGES}
 """Entry -> what its page states beyond the published numbers and claims."""
 FLAGGED = {"shaw_cortez_2022", "xernicrose_2024"}
 """Entries with runs that have a flag, as their functions state."""
+SCRIPT = """\"\"\"A title: one sentence.\"\"\"
 
-
-QUICK = """
 import matplotlib.pyplot as plt
 import numpy as np
 
@@ -153,9 +145,6 @@ reached = {"largest error [rad]": float(np.abs(runs["first"].e1).max())}
 holds = {"the output stays inside its bounds": True}
 evidence = {"printed": 0.1}
 """
-SCRIPT = f'"""A title: one sentence."""\n{QUICK}'
-
-
 OF_AN_AUTHOR = {
     "A bound on the output of a servo drive": "Bounds of a drive",
     "A. Author, B. Author": "C. Author",
@@ -225,46 +214,32 @@ IN_TEXT = {
     "ends at 0.01 s, and entry.toml": {"duration = 0.01": "duration = 3.0"},
 }
 IN_SCRIPT = {
-    "does not hold": ('bounds": True', 'bounds": False'),
-    "holds lacks": ("holds = {", "answers = {"),
-    "the figure has no curves": ('axes.plot(runs["first"].t, runs["first"].e1)', ""),
-    "panel 1 of the figure has no label of its x axis": ('xlabel="time [s]", ', ""),
-    "example.py does not run: line 8: Attribute": ("ij.presets.zhang", "ij.preset.zhang"),
-    "must begin with a docstring": ("A title: one", "A title, one"),
-    "must be one number": ("float(np.abs(", "(lambda x: np.ones(2))(np.abs("),
-    "shorten it to 150": ("evidence =", "\n" * check.MOST_LINES + "evidence ="),
-    "has the step 0.0001 s": ("dt=1e-3", "dt=1e-4"),
-    "must be the Rollout": ('{"first": ij', '{"second": 1, "first": ij'),
-    "uncertain has 'plant.m'": ("holds =", "uncertain = ('plant.m',)\nholds ="),
-    "must be True or False": ('bounds": True', 'bounds": np.ones(2) > 0'),
+    "does not hold": {'bounds": True': 'bounds": False'},
+    "holds lacks": {"holds = {": "answers = {"},
+    "the figure has no curves": {'axes.plot(runs["first"].t, runs["first"].e1)': ""},
+    "panel 1 of the figure has no label of its x axis": {'xlabel="time [s]", ': ""},
+    "example.py does not run: line 8: Attribute": {"ij.presets.zhang": "ij.preset.zhang"},
+    "must begin with a docstring": {"A title: one": "A title, one"},
+    "must be one number": {"float(np.abs(": "(lambda x: np.ones(2))(np.abs("},
+    "shorten it to 150": {"evidence =": "\n" * check.MOST_LINES + "evidence ="},
+    "has the step 0.0001 s": {"dt=1e-3": "dt=1e-4"},
+    "must be the Rollout": {'{"first": ij': '{"second": 1, "first": ij'},
+    "uncertain has 'plant.m'": {"holds =": "uncertain = ('plant.m',)\nholds ="},
+    "must be True or False": {'bounds": True': 'bounds": np.ones(2) > 0'},
 }
 
 
-def test_a_correct_entry_has_no_faults(faults):
-    assert faults() == []
-
-
-@pytest.mark.parametrize("fault", IN_TEXT)
-def test_the_checker_reports_a_fault_of_the_text(fault, faults):
-    assert any(fault in line for line in faults(text=IN_TEXT[fault]))
-
-
-@pytest.mark.parametrize("fault", IN_SCRIPT)
-def test_the_checker_reports_a_fault_of_the_script(fault, faults):
-    assert any(fault in line for line in faults(script=[IN_SCRIPT[fault]]))
-
-
 def test_the_checker_reports_faults_of_the_folder(faults, tmp_path):
+    assert faults() == []
     assert any("named after the first author" in line for line in faults(name="author"))
     assert any("must end in the year" in line for line in faults(name="author_1999"))
     assert "does not exist" in check.faults_of(tmp_path / "other_2020")[0]
-    (tmp_path / "empty_2020").mkdir()
-    assert check.faults_of(tmp_path / "empty_2020") == [
-        "there is no entry.toml; copy the one of benchmarks/field/template"
-    ]
-    shutil.copy(TEMPLATE / "entry.toml", tmp_path / "empty_2020")
-    found = check.faults_of(tmp_path / "empty_2020")
-    assert found[-1] == "there is no example.py; copy the one of benchmarks/field/template"
+    folder = tmp_path / "empty_2020"
+    folder.mkdir()
+    missing = "there is no {}; copy the one of benchmarks/field/template"
+    assert check.faults_of(folder) == [missing.format("entry.toml")]
+    shutil.copy(TEMPLATE / "entry.toml", folder)
+    assert check.faults_of(folder)[-1] == missing.format("example.py")
 
 
 FURTHER_FILES = {
@@ -282,11 +257,14 @@ FURTHER_FILES = {
         "independent.py": "def compare():\n    return 1 / 0\n"
     },
 }
+TABLES = {"text": IN_TEXT, "script": IN_SCRIPT, "files": FURTHER_FILES}
 
 
-@pytest.mark.parametrize("fault", FURTHER_FILES)
-def test_the_checker_reports_a_fault_of_a_further_file(fault, faults):
-    assert any(fault in line for line in faults(files=FURTHER_FILES[fault]))
+@pytest.mark.parametrize(
+    ("part", "fault"), [(part, fault) for part, table in TABLES.items() for fault in table]
+)
+def test_the_checker_reports_a_fault(part, fault, faults):
+    assert any(fault in line for line in faults(**{part: TABLES[part][fault]}))
 
 
 def test_an_independent_integration_that_stops_is_an_error():
@@ -297,8 +275,7 @@ def test_an_independent_integration_that_stops_is_an_error():
 
 
 def test_the_laws_of_a_plant_have_each_barrier_with_and_without_filters():
-    scenario = ij.presets.motor_driven_pendulum()
-    found = task_laws.laws_of(task_of_preset(scenario), ())
+    found = task_laws.laws_of(task_of(ij.presets.motor_driven_pendulum()), ())
     assert found[task_laws.OF_ROBOTS] == "the plant is no robot"
     for name in task_laws.BARRIERS:
         exact = found[f"BarrierBackstepping({name})"]
@@ -309,11 +286,11 @@ def test_the_laws_of_a_plant_have_each_barrier_with_and_without_filters():
             assert filtered.law.filter is not None
 
 
-def task_of_preset(scenario):
-    n, r = scenario.plant.n, task_laws.plants.order_of(scenario.plant)
-    return task_laws.Task(
-        scenario, 1.0, 1e-3, 2.0, np.ones(n), np.ones((r, n)), np.zeros(n), np.ones(n)
-    )
+def task_of(scenario):
+    """The task of a scenario at scales of one."""
+    ones = np.ones(scenario.plant.n)
+    levels = np.ones((task_laws.plants.order_of(scenario.plant), scenario.plant.n))
+    return task_laws.Task(scenario, 1.0, 1e-3, 2.0, ones, levels, 0.0 * ones, ones)
 
 
 def test_uncertain_parameters_are_those_of_the_plant_that_are_not_zero():
@@ -351,14 +328,10 @@ def test_the_page_of_the_benchmark(parts):
     assert f"{numbers} of {numbers} published numbers" in page
     rows = [line for line in page.splitlines() if line.startswith("| [")]
     assert len(rows) == len(NAMES)
-    assert [row for row in rows if row.endswith("| yes |")] == [
-        row for row in rows if "zhang_yan_2024" in row
-    ]
+    assert all(row.endswith("| yes |") == ("zhang_yan_2024" in row) for row in rows)
     assert f"On 1 of the {len(NAMES)} tasks [laws are compared" in page
-    for name in NAMES:
-        assert f"(gallery/{name}.md)" in page
-    for work in not_readable.NOT_READABLE:
-        assert f"- {work.reference}" in page
+    assert all(f"(gallery/{name}.md)" in page for name in NAMES)
+    assert all(f"- {work.reference}" in page for work in not_readable.NOT_READABLE)
     assert page.count(f"found {len(NAMES)} of {len(NAMES)} entries correct.") == 2
     assert page.count("It did not read") == 0
 

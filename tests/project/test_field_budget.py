@@ -1,7 +1,5 @@
 """Laws with the same budget of tuning: what is equal, which laws have a rank, and the page."""
 
-from __future__ import annotations
-
 import json
 import sys
 from types import SimpleNamespace
@@ -21,16 +19,14 @@ import equal_budget
 import field_budget
 import run_numbers
 import task_laws
+from test_field import task_of
 
 FILES = sorted(entry.RESULTS.glob("*.json"))
 
 
 def a_task(name):
-    """The task of an entry at scales of one, without its published run."""
-    scenario = entry.definition(entry.ENTRIES / name).scenario
-    n, order = scenario.plant.n, task_laws.plants.order_of(scenario.plant)
-    ones = np.ones(n)
-    return task_laws.Task(scenario, 1.0, 1e-3, 2.0, ones, np.ones((order, n)), 0.0 * ones, ones)
+    """The task of an entry without its published run."""
+    return task_of(entry.definition(entry.ENTRIES / name).scenario)
 
 
 # ---------------------------------------------------------------------------- what is equal
@@ -41,8 +37,8 @@ def test_every_law_of_a_task_has_two_or_three_gains_in_the_same_range(name):
     task = a_task(name)
     published = task.scenario.controller
     choices = equal_budget.laws_on(task, published, None, {})
-    laws = {equal_budget.PUBLISHED: published}
-    laws |= {law: one.law for law, one in choices.items() if not isinstance(one, str)}
+    laws = {law: one.law for law, one in choices.items() if not isinstance(one, str)}
+    laws[equal_budget.PUBLISHED] = published
     assert len(laws) >= 5
     for law, controller in laws.items():
         scenario = ij.with_parts(task.scenario, controller=controller)
@@ -56,9 +52,8 @@ def test_every_law_of_a_task_has_two_or_three_gains_in_the_same_range(name):
 
 
 def test_a_law_that_is_the_published_one_has_no_second_row():
-    task = a_task("zhang_yan_2024")
+    task, names = a_task("zhang_yan_2024"), ["ComputedTorque", "PDGravity"]
     law = task_laws.laws_of(task, ())["ComputedTorque"].law
-    names = ["ComputedTorque", "PDGravity"]
     found = equal_budget.laws_on(task, law, names, {"PDGravity": "no gravity"})
     assert found["ComputedTorque"] == "it is the published law with other gains"
     assert found["PDGravity"] == "no gravity"
@@ -67,10 +62,8 @@ def test_a_law_that_is_the_published_one_has_no_second_row():
 
 
 def test_the_rank_leaves_out_laws_outside_the_effort():
-    def law(*rows):
-        return {
-            "front": [{"level": level, **row} for level, row in zip((0.7, 1.0), rows, strict=True)]
-        }
+    def law(low, high):
+        return {"front": [{"level": 0.7, **low}, {"level": 1.0, **high}]}
 
     above = {"left": "its effort is above the limit"}
     inside = [{"left": "", "error": error} for error in (0.3, 0.2, 0.1)]
@@ -120,16 +113,17 @@ def test_limits_of_the_input_clip_every_command(name, command, expected):
 
 
 def test_a_run_says_what_it_does_not_keep():
-    def words(status, violation=-1.0, regions=False):
-        return run_numbers.failure_of(SimpleNamespace(status=int(status)), violation, regions)
-
-    assert words(0) == ""
-    assert words(ij.Status.BOUND_VIOLATED) == "leaves the bounds"
-    assert words(ij.Status.BOUND_VIOLATED | ij.Status.NOT_FINITE) == "diverges"
-    assert words(0, 0.1) == "violates a constraint or the bounds of a further level"
-    assert words(ij.Status.REGION_VIOLATED) == ""
-    assert words(ij.Status.REGION_VIOLATED, regions=True) == "enters a region"
-    assert words(ij.Status.STEP_TOO_LARGE) == "the time step is too large"
+    for status, violation, regions, words in (
+        (0, -1.0, False, ""),
+        (ij.Status.BOUND_VIOLATED, -1.0, False, "leaves the bounds"),
+        (ij.Status.BOUND_VIOLATED | ij.Status.NOT_FINITE, -1.0, False, "diverges"),
+        (0, 0.1, False, "violates a constraint or the bounds of a further level"),
+        (ij.Status.REGION_VIOLATED, -1.0, False, ""),
+        (ij.Status.REGION_VIOLATED, -1.0, True, "enters a region"),
+        (ij.Status.STEP_TOO_LARGE, -1.0, False, "the time step is too large"),
+    ):
+        run = SimpleNamespace(status=int(status))
+        assert run_numbers.failure_of(run, violation, regions) == words
 
 
 @pytest.mark.slow
@@ -145,14 +139,16 @@ def test_the_numbers_of_a_run_are_those_of_its_samples():
         time = run.t[part]
         return np.sqrt(np.trapezoid(values[part], time) / (time[-1] - time[0]))
 
-    found = run.metrics
-    np.testing.assert_allclose(found.error, rms(error, run.t >= 0.0), rtol=1e-6)
-    np.testing.assert_allclose(found.late_error, rms(error, run.t >= 0.5), rtol=1e-2)
-    np.testing.assert_allclose(found.effort, rms(square, run.t >= 0.0), rtol=1e-6)
-    np.testing.assert_allclose(found.start_effort, rms(square, run.t <= 0.05), rtol=0.03)
-    np.testing.assert_allclose(found.rest_effort, rms(square, run.t >= 0.05), rtol=0.03)
-    np.testing.assert_allclose(found.peak_input, np.abs(run.tau).max(), rtol=1e-6)
-    np.testing.assert_allclose(found.violation, run.q.max() - 3.0, rtol=1e-6)
+    for name, expected, rtol in (
+        ("error", rms(error, run.t >= 0.0), 1e-6),
+        ("late_error", rms(error, run.t >= 0.5), 1e-2),
+        ("effort", rms(square, run.t >= 0.0), 1e-6),
+        ("start_effort", rms(square, run.t <= 0.05), 0.03),
+        ("rest_effort", rms(square, run.t >= 0.05), 0.03),
+        ("peak_input", np.abs(run.tau).max(), 1e-6),
+        ("violation", run.q.max() - 3.0, 1e-6),
+    ):
+        np.testing.assert_allclose(run.metrics[name], expected, rtol=rtol, err_msg=name)
 
 
 @pytest.mark.slow
@@ -165,8 +161,7 @@ def test_the_quick_comparison(tmp_path, monkeypatch, capsys):
     result = json.loads((tmp_path / "liu_2018.json").read_text())
     assert set(result["laws"]) == {equal_budget.PUBLISHED, law}
     published = result["laws"][equal_budget.PUBLISHED]
-    kept = [row for row in published["front"] if row["level"] >= 1.0]
-    for row in kept:
+    for row in filter(lambda row: row["level"] >= 1.0, published["front"]):
         limit = row["level"] * result["published"]["effort"]
         assert row["left"] == "" and row["effort"] <= 1.001 * limit
         assert row["error"] <= result["published"]["error"] * (1.0 + 1e-9)
@@ -182,11 +177,8 @@ def test_the_quick_comparison(tmp_path, monkeypatch, capsys):
 def test_a_result_of_the_repository_keeps_what_the_page_says(path):
     result = json.loads(path.read_text(encoding="utf-8"))
     budget = equal_budget.BUDGET
-    assert result["budget"] == {
-        "points": budget.values,
-        "starts": budget.starts,
-        "steps": budget.iterations,
-    }
+    counts = {"points": budget.values, "starts": budget.starts, "steps": budget.iterations}
+    assert result["budget"] == counts
     assert "uncommitted" not in result["machine"]["commit"]
     assert equal_budget.equal_laws(result["laws"]) == []
     for name, law in result["laws"].items():
@@ -212,12 +204,10 @@ def test_readme_and_article_have_the_numbers_of_the_results():
 
 
 def test_the_page_has_all_tasks_and_what_a_law_does_not_keep():
-    found = field_budget.results()
-    check_page(found)
+    check_page(field_budget.results())
 
 
 def check_page(found):
-    """The page of results, and their figures."""
     page = field_budget.page(found)
     for name, result in found.items():
         assert f"]({field_budget.NAME}_{name}.png)" in page

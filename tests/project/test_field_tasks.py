@@ -1,7 +1,5 @@
 """The tasks of the benchmark of the field for other programs, and the results of these programs."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import subprocess
@@ -139,16 +137,11 @@ def textbook(t, x):
 
 
 def integrated(task, law, times):
-    found = solve_ivp(
-        lambda t, x: read_task.rates(task, t, x, law(t, x)),
-        (0.0, times[-1]),
-        task["start"],
-        "DOP853",
-        times,
-        rtol=1e-9,
-        atol=1e-11,
-    )
-    return found.y.T
+    def rates(t, x):
+        return read_task.rates(task, t, x, law(t, x))
+
+    how = {"method": "DOP853", "t_eval": times, "rtol": 1e-9, "atol": 1e-11}
+    return solve_ivp(rates, (0.0, times[-1]), task["start"], **how).y.T
 
 
 def test_a_task_and_the_printed_law_give_the_trajectory():
@@ -214,7 +207,7 @@ def test_numbers_of_a_result(short):
 
 @pytest.fixture
 def of_another_program(short, tmp_path, monkeypatch):
-    """The file of a result, for a copy of its task."""
+    """The file of a result for a copy of its task, and the words that check it."""
     task, t, x, u = short
     (tmp_path / "liu_2018.json").write_text(json.dumps(task))
     monkeypatch.setattr(external, "TASKS", tmp_path)
@@ -222,12 +215,12 @@ def of_another_program(short, tmp_path, monkeypatch):
     path = tmp_path / "result.csv"
     table = np.concatenate([u, t[:, None], x], axis=1)
     np.savetxt(path, table, "%.9g", ",", header="u_1,t,x1_1,x2_1", comments="")
+    words = ["check.py", "--result", "liu_2018", str(path), "--law", "textbook"]
+    monkeypatch.setattr(sys, "argv", words)
     return path
 
 
-def test_a_result_goes_into_the_page_of_the_benchmark(of_another_program, monkeypatch, capsys):
-    words = ["check.py", "--result", "liu_2018", str(of_another_program), "--law", "textbook"]
-    monkeypatch.setattr(sys, "argv", words)
+def test_a_result_goes_into_the_page_of_the_benchmark(of_another_program, capsys):
     assert check.main() == 0
     assert check.main() == 0  # replaces the row of the same law
     assert "is accepted" in capsys.readouterr().out
@@ -242,10 +235,8 @@ def test_a_result_goes_into_the_page_of_the_benchmark(of_another_program, monkey
     assert "the task has changed since" in field.of_other_programs(other)
 
 
-def test_a_refused_result_changes_nothing(of_another_program, monkeypatch, capsys):
+def test_a_refused_result_changes_nothing(of_another_program, capsys):
     text = of_another_program.read_text()
-    words = ["check.py", "--result", "liu_2018", str(of_another_program), "--law", "textbook"]
-    monkeypatch.setattr(sys, "argv", words)
     for old, new, reason in (
         ("x2_1", "v", "lacks the columns x2_1"),
         ("0,0.5,0\n", "0,0.6,0\n", "x1_1 starts at 0.6"),
@@ -257,10 +248,10 @@ def test_a_refused_result_changes_nothing(of_another_program, monkeypatch, capsy
     assert external.rows_of("liu_2018") == []
 
 
-@pytest.mark.parametrize("path", sorted(external.EXTERNAL.glob("*.json")), ids=lambda x: x.stem)
-def test_rows_of_the_repository_belong_to_their_tasks(path):
-    for row in external.rows_of(path.stem):
-        assert row["sha256 of the task"] == external.digest(tasks.FOLDER / path.name)
+def test_rows_of_the_repository_belong_to_their_tasks():
+    for path in external.EXTERNAL.glob("*.json"):
+        for row in external.rows_of(path.stem):
+            assert row["sha256 of the task"] == external.digest(tasks.FOLDER / path.name), path
 
 
 @pytest.mark.slow
@@ -275,12 +266,14 @@ def test_the_reader_of_octave_agrees_with_that_of_numpy(tmp_path):
         for part, value in (("t", t[rows][None]), ("x", x[rows].T), ("u", u[rows].T)):
             np.savetxt(tmp_path / f"{name}.{part}", value, "%.17g")
             lines.append(f"{part} = load('-ascii', '{tmp_path / name}.{part}');")
-        lines.append(f"task = read_task('{tasks.FOLDER / name}.json');")
-        lines.append("y = [task.rates(t, x, u); task.evaluate('reference', t);")
-        lines.append("task.evaluate('upper', t); task.evaluate('constraints', t, x)];")
-        lines.append(f"dlmwrite('{tmp_path / name}.y', y, 'precision', '%.17g');")
-        values = [read_task.rates(task, t, x, u), read_task.evaluate(task, "reference", t)]
-        values += [read_task.evaluate(task, "upper", t)]
+        lines += [
+            f"task = read_task('{tasks.FOLDER / name}.json');",
+            "y = [task.rates(t, x, u); task.evaluate('reference', t);",
+            "task.evaluate('upper', t); task.evaluate('constraints', t, x)];",
+            f"dlmwrite('{tmp_path / name}.y', y, 'precision', '%.17g');",
+        ]
+        values = [read_task.rates(task, t, x, u)]
+        values += [read_task.evaluate(task, side, t) for side in ("reference", "upper")]
         values += [read_task.evaluate(task, "constraints", t, x)]
         expected.append(np.concatenate(values, axis=1)[rows].T)
     script = tmp_path / "compare.m"

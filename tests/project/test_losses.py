@@ -1,13 +1,9 @@
 """`benchmarks/losses.py` names what lost, and measures again before it does."""
 
-from __future__ import annotations
-
 import importlib
 
 import pytest
 from conftest import ROOT
-
-BEFORE, AFTER = "before", "after"
 
 
 @pytest.fixture
@@ -24,9 +20,9 @@ def numbers(losses, monkeypatch):
         taken = dict.fromkeys(turns, 0)
 
         def measured(tree, measure):
-            k = min(taken[tree], len(turns[tree]) - 1)
             taken[tree] += 1
-            return [turns[tree][k]] * len(measure.rows)
+            number = turns[tree][: taken[tree]][-1]
+            return [number] * len(measure.rows)
 
         monkeypatch.setattr(losses, "measured", measured)
         return taken
@@ -45,9 +41,9 @@ def numbers(losses, monkeypatch):
 )
 def test_a_loss_is_measured_again(losses, numbers, before, after, turns, change):
     taken = numbers(before=before, after=after)
-    (row,) = losses.table((BEFORE, AFTER), [losses.Measure(("a [s]",), "")])
+    (row,) = losses.table(("before", "after"), [losses.Measure(("a [s]",), "")])
     assert row == ["a [s]", min(before), min(after), pytest.approx(change)]
-    assert taken == {BEFORE: turns, AFTER: turns}
+    assert taken == {"before": turns, "after": turns}
 
 
 def test_losses_of_more_than_5_percent_are_named_and_large_ones_fail(losses):

@@ -1,7 +1,5 @@
 """Tests mirror the package: a file of tests has the name of a module, so that a reader finds it."""
 
-from __future__ import annotations
-
 import pytest
 from conftest import ROOT
 
@@ -17,13 +15,8 @@ SUBJECTS = {
 """Folder -> subject of a file of tests that is about no single module -> what it is about."""
 
 
-def without_module(folder: str) -> set[str]:
-    """The subjects of the files of tests of a folder that have no module's name."""
-    modules = {path.stem for path in (ROOT / "iblf_jax" / folder).glob("*.py")}
-    files = (ROOT / "tests" / folder).glob("test_*.py")
-    return {path.stem.removeprefix("test_") for path in files} - modules
-
-
 @pytest.mark.parametrize("folder", SUBJECTS)
 def test_files_have_the_names_of_modules_or_of_subjects(folder):
-    assert without_module(folder) == {*SUBJECTS[folder]}
+    modules = {path.stem for path in (ROOT / "iblf_jax" / folder).glob("*.py")}
+    files = (ROOT / "tests" / folder).glob("test_*.py")
+    assert {path.stem.removeprefix("test_") for path in files} - modules == {*SUBJECTS[folder]}

@@ -1,7 +1,5 @@
 """The program that runs a command with the newest Python and JAX keeps environments apart."""
 
-from __future__ import annotations
-
 import os
 import sys
 
@@ -26,15 +24,11 @@ def test_different_environments_have_different_keys(tmp_path, monkeypatch):
         paths = [path for value in options.values() for path in tool.paths_in(value)]
         return tool.description(list(needed), python, tool.PipConfiguration(options, paths))
 
-    contents = [
-        description(),
-        description(needed=["jax, numpy"]),
-        description(needed=["jax", "numpy", "scipy"]),
-        description(python="3.13.2"),
-        description(options={}),
-        description(options={**options, "global.index-url": "file:///nowhere"}),
-        description(options={**options, ":env:.index-url": "file:///nowhere"}),
-    ]
+    changes = [{}, {"needed": ["jax, numpy"]}, {"needed": ["jax", "numpy", "scipy"]}]
+    changes += [{"python": "3.13.2"}, {"options": {}}]
+    for kind in ("global", ":env:"):
+        changes.append({"options": {**options, f"{kind}.index-url": "file:///nowhere"}})
+    contents = [description(**change) for change in changes]
     (wheels / "jax.whl").write_bytes(b"a")
     contents.append(description())
     monkeypatch.setattr(tool, "__file__", str(tmp_path / "other"))

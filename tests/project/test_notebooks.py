@@ -5,8 +5,6 @@ Each of them begins with goals and prerequisites, and ends with exercises, whose
 it, and with a link to the next one.
 """
 
-from __future__ import annotations
-
 import copy
 import itertools
 import re
@@ -41,10 +39,8 @@ def marked(path: Path):
 @pytest.mark.usefixtures("optimised_kernels")
 @pytest.mark.parametrize("name", map(marked, NOTEBOOKS))
 def test_notebook_runs(name, tmp_path):
-    notebook = build.execute(FOLDER / name, tmp_path)
-    shown = [
-        output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs
-    ]
+    cells = build.execute(FOLDER / name, tmp_path).cells
+    shown = [output for cell in cells for output in cell.get("outputs", ())]
     assert any("image/png" in output.get("data", {}) for output in shown), "no figure was shown"
     assert not [output for output in shown if is_progress(output)]
 
@@ -77,12 +73,9 @@ def test_a_notebook_is_installed_by_one_line_where_the_package_is_not(path):
 
 def target_of_next(cells: list) -> Path:
     """The file that the last cell of a notebook links to."""
-    link = re.search(r"\]\(([^)]+)\)", cells[-1].source)
-    if link is None:
-        return FOLDER / "no link"
-    if link[1].endswith(".ipynb"):
-        return FOLDER / link[1]
-    return (ROOT / "docs" / "tutorials" / link[1]).resolve()
+    (link,) = re.findall(r"\]\(([^)]+)\)", cells[-1].source)[:1] or ["no link"]
+    folder = FOLDER if link.endswith(".ipynb") else ROOT / "docs" / "tutorials"
+    return (folder / link).resolve()
 
 
 def missing_parts(cells: list) -> list[str]:
@@ -101,16 +94,12 @@ def missing_parts(cells: list) -> list[str]:
     return missing
 
 
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_a_notebook_has_goals_prerequisites_exercises_and_a_link(path):
-    cells = nbformat.read(path, as_version=4).cells
-    assert not missing_parts(cells)
-
-
-def test_each_notebook_leads_to_the_next():
+def test_notebooks_have_goals_prerequisites_and_exercises_and_lead_to_the_next():
     assert NOTEBOOKS[0].name == "01_reproduce_the_paper.ipynb"
-    for path, following in itertools.pairwise(NOTEBOOKS):
-        assert target_of_next(nbformat.read(path, as_version=4).cells) == following
+    for path, following in itertools.zip_longest(NOTEBOOKS, NOTEBOOKS[1:]):
+        cells = nbformat.read(path, as_version=4).cells
+        assert missing_parts(cells) == [], path
+        assert following is None or target_of_next(cells) == following, path
 
 
 def test_a_notebook_without_these_parts_is_refused():

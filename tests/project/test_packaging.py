@@ -1,14 +1,13 @@
 """pyproject.toml, constraints.txt and the workflows name the same Pythons, and declare what the
 package imports."""
 
-from __future__ import annotations
-
 import ast
 import importlib.metadata
 import json
 import re
 import sys
 import tomllib
+from collections.abc import Iterable
 
 import pytest
 from conftest import ROOT
@@ -33,16 +32,9 @@ CLASSIFIED = [
     if (match := re.fullmatch(r"Programming Language :: Python :: (3\.\d+)", text))
 ]
 """The Pythons of the classifiers, as (3, minor)."""
+OF_ROS = ["rclpy", "rcl_interfaces", "sensor_msgs", "std_msgs", "std_srvs", "diagnostic_msgs"]
 DISTRIBUTION = {"PIL": "pillow", "mpl_toolkits": "matplotlib", "tomli_w": "tomli-w"} | {
-    name: f"ros-{name.replace('_', '-')}"
-    for name in (
-        "rclpy",
-        "rcl_interfaces",
-        "sensor_msgs",
-        "std_msgs",
-        "std_srvs",
-        "diagnostic_msgs",
-    )
+    name: f"ros-{name.replace('_', '-')}" for name in OF_ROS
 }
 """Name of an import -> its distribution, where they differ."""
 COMES_WITH = {"jaxlib": "jax", "pandas": "xarray", "pillow": "matplotlib"}
@@ -64,16 +56,15 @@ def imported(source: str) -> set[str]:
     return {name.split(".")[0] for name in names} - set(sys.stdlib_module_names) - {"iblf_jax"}
 
 
-def names_of(requirements: list[Requirement]) -> set[str]:
+def names_of(requirements: Iterable[Requirement]) -> set[str]:
     return {canonicalize_name(requirement.name) for requirement in requirements}
 
 
 def test_the_classifiers_are_the_pythons_that_are_required():
     oldest = min(CLASSIFIED)
     assert PROJECT["requires-python"] == f">={oldest[0]}.{oldest[1]}"
-    assert [(3, minor) for minor in range(oldest[1], max(CLASSIFIED)[1] + 1)] == CLASSIFIED, (
-        "none is left out"
-    )
+    none_left_out = [(3, minor) for minor in range(oldest[1], max(CLASSIFIED)[1] + 1)]
+    assert none_left_out == CLASSIFIED
     assert sys.version_info[:2] >= oldest
 
 
@@ -93,26 +84,19 @@ def test_the_tests_run_on_every_python_with_and_without_extras():
 @pytest.mark.slow
 def test_every_import_is_declared():
     sources = [path.read_text(encoding="utf-8") for path in (ROOT / "iblf_jax").rglob("*.py")]
-    distributions = {
-        DISTRIBUTION.get(name, name) for source in sources for name in imported(source)
-    }
-    declared = names_of(REQUIRED) | names_of(OPTIONAL)
-    undeclared = {canonicalize_name(name) for name in distributions} - declared
-    undeclared -= {*COMES_WITH, *OF_TYPE_CHECKERS}
-    assert not undeclared, f"declare {undeclared} in pyproject.toml"
+    names = {name for source in sources for name in imported(source)}
+    distributions = {canonicalize_name(DISTRIBUTION.get(name, name)) for name in names}
+    known = names_of([*REQUIRED, *OPTIONAL]) | {*COMES_WITH, *OF_TYPE_CHECKERS}
+    assert not distributions - known, "declare them in pyproject.toml"
     for name, parent in COMES_WITH.items():
-        assert name in names_of(
-            list(map(Requirement, importlib.metadata.requires(parent) or []))
-        ), (name, parent)
+        brought = map(Requirement, importlib.metadata.requires(parent) or [])
+        assert name in names_of(brought), (name, parent)
 
 
 def test_every_dependency_is_pinned_at_a_version_that_is_allowed():
     assert {"jax", "numpy", "scipy"} <= names_of(REQUIRED), "every part imports these: no extras"
-    for requirement in REQUIRED:
-        pin = PINS.get(canonicalize_name(requirement.name))
-        assert pin is not None, f"constraints.txt has no {requirement.name}"
-        assert requirement.specifier.contains(pin), (requirement, pin)
-    for requirement in OPTIONAL:
+    assert names_of(REQUIRED) <= set(PINS)
+    for requirement in (*REQUIRED, *OPTIONAL):
         pin = PINS.get(canonicalize_name(requirement.name))
         assert pin is None or requirement.specifier.contains(pin), (requirement, pin)
 
@@ -121,7 +105,8 @@ def test_jax_is_limited_to_the_versions_that_were_tested():
     """The lower limit is the pinned version, and the upper one a minor version."""
     (jax_,) = [x for x in REQUIRED if x.name == "jax"]
     lower = PINS["jax"]
-    match = re.fullmatch(rf">={re.escape(lower)},<0\.(\d+)", sorted_specifier(jax_))
+    specifier = ",".join(sorted(map(str, jax_.specifier), reverse=True))
+    match = re.fullmatch(rf">={re.escape(lower)},<0\.(\d+)", specifier)
     assert match is not None, jax_
     newest = f"0.{int(match[1]) - 1}"
     page = (ROOT / "docs" / "stability.md").read_text(encoding="utf-8")
@@ -129,12 +114,7 @@ def test_jax_is_limited_to_the_versions_that_were_tested():
     assert jax_.specifier.contains(importlib.metadata.version("jax"))
 
 
-def sorted_specifier(requirement):
-    return ",".join(sorted(map(str, requirement.specifier), reverse=True))
-
-
 def test_these_tests_can_fail():
-    assert imported(
-        "import os, made_up.part\ndef f():\n    from other import x\n    import iblf_jax"
-    ) == {"made_up", "other"}
+    code = "import os, made_up.part\ndef f():\n    from other import x\n    import iblf_jax"
+    assert imported(code) == {"made_up", "other"}
     assert not SpecifierSet(">=3.12").contains("3.11.9")

@@ -1,7 +1,5 @@
 """The errors that `tools/planted_errors.py` plants have their places."""
 
-from __future__ import annotations
-
 import ast
 import sys
 from random import Random

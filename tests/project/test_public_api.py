@@ -1,8 +1,6 @@
 """What `import iblf_jax` gives: every name documented, nothing heavy loaded, the session's settings
 untouched."""
 
-from __future__ import annotations
-
 import ast
 import functools
 import importlib.metadata
@@ -46,23 +44,16 @@ MODULES = [ij, *(x for x in (getattr(ij, name) for name in NAMES) if inspect.ism
 
 def undocumented(name: str, thing: object) -> list[str]:
     """What lacks a docstring of its own: the thing, or public methods of a class."""
-    if inspect.ismodule(thing) or not (inspect.isclass(thing) or inspect.isfunction(thing)):
+    if not (inspect.isclass(thing) or inspect.isfunction(thing)):
         return []
-    missing = [] if (thing.__doc__ or "").strip() else [name]
+    words = (thing.__doc__ or "").strip()
     # The docstring that dataclasses makes up is a signature, and says nothing.
-    if re.fullmatch(
-        rf"{getattr(thing, '__name__', '')}\(.*\)", (thing.__doc__ or "").strip(), re.DOTALL
-    ):
-        missing = [name]
-    if inspect.isclass(thing):
-        for key, value in vars(thing).items():
-            function = inspect.unwrap(value.fget if isinstance(value, property) else value)
-            if (
-                not key.startswith("_")
-                and inspect.isfunction(function)
-                and not (function.__doc__ or "").strip()
-            ):
-                missing.append(f"{name}.{key}")
+    made_up = re.fullmatch(rf"{getattr(thing, '__name__', '')}\(.*\)", words, re.DOTALL)
+    missing = [] if words and not made_up else [name]
+    for key, value in vars(thing).items() if inspect.isclass(thing) else ():
+        function = inspect.unwrap(value.fget if isinstance(value, property) else value)
+        if inspect.isfunction(function) and key[0] != "_" and not (function.__doc__ or "").strip():
+            missing.append(f"{name}.{key}")
     return missing
 
 
@@ -95,18 +86,10 @@ def contracts() -> dict[str, ast.ClassDef]:
             if not isinstance(node, ast.ClassDef) or node.name.startswith("_"):
                 continue
             is_member = "component" in map(ast.unparse, node.decorator_list)
-            if ".core." in module or ".proofs." in module or is_member:  # users write none
-                continue
-            if BASES & {*map(ast.unparse, node.bases)}:
+            users_write_none = ".core." in module or ".proofs." in module or is_member
+            if BASES & {*map(ast.unparse, node.bases)} and not users_write_none:
                 found[f"{module}:{node.name}"] = node
     return found
-
-
-def family_of(module: str):
-    """The public module of a family that has its base class in `module`."""
-    parts = module.split(".")
-    depth = 3 if parts[1] in ("world", "control") else 2
-    return importlib.import_module(PUBLIC_MODULE.get(module, ".".join(parts[:depth])))
 
 
 def types_named(annotations: list[ast.expr]) -> set[str]:
@@ -119,26 +102,26 @@ def types_named(annotations: list[ast.expr]) -> set[str]:
 def not_public(key: str, definition: ast.ClassDef) -> list[str]:
     """Types that a class of this family returns or is given, and that no public module has under
     their name."""
-    module = importlib.import_module(key.split(":")[0])
-    family = family_of(key.split(":")[0])
+    name, _, _ = key.partition(":")
+    depth = 3 if name.startswith(("iblf_jax.world.", "iblf_jax.control.")) else 2
+    place = PUBLIC_MODULE.get(name, ".".join(name.split(".")[:depth]))
+    module, family = importlib.import_module(name), importlib.import_module(place)
     anywhere = [getattr(ij, name) for name in dir(ij) if inspect.ismodule(getattr(ij, name))]
     methods = [node for node in definition.body if isinstance(node, ast.FunctionDef)]
+    fields = [node.annotation for node in definition.body if isinstance(node, ast.AnnAssign)]
+    given = [arg.annotation for node in methods for arg in node.args.args if arg.annotation]
     returned = types_named([node.returns for node in methods if node.returns is not None])
-    fields = types_named(
-        [node.annotation for node in definition.body if isinstance(node, ast.AnnAssign)]
-    )
-    given = types_named(
-        [arg.annotation for node in methods for arg in node.args.args if arg.annotation is not None]
-    )
 
-    def lacks(name: str, places: list) -> bool:
-        return not any(getattr(place, name, None) is getattr(module, name) for place in places)
+    def lacking(names: set[str], places: list) -> set[str]:
+        found = {name: getattr(module, name) for name in names}
+        return {
+            name
+            for name, thing in found.items()
+            if not any(getattr(place, name, None) is thing for place in places)
+        }
 
-    own = {definition.name, *returned}
-    missing = {name for name in own if lacks(name, [family])} | {
-        name for name in fields | given if lacks(name, [family, *anywhere])
-    }
-    return sorted(missing)
+    missing = lacking({definition.name, *returned}, [family])
+    return sorted(missing | lacking(types_named([*fields, *given]), [family, *anywhere]))
 
 
 def test_every_type_that_a_users_class_returns_is_public():
@@ -154,31 +137,30 @@ def test_what_users_return_is_documented_on_the_reference_pages(name, tmp_path, 
     import reference
 
     family, _, short = name.partition(".")
-    listed = (
-        {f"{family}.{known}" for known in public_types.types_of(getattr(ij, family))}
-        if family in reference.FAMILIES
-        else set()
-    )
-    listed |= {known for _, names in reference.PAGES.values() for known in names.split()}
+    listed = {known for _, names in reference.PAGES.values() for known in names.split()}
+    if family in reference.FAMILIES:
+        listed |= {f"{family}.{known}" for known in public_types.types_of(getattr(ij, family))}
     assert name in listed
-    fields = public_types.fields_of(reference.named(name))
-    assert set(getattr(reference.named(name), "_fields", ())) <= set(fields)
-    assert all(
-        f"**{field}**" in reference.page_of(reference.named(name), short) for field in fields
-    )
+    thing = reference.named(name)
+    fields = public_types.fields_of(thing)
+    assert set(getattr(thing, "_fields", ())) <= set(fields)
+    assert all(f"**{field}**" in reference.page_of(thing, short) for field in fields)
 
 
 def test_every_objective_is_on_its_reference_page(monkeypatch):
     monkeypatch.syspath_prepend(str(ROOT / "docs"))
     import reference
 
-    made = {
-        f"objectives.{name}"
+    signatures = {
+        f"objectives.{name}": inspect.signature(function)
         for name, function in vars(ij.objectives).items()
-        if inspect.isfunction(function)
-        and inspect.signature(function).return_annotation in ("Objective", "Requirement")
-        and not name.startswith("_")
-        and "objective" not in inspect.signature(function).parameters
+        if inspect.isfunction(function) and not name.startswith("_")
+    }
+    made = {
+        name
+        for name, signature in signatures.items()
+        if signature.return_annotation in ("Objective", "Requirement")
+        and "objective" not in signature.parameters
     }
     assert {"objectives.tracking", "objectives.margin_above"} <= made
     assert made <= set(reference.PAGES["objectives"][1].split())
@@ -187,8 +169,7 @@ def test_every_objective_is_on_its_reference_page(monkeypatch):
 @pytest.mark.parametrize("module", MODULES, ids=lambda m: m.__name__)
 def test_every_public_name_is_documented(module):
     assert module.__doc__
-    missing = [x for name, thing in public(module).items() for x in undocumented(name, thing)]
-    assert not missing, f"{module.__name__}: without a docstring: {missing}"
+    assert [x for name, thing in public(module).items() for x in undocumented(name, thing)] == []
 
 
 def functions_of(thing: object) -> dict[str, Any]:
@@ -196,24 +177,25 @@ def functions_of(thing: object) -> dict[str, Any]:
     if not inspect.isclass(thing):
         return {getattr(thing, "__name__", ""): thing}
     members = {name: value for base in thing.__mro__ for name, value in vars(base).items()}
-    found = {thing.__name__: thing}
-    for name, value in members.items():
-        function = getattr(value, "fget", None) or getattr(value, "__func__", value)
-        own = inspect.isfunction(function) and function.__module__.startswith("iblf_jax")
-        if own and not name.startswith("_"):
-            found[f"{thing.__name__}.{name}"] = function
-    return found
+    functions = {
+        f"{thing.__name__}.{name}": getattr(x, "fget", None) or getattr(x, "__func__", x)
+        for name, x in members.items()
+        if not name.startswith("_")
+    }
+    return {thing.__name__: thing} | {
+        name: x
+        for name, x in functions.items()
+        if inspect.isfunction(x) and x.__module__.startswith("iblf_jax")
+    }
 
 
 @pytest.mark.slow
 def test_every_annotation_can_be_evaluated():
     """By `typing.get_type_hints`, which tools for documentation and for checks of types call."""
-    listed = names_in(PAGE, "stable") | names_in(PAGE, "provisional")
-    things = {name: getattr(ij, name) for name in listed}
-    for module in filter(inspect.ismodule, [*things.values()]):
-        things |= public(module)
+    things = [getattr(ij, name) for name in NAMES]
+    things += [x for module in filter(inspect.ismodule, things) for x in public(module).values()]
     functions = {}
-    for thing in things.values():
+    for thing in things:
         if (getattr(thing, "__module__", None) or "").startswith("iblf_jax"):
             functions |= functions_of(thing)
     assert len(functions) > 500
@@ -268,23 +250,19 @@ def test_import_is_light_and_leaves_the_session_alone():
     """In a process of its own: nothing heavy beyond what jax loads, no array made, x64 and the
     cache as they were.  No device is started, else neither `jax.distributed.initialize` nor the
     number of CPU devices could come after the import of the studies."""
-    code = (
-        "import sys, json, jax\nbefore = set(sys.modules); x64 = jax.config.jax_enable_x64; cache"
-        f" = jax.config.jax_compilation_cache_dir\nimport iblf_jax\nheavy = [m for m in {HEAVY!r}"
-        " if m in set(sys.modules) - before]\niblf_jax.monte_carlo, iblf_jax.sweep\nfrom"
-        " jax._src import xla_bridge\nsame = [x64 =="
-        " jax.config.jax_enable_x64, cache =="
-        " jax.config.jax_compilation_cache_dir]\nprint(json.dumps([heavy, *same,"
-        " bool(xla_bridge._backends)]))"
-    )
-    out = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True
-    ).stdout
-    heavy, same_x64, same_cache, backend_started = json.loads(out)
-    assert heavy == []
-    assert same_x64
-    assert same_cache
-    assert not backend_started
+    code = f"""
+import sys, json, jax
+before, settings = set(sys.modules), ("jax_enable_x64", "jax_compilation_cache_dir")
+values = [getattr(jax.config, x) for x in settings]
+import iblf_jax
+heavy = [m for m in {HEAVY!r} if m in set(sys.modules) - before]
+iblf_jax.monte_carlo, iblf_jax.sweep
+from jax._src import xla_bridge
+same = values == [getattr(jax.config, x) for x in settings]
+print(json.dumps([heavy, same, bool(xla_bridge._backends)]))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert json.loads(done.stdout) == [[], True, False]
 
 
 def test_these_tests_can_fail():

@@ -1,7 +1,5 @@
 """The files of a release agree, and the release script finds it where they do not."""
 
-from __future__ import annotations
-
 import importlib.machinery
 import importlib.util
 import shutil
@@ -26,12 +24,6 @@ release = module_of(ROOT / "tools" / "release", "release")
 comparison = module_of(ROOT / "benchmarks" / "comparison.py", "comparison")
 
 
-def copied(folder):
-    for name in ("pyproject.toml", "CITATION.cff", "CHANGELOG.md"):
-        shutil.copy(ROOT / name, folder)
-    return folder
-
-
 def test_all_files_name_the_same_version():
     assert release.check_versions() == release.project()["version"]
 
@@ -45,21 +37,19 @@ def test_all_files_name_the_same_version():
     ],
 )
 def test_a_file_with_another_version_is_found(file, old, new, message, tmp_path):
-    folder = copied(tmp_path)
+    for name in ("pyproject.toml", "CITATION.cff", "CHANGELOG.md"):
+        shutil.copy(ROOT / name, tmp_path)
     version = release.project()["version"]
-    text = (folder / file).read_text(encoding="utf-8")
+    text = (tmp_path / file).read_text(encoding="utf-8")
     changed = text.replace(old.format(version=version), new.format(version=version), 1)
     assert changed != text
-    (folder / file).write_text(changed, encoding="utf-8")
+    (tmp_path / file).write_text(changed, encoding="utf-8")
     with pytest.raises(release.ReleaseError, match=message):
-        release.check_versions(folder)
+        release.check_versions(tmp_path)
 
 
-def test_readme_and_article_have_the_measured_numbers():
+def test_readme_and_article_have_the_measured_numbers_and_another_one_is_found():
     assert comparison.outdated() == []
-
-
-def test_another_number_in_the_table_is_found():
     text = comparison.FILES[0].read_text(encoding="utf-8")
     changed = text.replace(" ms of a processor", " s of a processor", 1)
     assert changed != text and comparison.replaced(changed) == text
@@ -73,5 +63,4 @@ def test_another_number_in_the_table_is_found():
 def test_the_article_shows_the_figures_that_its_program_makes():
     figures = module_of(ROOT / "paper" / "figures.py", "article_figures")
     assert figures.faults() == []
-    for name in figures.FIGURES:
-        assert (ROOT / "paper" / name).exists()
+    assert all((ROOT / "paper" / name).exists() for name in figures.FIGURES)

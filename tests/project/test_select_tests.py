@@ -1,7 +1,5 @@
 """Which tests a change selects (`tools/select_tests.py`), in a small package and in this one."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -102,7 +100,6 @@ TESTS = {
 
 @pytest.fixture(scope="module")
 def graph(tmp_path_factory) -> Graph:
-    """The small package."""
     root = tmp_path_factory.mktemp("repository")
     tests = {f"tests/folder/test_{name}.py": text for name, text in TESTS.items()}
     for name, text in (FILES | tests).items():
@@ -115,9 +112,8 @@ def graph(tmp_path_factory) -> Graph:
 def names(graph: Graph, *changed: str) -> set[str] | None:
     """The tests that a change selects; None for all."""
     found = selected(graph, changed)
-    if len(found) == len(graph.tests):
-        return None
-    return {Path(x).stem.removeprefix("test_") for x in found}
+    is_all = len(found) == len(graph.tests)
+    return None if is_all else {Path(x).stem.removeprefix("test_") for x in found}
 
 
 USE_ALL = {"all_names", "command", "site"}
@@ -155,13 +151,7 @@ def test_what_all_depend_on_or_nobody_knows_selects_all(graph, changed):
     assert names(graph, "tests/folder/test_tune.py", changed) is None
 
 
-def git(folder: Path, *arguments: str) -> None:
-    identity = ("-c", "user.name=A", "-c", "user.email=a@b.c")
-    subprocess.run(["git", *identity, *arguments], cwd=folder, check=True, capture_output=True)
-
-
 def changed() -> list[str] | None:
-    """The files of the change."""
     base = select_tests.base_of_change()
     return None if base is None else select_tests.changed_files(base)
 
@@ -171,20 +161,25 @@ def test_a_change_is_what_a_branch_or_a_merge_adds_to_main(tmp_path, monkeypatch
     for name in [x for x in os.environ if x.startswith("GIT_")]:
         monkeypatch.delenv(name)
     monkeypatch.setattr(select_tests, "ROOT", tmp_path)
-    git(tmp_path, "init", "--quiet", "--initial-branch=main")
+
+    def git(words: str) -> None:
+        command = ["git", "-c", "user.name=A", "-c", "user.email=a@b.c", *words.split()]
+        subprocess.run(command, cwd=tmp_path, check=True, capture_output=True)
+
+    git("init --initial-branch=main")
     for name in "abcd":
         if name == "c":
-            git(tmp_path, "checkout", "--quiet", "-b", "branch")
+            git("checkout -b branch")
         (tmp_path / name).write_text(name)
-        git(tmp_path, "add", name)
-        git(tmp_path, "commit", "--quiet", "-m", name)
+        git(f"add {name}")
+        git(f"commit -m {name}")
     (tmp_path / "new").write_text("")
     (tmp_path / "b").unlink()
     assert changed() == ["b", "c", "d", "new"]
     (tmp_path / "new").unlink()
-    git(tmp_path, "checkout", "--quiet", "--force", "main")
+    git("checkout --force main")
     assert changed() is None
-    git(tmp_path, "merge", "--quiet", "--no-ff", "branch")
+    git("merge --no-ff branch")
     assert changed() == ["c", "d"]
     assert select_tests.changed_files("0" * 40) is None
 

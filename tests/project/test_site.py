@@ -1,12 +1,10 @@
 """What the site shows is run: the gallery's scripts, and every block of Python on its pages."""
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess
 import sys
-from pathlib import Path
+from types import ModuleType
 
 import pytest
 import run_page
@@ -24,16 +22,12 @@ import reference
 
 import iblf_jax as ij
 
+FOLDERS = [ROOT / name for name in ("docs", "benchmarks", "examples")]
+MARKDOWN = [ROOT.glob("*.md"), *(folder.rglob("*.md") for folder in FOLDERS)]
 PAGES = [
     page
-    for page in [
-        *sorted(ROOT.glob("*.md")),
-        *(
-            page
-            for folder in ("docs", "benchmarks", "examples")
-            for page in sorted((ROOT / folder).rglob("*.md"))
-        ),
-    ]
+    for pages in MARKDOWN
+    for page in sorted(pages)
     if run_page.blocks(page.read_text(encoding="utf-8"))
 ]
 """Every page with Python: README, CONTRIBUTING and what is beside them, and the documentation."""
@@ -47,13 +41,7 @@ LONG = {"guide", "tune_my_robot", "export_a_law", "own_law"}
 the short forms of the guide; a notebook goes from the paper to a tuned robot."""
 COMPILES_MOST = {"own_barrier"}
 """Optimising their kernels takes longer than what they compute."""
-
-
-def mark_of(page: Path) -> pytest.MarkDecorator:
-    """The mark of the test that runs a page."""
-    if page.stem in LONG:
-        return pytest.mark.release
-    return pytest.mark.site if page.stem in FIRST else pytest.mark.slow
+MARKS = dict.fromkeys(LONG, pytest.mark.release) | dict.fromkeys(FIRST, pytest.mark.site)
 
 
 @pytest.mark.site
@@ -68,13 +56,16 @@ def test_a_script_of_the_gallery_makes_its_page(script):
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_every_name_on_a_page_exists(page):
-    unknown = run_page.unknown_names(page.read_text(encoding="utf-8"), ij)
-    assert not unknown, f"{page.name} names {unknown}, which iblf_jax does not have"
+    assert run_page.unknown_names(page.read_text(encoding="utf-8"), ij) == []
 
 
 @pytest.mark.parametrize(
     "page",
-    [pytest.param(page, marks=mark_of(page)) for page in PAGES if page.stem not in ELSEWHERE],
+    [
+        pytest.param(page, marks=MARKS.get(page.stem, pytest.mark.slow))
+        for page in PAGES
+        if page.stem not in ELSEWHERE
+    ],
     ids=lambda page: page.stem,
 )
 def test_every_block_of_a_page_runs_in_a_process_of_its_own(page, tmp_path, request):
@@ -136,13 +127,10 @@ def test_a_run_raises_its_flag(name):
 
 
 def test_every_public_name_is_in_the_reference():
-    listed = {name for _, names in reference.PAGES.values() for name in names.split()} | set(
-        reference.FAMILIES
-    )
-    classes = {name for name in dir(ij) if not name.startswith("_")}
-    modules = {name for name in classes if type(getattr(ij, name)).__name__ == "module"}
-    missing = classes - listed - modules - {"TYPE_CHECKING"}
-    assert not missing, f"docs/reference.py lacks {sorted(missing)}"
+    listed = {name for _, names in reference.PAGES.values() for name in names.split()}
+    public = {name for name in dir(ij) if not name.startswith("_")} - {"TYPE_CHECKING"}
+    things = {name for name in public if not isinstance(getattr(ij, name), ModuleType)}
+    assert things <= listed | set(reference.FAMILIES)
 
 
 @pytest.mark.parametrize(
@@ -165,13 +153,7 @@ def test_an_equation_for_terminals_is_one_in_tex(text, expected):
 
 def test_dead_links_and_pages_out_of_reach_are_named(tmp_path):
     (tmp_path / "deep").mkdir()
-    chain = {
-        "index": "a.html",
-        "a": "deep/b.html#here",
-        "deep/b": "../c.html",
-        "c": "d.html",
-        "d": "#nowhere",
-    }
+    chain = {"index": "a.html", "deep/b": "../c.html", "c": "d.html", "d": "#nowhere"}
     for name, to in chain.items():
         (tmp_path / f"{name}.html").write_text(
             f'<h1 id="here">x</h1><a href="{to}">y</a><a href="https://example.org/z">z</a>'
@@ -242,9 +224,9 @@ def test_the_front_page_leads_to_the_last_release(built, preferred, tmp_path):
     for name in built:
         (tmp_path / name / "objects.inv").touch()
     build.write_versions(tmp_path)
-    rows = json.loads((tmp_path / "switcher.json").read_text())
-    assert {row["version"] for row in rows} == set(built)
-    assert [row["version"] for row in rows if row["preferred"]] == [preferred]
-    last = [row["version"] for row in rows if row["name"].endswith("(last release)")]
+    rows = {row["version"]: row for row in json.loads((tmp_path / "switcher.json").read_text())}
+    assert set(rows) == set(built)
+    assert [name for name, row in rows.items() if row["preferred"]] == [preferred]
+    last = [name for name, row in rows.items() if row["name"].endswith("(last release)")]
     assert last == [name for name in [preferred] if name != "main"]
     assert f"url={preferred}/index.html" in (tmp_path / "index.html").read_text()

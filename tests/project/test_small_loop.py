@@ -5,8 +5,6 @@ What they find is compared with what holds for it whatever the loop: solvers agr
 returns is no worse than its start, and other programs end where the run does.
 """
 
-from __future__ import annotations
-
 import functools
 import re
 import zipfile

@@ -1,7 +1,5 @@
 """The page on stability names every public name once."""
 
-from __future__ import annotations
-
 import pkgutil
 import re
 
@@ -17,14 +15,9 @@ PUBLIC = (set(dir(ij)) | MODULES) - NO_PROMISE
 """A module is an attribute of the package from its first import on."""
 
 
-def table(page: str, mark: str) -> str:
-    """The table after a mark."""
-    return page.split(f"<!-- {mark} -->\n", 1)[1].split("\n\n", 1)[0]
-
-
 def names_in(page: str, mark: str) -> set[str]:
     """The names in code of a table's first columns; the last one says something about them."""
-    rows = table(page, mark).splitlines()
+    rows = page.split(f"<!-- {mark} -->\n", 1)[1].split("\n\n", 1)[0].splitlines()
     cells = [row.split("|")[1:-1] for row in rows]
     columns = slice(1, None) if mark == "stable" else slice(0, 1)
     return {name for row in cells for cell in row[columns] for name in re.findall(r"`(\w+)`", cell)}

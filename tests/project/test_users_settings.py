@@ -6,8 +6,6 @@ these are the tests of the reference data, of bit-identity, of the functions of 
 ways in which XLA is given a loop.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -41,14 +39,9 @@ def run_tests(*words: str, **variables: str) -> str:
     own = ("PYTEST_", "SLOW_")
     plain = {name: value for name, value in os.environ.items() if not name.startswith(own)}
     options = ["-n", "0", "-p", "no:cacheprovider", "-m", "not release"]
-    done = subprocess.run(
-        [sys.executable, "-m", "pytest", *options, *words],
-        cwd=ROOT,
-        env=plain | variables,
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
+    how = {"cwd": ROOT, "env": plain | variables, "timeout": 300}
+    command = [sys.executable, "-m", "pytest", *options, *words]
+    done = subprocess.run(command, capture_output=True, text=True, **how)
     assert done.returncode == 0, done.stdout[-3000:]
     return done.stdout
 
@@ -62,12 +55,11 @@ def test_the_testers_own_flags_come_last():
     )
 
 
+MARKS = {"the paper": pytest.mark.slow}
+
+
 @pytest.mark.parametrize(
-    "what",
-    [
-        pytest.param(name, marks=pytest.mark.slow if name == "the paper" else pytest.mark.release)
-        for name in AGAIN
-    ],
+    "what", [pytest.param(name, marks=MARKS.get(name, pytest.mark.release)) for name in AGAIN]
 )
 def test_the_same_as_users_compile(what):
     names = [str(ROOT / "tests" / name) for name in (SETTINGS, *AGAIN[what])]
@@ -98,7 +90,6 @@ def test_a_change_runs_the_slow_tests_of_the_files_that_it_reaches():
 
 @pytest.mark.slow
 def test_slow_tests_that_begin_late_are_skipped():
-    """And the others run."""
     names = "test_an_empty_base_selects_all or test_changes_of_this_package"
     file = str(ROOT / "tests" / "project" / "test_select_tests.py")
     printed = run_tests("-rs", "-k", names, file, SLOW_MINUTES="0")

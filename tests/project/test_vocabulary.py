@@ -4,8 +4,6 @@ The words have no fixed meaning in control engineering or numerical computing, s
 have to learn them first. CONTRIBUTING.md has the terms that take their place.
 """
 
-from __future__ import annotations
-
 import ast
 import io
 import json
@@ -45,24 +43,18 @@ def names_in(source: str) -> set[str]:
 
 
 def private_names(source: str) -> set[str]:
-    """The names of a source file that are on the list."""
     return {name for name in names_in(source) if name.strip("_").lower() in NAMES}
 
 
 def prose_in(source: str) -> str:
-    """The docstrings and comments of a source file."""
-    texts = []
-    for node in ast.walk(ast.parse(source)):
-        is_text = isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
-        if is_text and isinstance(node.value.value, str):
-            texts.append(node.value.value)
+    constants = (x.value for x in ast.walk(ast.parse(source)) if type(x) is ast.Expr)
+    texts = [str(x.value) for x in constants if isinstance(x, ast.Constant)]
     tokens = tokenize.generate_tokens(io.StringIO(source).readline)
     texts += [token.string for token in tokens if token.type == tokenize.COMMENT]
     return "\n".join(texts)
 
 
 def private_words(text: str) -> list[str]:
-    """The words of a text that are on the list."""
     lower = text.lower()
     if not any(word in lower for word in WORDS):  # much faster than the pattern
         return []
@@ -79,17 +71,13 @@ def test_names_docstrings_and_comments_are_standard_terms(folder):
             assert not private_words(prose_in(source)), path
 
 
-def test_pages_use_standard_terms():
-    found = {path: private_words(path.read_text(encoding="utf-8")) for path in PAGES}
-    assert not {path: words for path, words in found.items() if words}
-
-
-def test_notebooks_use_standard_terms():
-    words = {}
-    for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
+def test_pages_and_notebooks_use_standard_terms():
+    texts = {path: path.read_text(encoding="utf-8") for path in PAGES}
+    for path in (ROOT / "notebooks").glob("*.ipynb"):
         cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
-        words[path.name] = private_words("\n".join("".join(cell["source"]) for cell in cells))
-    assert not {name: found for name, found in words.items() if found}
+        texts[path] = "\n".join("".join(cell["source"]) for cell in cells)
+    found = {path: private_words(text) for path, text in texts.items()}
+    assert not {path: words for path, words in found.items() if words}
 
 
 def test_these_tests_can_fail():
