@@ -1,7 +1,5 @@
 """Exported laws and loops outside of Python: self-tests, FMUs in FMPy and modules in wasmtime."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 from pathlib import Path

@@ -1,7 +1,6 @@
-"""A law against MuJoCo's robot: equal to `simulate` where the robots are equal, and what happens
-where they are not."""
+"""A law against MuJoCo's robot: equal to `simulate` where the robots are equal."""
 
-from __future__ import annotations
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -15,26 +14,22 @@ from iblf_jax.deployment.film import has_shapes
 from iblf_jax.deployment.mujoco_plant import MujocoPlant
 
 TIMING = {"duration": 0.4, "dt": 5e-4}
-PAPER = ij.with_parameters(
-    ij.presets.zhang_yan_2024(variant="corrected"), {"controller.K2": 4.0, "observer.kf": 4.0}
-)
+GAINS = {"controller.K2": 4.0, "observer.kf": 4.0}
+PAPER = ij.with_parameters(ij.presets.zhang_yan_2024(variant="corrected"), GAINS)
 """Slow enough for a filter and a drive in the loop."""
 LIMITS = {"limit": [15.0, 5.0], "stall": [14.0, 6.0], "no_load_speed": [6.0, 8.0]}
 DRIVEN = ij.with_parts(
     PAPER,
     sampling=ij.Sampling(1e-3, delay=0.7e-3),
-    sensor=ij.sensors.Encoder(
-        counts=65536, noise=1e-5, velocity=ij.sensors.FilteredDifference(cutoff=700.0)
-    ),
+    sensor=ij.sensors.Encoder(ij.sensors.FilteredDifference(700.0), counts=65536, noise=1e-5),
     actuator=ij.actuators.Motor(bandwidth=600.0, rate_limit=900.0, **LIMITS),
 )
 
 
 def two_link(robot, *, inside: str = "", elbow: str = "", outside: str = "") -> str:
     """The planar arm as an MJCF: gravity along -y, hinges about z."""
-    m, length, centre, inertia = (
-        np.asarray(x) for x in (robot.mass, robot.length, robot.centre, robot.inertia)
-    )
+    numbers = (robot.mass, robot.length, robot.centre, robot.inertia)
+    m, length, centre, inertia = map(np.asarray, numbers)
     bodies = [
         f'<inertial pos="{centre[i]} 0 0" mass="{m[i]}" diaginertia="{inertia[i]} {inertia[i]}'
         f' {inertia[i]}"/><geom type="capsule" fromto="0 0 0 {length[i]} 0 0" size="0.03"'
@@ -68,8 +63,7 @@ def test_on_the_nominal_arm_it_is_simulate(scenario):
     other = ij.cosimulate(scenario, spec_of(scenario.plant), **TIMING, seed=3)
     assert largest_difference(run.measured.q, other.measured.q) < 1e-9
     assert largest_difference(run.observer_state, other.observer_state) < 1e-9
-    assert np.isnan(other.fastest_mode)
-    assert "numerical_error" not in other.metrics
+    assert np.isnan(other.fastest_mode) and "numerical_error" not in other.metrics
     assert other.method == "MuJoCo RK4"
     for name in ("q", "dq", "tau", "alpha", "disturbance", "disturbance_estimate", "V", "xi"):
         assert largest_difference(getattr(run, name), getattr(other, name)) < 1e-9, name
@@ -81,37 +75,41 @@ def test_on_the_nominal_arm_it_is_simulate(scenario):
 
 
 @pytest.mark.slow
-def test_a_joint_that_touches_its_stop():
+def test_a_joint_that_touches_its_stop_a_run_that_flies_away_and_meshes_that_are_not_there():
     scenario = ij.with_parts(PAPER, sampling=ij.Sampling(1e-3))
     free = ij.cosimulate(scenario, spec_of(PAPER.plant), **TIMING)
     # The start is 0.8 and the reference leads downwards: a stop lies in the way.
     stop = 0.5 * (float(free.q[0, 1]) + float(np.min(free.q[:, 1])))
     held = ij.cosimulate(scenario, spec_of(PAPER.plant, elbow=f'range="{stop} 3"'), **TIMING)
-    assert float(np.min(free.q[:, 1])) < stop - 0.05
-    assert float(np.min(held.q[:, 1])) > stop - 0.02
+    assert float(np.min(free.q[:, 1])) < stop - 0.05 and float(np.min(held.q[:, 1])) > stop - 0.02
     before = np.argmax(np.asarray(free.q[:, 1]) < stop) - 1
     assert largest_difference(held.q[:before], free.q[:before]) < 1e-12
     # What the law does not know of, the stop's push, is in f.
     pushed, own = (np.abs(run.disturbance[before:]).max() for run in (held, free))
     assert pushed > 2 * own
+    wild = ij.with_parameters(PAPER, {"controller.K2": 2000.0})
+    with pytest.warns(ij.SimulationWarning, match="ran away|not finite|bound"):
+        run = ij.cosimulate(wild, spec_of(PAPER.plant), period=5e-3, **TIMING)
+    assert int(run.status) & int(ij.Status.BOUND_VIOLATED)
+    with pytest.raises(ij.SimulationError):
+        ij.cosimulate(wild, spec_of(PAPER.plant), period=5e-3, throw=True, **TIMING)
+    mesh = '<mesh filename="package://nowhere/link.stl"/>'
+    shape = f"<collision><geometry>{mesh}</geometry></collision></link>"
+    text = (ARMS / "ur5.urdf").read_text().replace("</link>", shape)
+    scenario = ij.with_parts(ij.presets.ur5(), sampling=ij.Sampling(1e-3))
+    with pytest.warns(UserWarning, match="shapes are left out"):
+        MujocoPlant(_written("meshed.urdf", text), tuple(scenario.plant.joints), 6, {}, "RK4")
 
 
-FINGER = (
-    '<body name="finger" pos="0.1 0 0"><joint name="grip" type="slide" axis="0 1 0"/><geom'
-    ' size="0.01" mass="0.2"/></body>'
-)
+FINGER = """<body name="finger" pos="0.1 0 0"><joint name="grip" type="slide" axis="0 1 0"/>
+  <geom size="0.01" mass="0.2"/></body>"""
 
 
 @pytest.mark.slow
 def test_a_locked_joint_in_a_frame_is_held_where_it_is():
-    inner = (
-        '<frame pos="0 0.02 0" euler="0 0 0.4"><body name="palm" pos="0.03 0 0" euler="0 0'
-        ' -0.3"><joint name="wrist" axis="0 0 1"/>'
-    )
-    held = (
-        f'<frame pos="0.05 0 0" euler="0 0 0.9">{inner}<geom size="0.02" pos="0.1 0 0"'
-        f' mass="0.2"/>{FINGER}</body></frame></frame>'
-    )
+    held = f"""<frame pos="0.05 0 0" euler="0 0 0.9"><frame pos="0 0.02 0" euler="0 0 0.4">
+      <body name="palm" pos="0.03 0 0" euler="0 0 -0.3"><joint name="wrist" axis="0 0 1"/>
+      <geom size="0.02" pos="0.1 0 0" mass="0.2"/>{FINGER}</body></frame></frame>"""
     locked = {"wrist": 0.7, "grip": 0.1}
     file = _written("arm.xml", two_link(PAPER.plant, inside=held))
     arm = ij.robots.load(file, tip="fore", locked=locked)
@@ -129,8 +127,7 @@ def _in_a_folder(tmp_path, monkeypatch):
 
 
 def _written(name: str, text: str) -> str:
-    with open(name, "w") as file:
-        file.write(text)
+    Path(name).write_text(text)
     return name
 
 
@@ -141,11 +138,9 @@ DRIVES = """<tendon><fixed name="wire"><joint joint="elbow" coef="1"/></fixed></
 
 
 @pytest.mark.slow
-def test_a_models_own_drives_are_off():
-    aside = (
-        '<body name="table" pos="3 0 0"><joint name="turntable" axis="0 0 1"/><geom'
-        ' size="0.1"/></body>'
-    )
+def test_a_models_own_drives_are_off_and_a_gripper_goes_with_all_that_moves_it():
+    joint = '<joint name="turntable" axis="0 0 1"/><geom size="0.1"/>'
+    aside = f'<body name="table" pos="3 0 0">{joint}</body>'
     site = '<site name="hand" pos="0.2 0 0"/>'
     arm = ij.robots.load(_written("arm.xml", two_link(PAPER.plant)))
     scenario = ij.with_parts(PAPER, robot=arm)
@@ -154,6 +149,15 @@ def test_a_models_own_drives_are_off():
     driven = ij.cosimulate(scenario, _written("driven.xml", text), period=1e-3, **TIMING)
     plain = ij.cosimulate(scenario, "arm.xml", period=1e-3, **TIMING)
     assert largest_difference(driven.q, plain.q) < 1e-12
+    text = two_link(PAPER.plant, inside=GRIPPER).replace("</worldbody>", f"</worldbody>{AROUND}")
+    arm = ij.robots.load(_written("gripper.xml", text), tip="fore", locked={"l": 0.02, "r": 0.02})
+    scenario = ij.with_parts(PAPER, robot=arm, sampling=ij.Sampling(1e-3))
+    expected = ij.simulate(scenario, **TIMING)
+    found = ij.cosimulate(scenario, "gripper.xml", locked={"l": 0.02, "r": 0.02}, **TIMING)
+    assert largest_difference(found.q, expected.q) < 1e-9
+    tied = text.replace('joint="r" coef="0.5"', 'joint="elbow" coef="0.5"')
+    with pytest.raises(ValueError, match=r"tendon 'split'.*one or the other"):
+        ij.cosimulate(scenario, _written("tied.xml", tied), duration=0.1)
 
 
 GRIPPER = "".join(
@@ -169,20 +173,7 @@ AROUND = """<tendon><fixed name="split"><joint joint="l" coef="0.5"/>
 
 
 @pytest.mark.slow
-def test_a_gripper_goes_with_all_that_moves_it():
-    text = two_link(PAPER.plant, inside=GRIPPER).replace("</worldbody>", f"</worldbody>{AROUND}")
-    arm = ij.robots.load(_written("gripper.xml", text), tip="fore", locked={"l": 0.02, "r": 0.02})
-    scenario = ij.with_parts(PAPER, robot=arm, sampling=ij.Sampling(1e-3))
-    expected = ij.simulate(scenario, **TIMING)
-    found = ij.cosimulate(scenario, "gripper.xml", locked={"l": 0.02, "r": 0.02}, **TIMING)
-    assert largest_difference(found.q, expected.q) < 1e-9
-    tied = text.replace('joint="r" coef="0.5"', 'joint="elbow" coef="0.5"')
-    with pytest.raises(ValueError, match=r"tendon 'split'.*one or the other"):
-        ij.cosimulate(scenario, _written("tied.xml", tied), duration=0.1)
-
-
-@pytest.mark.slow
-def test_models_stay_as_they_are_and_other_integrators_come_near():
+def test_models_and_callbacks_stay_and_other_integrators_come_near():
     model = spec_of(PAPER.plant).compile()
     # 0.8 ms do not divide 1 ms: the step is the next shorter one that does.
     found = ij.cosimulate(PAPER, model, duration=0.4, period=1e-3)
@@ -195,11 +186,7 @@ def test_models_stay_as_they_are_and_other_integrators_come_near():
     )
     errors = [largest_difference(run.q[-1], found.q[-1]) for run in (coarse, fine)]
     assert errors[1] == pytest.approx(0.5 * errors[0], rel=0.1)
-
-
-@pytest.mark.slow
-def test_callbacks_of_others_are_kept():
-    seen, model = [], spec_of(PAPER.plant).compile()
+    seen = []
     mujoco.set_mjcb_control(lambda model, data: seen.append(data.time))
     try:
         ij.cosimulate(PAPER, model, period=1e-3, duration=0.01, dt=1e-3)
@@ -209,20 +196,15 @@ def test_callbacks_of_others_are_kept():
         assert len(seen) == count + 1
     finally:
         mujoco.set_mjcb_control(None)
+    slow = ij.with_parts(PAPER, sampling=ij.Sampling(4e-3, delay=4e-3))
+    run = ij.cosimulate(slow, spec_of(PAPER.plant), period=1e-3, duration=0.02, dt=1e-3)
+    quick = ij.with_parts(PAPER, sampling=ij.Sampling(1e-3, delay=4e-3))
+    assert largest_difference(run.q, ij.simulate(quick, duration=0.02, dt=1e-3).q) < 1e-12
 
 
 @pytest.mark.slow
-def test_a_run_that_flies_away_is_told():
-    wild = ij.with_parameters(PAPER, {"controller.K2": 2000.0})
-    with pytest.warns(ij.SimulationWarning, match="ran away|not finite|bound"):
-        run = ij.cosimulate(wild, spec_of(PAPER.plant), period=5e-3, **TIMING)
-    assert int(run.status) & int(ij.Status.BOUND_VIOLATED)
-    with pytest.raises(ij.SimulationError):
-        ij.cosimulate(wild, spec_of(PAPER.plant), period=5e-3, throw=True, **TIMING)
-
-
-@pytest.mark.slow
-def test_records(tmp_path):
+def test_records_and_films_which_may_follow_each_other(tmp_path):
+    """Without a display MuJoCo's renderer fails once, and ends the process at the second try."""
     short = {"duration": 0.2, "dt": 1e-3, "period": 1e-3}
     every = ij.cosimulate(DRIVEN, spec_of(PAPER.plant), **short)
     some = ij.cosimulate(DRIVEN, spec_of(PAPER.plant), record_every=10, **short)
@@ -232,22 +214,6 @@ def test_records(tmp_path):
     np.testing.assert_array_equal(some.metrics.rmse, every.metrics.rmse)
     some.to_xarray()
     ij.save_rollouts(some, tmp_path / "run.nc")
-
-
-def test_an_arm_without_shapes_is_drawn_as_its_skeleton():
-    shapes = spec_of(PAPER.plant)
-    bare = mujoco.MjModel.from_xml_path(str(ARMS / "iiwa14.urdf"))
-    assert has_shapes(shapes.compile())
-    assert not has_shapes(bare)
-    shapes.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.1, 0.1, 0.1])
-    for geom in shapes.geoms:
-        geom.group = 0 if geom.parent == shapes.worldbody else 3
-    assert not has_shapes(shapes.compile()), "a table does not move, and other groups are not drawn"
-
-
-@pytest.mark.slow
-def test_films_may_follow_each_other(tmp_path):
-    """Without a display MuJoCo's renderer fails once, and ends the process at the second try."""
     from PIL import Image
 
     run = {"period": 1e-3, "duration": 0.08, "dt": 1e-3}
@@ -259,36 +225,29 @@ def test_films_may_follow_each_other(tmp_path):
         assert film.n_frames == 3
 
 
-@pytest.mark.slow
-def test_a_shorter_period_finds_room_for_its_commands():
-    slow = ij.with_parts(PAPER, sampling=ij.Sampling(4e-3, delay=4e-3))
-    run = ij.cosimulate(slow, spec_of(PAPER.plant), period=1e-3, duration=0.02, dt=1e-3)
-    quick = ij.with_parts(PAPER, sampling=ij.Sampling(1e-3, delay=4e-3))
-    expected = ij.simulate(quick, duration=0.02, dt=1e-3)
-    assert largest_difference(run.q, expected.q) < 1e-12
+def test_an_arm_without_shapes_is_drawn_as_its_skeleton():
+    shapes = spec_of(PAPER.plant)
+    bare = mujoco.MjModel.from_xml_path(str(ARMS / "iiwa14.urdf"))
+    assert has_shapes(shapes.compile()) and not has_shapes(bare)
+    shapes.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.1, 0.1, 0.1])
+    for geom in shapes.geoms:
+        geom.group = 0 if geom.parent == shapes.worldbody else 3
+    assert not has_shapes(shapes.compile()), "a table does not move, and other groups are not drawn"
 
 
 BRIEF = {"duration": 0.1, "period": 1e-3}
-BAD = {
-    "no period": ({}, {}, "period"),
-    "steps": ({}, {"period": 1e-3, "dt": 3e-4}, "Take dt=0.00025"),
-    "joints": ({"inside": FINGER}, {"period": 1e-3}, "3 joints that move"),
-    "locked": ({}, {"period": 1e-3, "locked": {"wrist": 0.0}}, "wrist.*shoulder"),
-    "too few": ({}, {"period": 1e-3, "locked": {"elbow": 0.0}}, "1 joints that move.*Only hinges"),
-    "film": ({}, {"period": 1e-3, "film": "arm.mp4"}, "film.*gif"),
-    "no number": ({}, {"period": 1e-3, "locked": {"elbow": float("nan")}}, "locked"),
-    "duration": ({}, {"period": 7e-4, "duration": 0.1}, r"Take duration=0\.10\d*\.$"),
-}
+BAD = [
+    ({"period": None}, "period"),
+    ({"dt": 3e-4}, "Take dt=0.00025"),
+    ({"locked": {"wrist": 0.0}}, "wrist.*shoulder"),
+    ({"locked": {"elbow": 0.0}}, "1 joints that move.*Only hinges"),
+    ({"film": "arm.mp4"}, "film.*gif"),
+    ({"locked": {"elbow": float("nan")}}, "locked"),
+    ({"period": 7e-4}, r"Take duration=0\.10\d*\.$"),
+]
 
 
-@pytest.mark.parametrize("case", BAD)
-def test_what_does_not_fit_is_named(case):
-    parts, options, words = BAD[case]
-    with pytest.raises(ValueError, match=words):
-        ij.cosimulate(PAPER, spec_of(PAPER.plant, **parts), **({"duration": 0.1} | options))
-
-
-def test_what_is_no_model_or_no_single_scenario_is_named():
+def test_what_does_not_fit_is_named():
     text = two_link(PAPER.plant)
     arm = ij.with_parts(PAPER, robot=ij.robots.load(_written("arm.xml", text)))
     many = jax.tree.map(lambda x: np.stack([x, x]), PAPER)
@@ -297,8 +256,12 @@ def test_what_is_no_model_or_no_single_scenario_is_named():
     floating = text.replace('<body name="upper">', base)
     floating = floating.replace("</body></body>", "</body></body></body>")
     with_finger = spec_of(PAPER.plant, inside=FINGER)
+    for options, words in BAD:
+        with pytest.raises(ValueError, match=words):
+            ij.cosimulate(PAPER, spec_of(PAPER.plant), **BRIEF | options)
     for scenario, plant, words in (
         (many, spec_of(PAPER.plant), "one scenario"),
+        (PAPER, with_finger, "3 joints that move"),
         (PAPER, "nowhere.xml", r"nowhere\.xml"),
         (PAPER, _written("bad.xml", bad), "body"),
         (arm, _written("other.xml", text.replace("elbow", "elbows")), r"elbow.*elbows"),
@@ -307,15 +270,3 @@ def test_what_is_no_model_or_no_single_scenario_is_named():
     ):
         with pytest.raises(ValueError, match=words):
             ij.cosimulate(scenario, plant, **BRIEF)
-
-
-@pytest.mark.slow
-def test_a_urdf_whose_meshes_are_not_there_touches_nothing():
-    shape = (
-        "<collision><geometry><mesh"
-        ' filename="package://nowhere/link.stl"/></geometry></collision></link>'
-    )
-    text = (ARMS / "ur5.urdf").read_text().replace("</link>", shape)
-    scenario = ij.with_parts(ij.presets.ur5(), sampling=ij.Sampling(1e-3))
-    with pytest.warns(UserWarning, match="shapes are left out"):
-        MujocoPlant(_written("meshed.urdf", text), tuple(scenario.plant.joints), 6, {}, "RK4")

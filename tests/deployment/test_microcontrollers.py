@@ -1,8 +1,6 @@
 """What the page on Simulink and microcontrollers says of the C law: its blocks of C are compiled
 and run, and the law needs no C library but `memcpy`, `memset` and functions of `math.h`."""
 
-from __future__ import annotations
-
 import json
 import platform
 import re
@@ -49,7 +47,6 @@ def undefined(path):
 
 
 def writable(path):
-    """The names of writable data in an object."""
     return re.findall(r" [bBdDcC] (\w+)", run(["nm", path], path.parent))
 
 
@@ -80,9 +77,8 @@ def folder_of(scenario, folder):
 
 @pytest.fixture(scope="module")
 def sampled():
-    scenario = ij.with_parameters(
-        ij.presets.zhang_yan_2024(variant="corrected"), {"controller.K2": 4.0, "observer.kf": 4.0}
-    )
+    gains = {"controller.K2": 4.0, "observer.kf": 4.0}
+    scenario = ij.with_parameters(ij.presets.zhang_yan_2024(variant="corrected"), gains)
     return ij.with_parts(scenario, sampling=ij.Sampling(1e-3, delay=1e-3))
 
 
@@ -127,8 +123,7 @@ int main(void) {
 
 @pytest.mark.slow
 def test_the_blocks_of_the_page_return_the_torques_of_the_self_test(law):
-    """The C Caller block, whose second run after a reset is the first one again, and the
-    S-function."""
+    """The C Caller block, also in a second run after a reset, and the S-function."""
     (law / "block_test.c").write_text(BLOCK_TEST)
     for block, includes, *sources in (
         ("arm_law_block.c", (), "block_test.c"),
@@ -184,19 +179,16 @@ def test_the_check_of_the_page_prints_the_end_of_the_run(sampled, tmp_path):
     ij.export(sampled, tmp_path / "arm_loop", target="wasm", name="arm_loop")
     (tmp_path / "check.mjs").write_text(block_of("check.mjs"))
     expected = ij.simulate(sampled, duration=1.0, dt=1e-3, seed=0).q[-1]
-    found = json.loads(run([node, "check.mjs"], tmp_path))
-    np.testing.assert_allclose(found, expected, atol=1e-10)
+    np.testing.assert_allclose(json.loads(run([node, "check.mjs"], tmp_path)), expected, atol=1e-10)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("suffix", ["", "f"])
 def test_the_law_of_the_page_needs_the_functions_that_it_lists(suffix, law, small_law):
-    folder = small_law if suffix else law
-    needed = names_needed_by("arm_law", folder, "-O2")
+    needed = names_needed_by("arm_law", small_law if suffix else law, "-O2")
     assert needed == MEMORY | {f"{name}{suffix}" for name in OWN}
     words = r"The others that can occur in other laws are (.*?)\. newlib"
-    others = re.search(words, PAGE, re.DOTALL)[1]
-    assert set(re.findall(r"`(\w+)`", others)) == MATH - OWN
+    assert set(re.findall(r"`(\w+)`", re.search(words, PAGE, re.DOTALL)[1])) == MATH - OWN
 
 
 @pytest.mark.slow

@@ -26,12 +26,8 @@ def arrays_of(path: Path) -> dict[str, np.ndarray]:
     """Field -> array of the run in a file, read without this package."""
     with np.load(path) as archive:
         fields = json.loads(archive["result.json"])["result"]["fields"]
-        given = {
-            name: node["jax"]
-            for name, node in fields.items()
-            if isinstance(node, dict) and "jax" in node
-        }
-        return {name: archive[str(number)] for name, number in given.items()}
+        given = {name: node for name, node in fields.items() if isinstance(node, dict)}
+        return {name: archive[str(x["jax"])] for name, x in given.items() if "jax" in x}
 
 
 @pytest.mark.parametrize("kind", PRESETS)
@@ -43,12 +39,10 @@ def test_a_scenario(kind):
         np.testing.assert_allclose(value, values[1][path], rtol=1e-14, err_msg=path)
 
 
-@pytest.mark.parametrize(
-    ("kind", "field", "is_before"),
-    [("robot", "velocity_bounds", True), ("plant", "state_bounds", False)],
-)
-def test_bounds_of_levels_have_their_earlier_place_beside_the_regions(kind, field, is_before):
+@pytest.mark.parametrize("kind", PRESETS)
+def test_bounds_of_levels_have_their_earlier_place_beside_the_regions(kind):
     """Before them for a robot, behind them for another plant; all other leaves keep their order."""
+    field = "velocity_bounds" if kind == "robot" else "state_bounds"
     walls = (ij.regions.HalfSpace(normal=[0.0, 1.0], offset=0.45),)
     scenario = ij.with_parts(PRESETS[kind](), regions=walls)
     paths = [jax.tree_util.keystr(path) for path, _ in jax.tree.leaves_with_path(scenario)]
@@ -59,7 +53,7 @@ def test_bounds_of_levels_have_their_earlier_place_beside_the_regions(kind, fiel
         for start in ((".bounds[1]", ".bounds[2]"), ".regions")
     )
     assert above and regions
-    assert (max(above) < min(regions)) if is_before else (min(above) > max(regions))
+    assert max(above) < min(regions) if kind == "robot" else min(above) > max(regions)
     others = [number for i, number in enumerate(order) if i not in above]
     assert others == sorted(others)
 

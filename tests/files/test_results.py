@@ -1,7 +1,5 @@
 """Every result of a public function has `save`, and `ij.load` returns an equal result."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import importlib
@@ -13,13 +11,13 @@ import re
 import typing
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import ROOT
 from matplotlib.figure import Figure
 from stored_results import stored
 
@@ -48,6 +46,7 @@ NOT_RESULTS = {
 MASS = {"plant.mass": ij.factor(ij.uniform(0.8, 1.2))}
 TIMES = {"duration": 0.1, "dt": 2e-3}
 QUIET = {"progress": False}
+BRIEF = TIMES | QUIET
 PAPER = ij.presets.zhang_yan_2024()
 PENDULUM = ij.Scenario(
     plant=ij.robots.PlanarChain(mass=[2.0], length=[0.5], centre=[0.25], inertia=[0.05]),
@@ -98,13 +97,10 @@ def _result_classes() -> list[type]:
 CLASSES = _result_classes()
 
 
-@pytest.mark.parametrize("cls", CLASSES, ids=lambda cls: cls.__name__)
-def test_every_result_has_save_and_a_name_in_files(cls):
-    assert cls.save is Result.save
-    assert (cls.__module__.removeprefix("iblf_jax."), cls.__qualname__) in RECORDS.values()
-
-
-def test_every_name_in_files_leads_to_a_class_of_its_own():
+def test_every_result_has_save_and_a_name_in_files_which_leads_to_it():
+    for cls in CLASSES:
+        assert cls.save is Result.save, cls
+        assert (cls.__module__.removeprefix("iblf_jax."), cls.__qualname__) in RECORDS.values()
     names = {cls.__name__ for cls in CLASSES}
     assert names >= {"Rollout", "Study", "FirstExit", "Proof", "Certificate", "TuningReport"}
     places = list(RECORDS.values())
@@ -117,7 +113,7 @@ def test_every_name_in_files_leads_to_a_class_of_its_own():
 def _study() -> Any:
     perturbations = MASS | {"initial.q": ij.offset(ij.normal(0.0, 0.05))}
     metrics = (*ij.metrics.standard(), ij.metrics.FirstExit())
-    return ij.monte_carlo(PAPER, perturbations, runs=16, metrics=metrics, **TIMES, **QUIET)
+    return ij.monte_carlo(PAPER, perturbations, runs=16, metrics=metrics, **BRIEF)
 
 
 @functools.cache
@@ -133,7 +129,7 @@ def _tuned() -> Any:
 def _failure() -> Any:
     law = ij.with_parameters(PAPER, {"initial.q": 0.88})
     start = {"initial.q": ij.offset(ij.normal(0.0, 0.03))}
-    return ij.failure_probability(law, start, estimator="monte_carlo", runs=400, **TIMES, **QUIET)
+    return ij.failure_probability(law, start, estimator="monte_carlo", runs=400, **BRIEF)
 
 
 @functools.cache
@@ -164,8 +160,7 @@ def _certificate(scenario: ij.Scenario) -> Any:
 
 
 def _identification() -> Any:
-    motion = excitation(PAPER, ["robot.mass"], duration=2.0)
-    scenario = ij.with_parts(PAPER, reference=motion)
+    scenario = ij.with_parts(PAPER, reference=excitation(PAPER, ["robot.mass"], duration=2.0))
     run = ij.simulate(scenario, duration=2.0, dt=2e-3, record_every=5)
     log = {name: np.asarray(getattr(run, name)) for name in ("t", "q", "tau")}
     return ij.identify(scenario, log, ["robot.mass"])
@@ -191,7 +186,7 @@ def _many() -> ij.Rollout:
 
 
 EXAMPLES: dict[str, tuple[Callable[[], Any], ...]] = {
-    "WorstCase": (lambda: ij.falsify(PENDULUM, MASS, starts=2, iterations=2, **TIMES, **QUIET),),
+    "WorstCase": (lambda: ij.falsify(PENDULUM, MASS, starts=2, iterations=2, **BRIEF),),
     "Certificate": (
         lambda: _certificate(PAPER),
         lambda: _certificate(ij.presets.motor_driven_pendulum()),
@@ -208,9 +203,7 @@ EXAMPLES: dict[str, tuple[Callable[[], Any], ...]] = {
     "Probability": (lambda: _study().violation_probability,),
     "Proof": (_proof,),
     "Rollout": (_many, _sampled),
-    "Sensitivity": (
-        lambda: ij.sensitivity(PENDULUM, MASS, output="rmse", points=8, **TIMES, **QUIET),
-    ),
+    "Sensitivity": (lambda: ij.sensitivity(PENDULUM, MASS, output="rmse", points=8, **BRIEF),),
     "Study": (_study,),
     "TuneResult": (_tuned,),
     "TuningReport": (lambda: _tuned().report,),
@@ -266,15 +259,11 @@ def test_a_saved_result_comes_back(cls, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_loaded_result_replays_its_runs(tmp_path):
+def test_a_loaded_result_replays_its_runs_finds_its_problem_and_computes_nothing_again(tmp_path):
     for result, arguments in ((_study(), (3,)), (_failure().most_likely_failure, ())):
         result.save(tmp_path / "result")
         expected, run = result.replay(*arguments), ij.load(tmp_path / "result").replay(*arguments)
         assert_equal(expected, run, "replay")
-
-
-@pytest.mark.slow
-def test_a_loaded_proof_finds_its_problem(tmp_path):
     proof = _proof()
     assert proof.problem.names  # Now the proof keeps the problem, which no file can hold.
     proof.save(tmp_path / "proof")
@@ -282,11 +271,7 @@ def test_a_loaded_proof_finds_its_problem(tmp_path):
     (run,), (expected,) = again.adversarial_runs(1, dt=0.01), proof.adversarial_runs(1, dt=0.01)
     assert_equal(expected, run, "run")
     assert again.problem.assumptions == proof.assumptions
-
-
-@pytest.mark.slow
-def test_what_was_computed_is_not_computed_again(tmp_path):
-    """The text of a tuning states its report, which takes many runs."""
+    # The text of a tuning states its report, which takes many runs.
     result = _tuned()
     assert "fresh runs" in repr(result) and result.report
     result.save(tmp_path / "tuned")
@@ -328,8 +313,6 @@ def test_numbers_keep_their_precision_in_both_modes_of_jax(enabled, tmp_path):
 
 @ij.component
 class Push:
-    """A constant torque."""
-
     size: ij.Leaf = ij.leaf("N m")
 
     def torque(self, t, q, dq, plant, model):
@@ -340,8 +323,6 @@ class Push:
 
 
 class Pair(NamedTuple):
-    """The state of a user's part."""
-
     one: jax.Array
     other: jax.Array
 
@@ -357,13 +338,10 @@ class WithPair(ij.actuators.Actuator):
         return ij.actuators.Delivered(command, jnp.zeros(command.shape, bool), state)
 
 
-def test_states_of_all_parts_come_back_in_their_structure(run, tmp_path, monkeypatch):
+def test_states_come_back_and_a_class_of_a_user_needs_a_name(run, tmp_path, monkeypatch):
     monkeypatch.setitem(ij.actuators.MEMBERS, "with_pair", WithPair)
-    parts = {
-        "controller": ij.controllers.AdaptiveRBF(k1=2.0, K2=20.0, nodes=2),
-        "observer": ij.observers.ExtendedState(bandwidth=40.0),
-        "actuator": WithPair(),
-    }
+    law, observer = ij.controllers.AdaptiveRBF(2.0, 20.0, nodes=2), ij.observers.ExtendedState(40.0)
+    parts = {"controller": law, "observer": observer, "actuator": WithPair()}
     scenario = ij.with_parts(PAPER, **parts)
     start = initial_state(canonical(scenario))
     states = {f"{part}_state": getattr(start, part) for part in parts}
@@ -371,9 +349,6 @@ def test_states_of_all_parts_come_back_in_their_structure(run, tmp_path, monkeyp
     with_states = dataclasses.replace(run, scenario=scenario, **states)
     with_states.save(tmp_path / "run")
     assert_equal(with_states, ij.load(tmp_path / "run"), "run")
-
-
-def test_a_class_of_a_user_needs_a_name(run, tmp_path, monkeypatch):
     mine = dataclasses.replace(run, scenario=ij.with_parts(PAPER, disturbance=Push(0.5)))
     with pytest.raises(ValueError, match=r'scenario: disturbance: .*disturbances.MEMBERS\["my_'):
         mine.save(tmp_path / "mine")
@@ -402,7 +377,7 @@ UNREADABLE = [
 ]
 
 
-def test_what_could_not_be_read_is_not_saved(run, tmp_path):
+def test_what_could_not_be_read_is_not_saved(run, tmp_path, monkeypatch):
     for value, words in UNREADABLE:
         odd = dataclasses.replace(run, measured=value)
         with pytest.raises(ValueError, match=rf"Rollout\.measured{words}"):
@@ -410,9 +385,6 @@ def test_what_could_not_be_read_is_not_saved(run, tmp_path):
     with pytest.raises(ValueError, match="traced"):
         jax.jit(lambda x: dataclasses.replace(run, x=x).save(tmp_path / "odd"))(run.x)
     assert not list(tmp_path.iterdir())
-
-
-def test_a_failed_save_leaves_what_was_there(run, tmp_path, monkeypatch):
     path = tmp_path / "run"
     path.write_bytes(b"old")
 
@@ -422,8 +394,7 @@ def test_a_failed_save_leaves_what_was_there(run, tmp_path, monkeypatch):
     monkeypatch.setattr(np, "save", full)
     with pytest.raises(OSError, match="no space"):
         run.save(path)
-    assert path.read_bytes() == b"old"
-    assert list(tmp_path.iterdir()) == [path]
+    assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
 
 
 DEEP = functools.reduce(lambda node, _: {"list": [node]}, range(100), 1)
@@ -481,8 +452,7 @@ def test_a_changed_file_is_refused_with_its_key(run, tmp_path):
 
 
 def test_damaged_and_foreign_files_are_refused_with_their_name(run, tmp_path):
-    path = run.save(tmp_path / "run")
-    content = path.read_bytes()
+    content = run.save(tmp_path / "run").read_bytes()
     place = tmp_path / "damaged"
     cut = [content[:size] for size in (0, 1, 10, len(content) // 2, len(content) - 1)]
     for text in (*cut, b"PK", b"CDF", b"{", b"hello", np.random.default_rng(0).bytes(1000)):
@@ -495,12 +465,7 @@ def test_damaged_and_foreign_files_are_refused_with_their_name(run, tmp_path):
         ij.load(place)
     with pytest.raises(FileNotFoundError, match="Nothing is there"):
         ij.load(tmp_path / "none")
-
-
-def test_no_flipped_byte_passes_unnoticed(run, tmp_path):
-    content = bytearray(run.save(tmp_path / "run").read_bytes())
-    generator = np.random.default_rng(0)
-    place = tmp_path / "flipped"
+    generator, place = np.random.default_rng(0), tmp_path / "flipped"
     for position in generator.integers(0, len(content), 60):
         changed = bytearray(content)
         changed[position] ^= 1 << int(generator.integers(8))
@@ -510,21 +475,17 @@ def test_no_flipped_byte_passes_unnoticed(run, tmp_path):
             again = ij.load(place)
         except ValueError as error:
             message = str(error)
-        if not message:  # The bit was one of a date, for example.
-            assert_equal(run, again, "run")
-        else:
+        if message:
             assert "flipped" in message
+        else:  # The bit was one of a date, for example.
+            assert_equal(run, again, "run")
 
 
-def test_the_archive_can_be_read_by_numpy(run, tmp_path):
+def test_numpy_reads_an_archive_and_scenarios_and_earlier_tunings_are_loaded_too(run, tmp_path):
     with np.load(run.save(tmp_path / "run.npz"), allow_pickle=False) as archive:
-        description = json.loads(archive["result.json"])
-        number = description["result"]["fields"]["x"]["jax"]
+        number = json.loads(archive["result.json"])["result"]["fields"]["x"]["jax"]
         np.testing.assert_array_equal(archive[str(number)], run.x)
-
-
-def test_scenarios_and_earlier_tunings_are_loaded_too(tmp_path):
     ij.save_scenario(PAPER, tmp_path / "paper.toml")
     assert isinstance(ij.load(tmp_path / "paper.toml"), ij.Scenario)
-    earlier = Path(__file__).parents[1] / "data" / "tuning_before_weights.json"
-    assert ij.load(earlier).names == ("controller.k1[0]", "controller.k1[1]")
+    earlier = ij.load(ROOT / "tests" / "data" / "tuning_before_weights.json")
+    assert earlier.names == ("controller.k1[0]", "controller.k1[1]")

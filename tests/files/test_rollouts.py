@@ -1,7 +1,5 @@
 """Runs as xarray Datasets, and the files that hold them."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import tomllib
@@ -23,16 +21,7 @@ from iblf_jax.files.rollouts import load_datasets, load_rollouts
 from iblf_jax.simulation.signals import VIEWS
 
 
-@pytest.fixture(scope="module")
-def batch(paper) -> ij.Rollout:
-    def one(gain):
-        scenario = ij.with_parameters(paper, {"controller.K2": gain})
-        return ij.simulate(scenario, duration=0.1, record_every=5, method="euler")
-
-    return jax.vmap(one)(jnp.array([10.0, 20.0, 30.0]))
-
-
-def test_one_run(short_run):
+def test_one_run_which_can_be_done_again_from_its_attributes(short_run):
     data = short_run.to_xarray()
     assert data.sizes == {"time": short_run.t.size, "joint": 2}
     shown = {*ALWAYS, *VIEWS} & set(data)
@@ -43,38 +32,48 @@ def test_one_run(short_run):
         np.testing.assert_array_equal(data[name], short_run.metrics[name])
         assert data[name].attrs["units"] == short_run.metrics.units[name]
     for variable in data.variables.values():
-        assert variable.attrs["units"]
-        assert variable.attrs["description"]
+        assert variable.attrs["units"] and variable.attrs["description"]
     np.testing.assert_array_equal(data.observer_state, short_run.observer_state)
-    assert data.sel(joint=1, time=0.1, method="nearest").q.item() == pytest.approx(
-        float(short_run.q[100, 1])
-    )
-
-
-def test_the_run_can_be_done_again_from_its_attributes(short_run):
-    attributes = short_run.to_xarray().attrs
+    one = data.sel(joint=1, time=0.1, method="nearest").q.item()
+    assert one == pytest.approx(float(short_run.q[100, 1]))
+    attributes = data.attrs
     again = scenario_file.from_dict(tomllib.loads(attributes["scenario"])).scenario
     np.testing.assert_array_equal(ij.simulate(again, **SHORT).q, short_run.q)
     assert json.loads(attributes["parameters"])["plant.mass"] == [2.0, 0.85]
     assert attributes["iblf_jax_version"] == ij.__version__
-    assert attributes["jax_version"] == jax.__version__
-    assert attributes["status"] == "ok"
+    assert attributes["jax_version"] == jax.__version__ and attributes["status"] == "ok"
 
 
 @pytest.mark.slow
-def test_a_batch(batch):
+def test_a_batch(paper):
+    def one(gain):
+        scenario = ij.with_parameters(paper, {"controller.K2": gain})
+        return ij.simulate(scenario, duration=0.1, record_every=5, method="euler")
+
+    batch = jax.vmap(one)(jnp.array([10.0, 20.0, 30.0]))
     data = batch.to_xarray()
-    assert data.q.dims == ("run", "time", "joint")
-    assert data.rmse.dims == ("run", "joint")
-    assert data.status.dims == ("run",)
-    assert list(data.status_words.values) == ["ok"] * 3
+    assert data.q.dims == ("run", "time", "joint") and data.rmse.dims == ("run", "joint")
+    assert data.status.dims == ("run",) and list(data.status_words.values) == ["ok"] * 3
     np.testing.assert_array_equal(data["controller.K2"], [[10.0, 10.0], [20.0, 20.0], [30.0, 30.0]])
     assert "controller.K2" not in json.loads(data.attrs["parameters"])
     assert json.loads(data.attrs["parameters"])["plant.mass"] == [2.0, 0.85]
     xarray.testing.assert_equal(data.q.isel(run=1, drop=True), batch[1].to_xarray().q)
 
 
-def test_states_of_any_structure(short_run, tmp_path):
+def test_metrics_laws_and_states_of_any_kind(short_run, tmp_path):
+    """A metric with the name of a field, a law of a user, which is kept by its parameters, and
+    states of any structure.  The digest knows values that are written in several ways: a NaN of the
+    other sign, 64-bit integers and truth values are equal after a file of netCDF 3."""
+    metrics = ij.Metrics({"V": jnp.array(3.0), "own": jnp.zeros(5)}, (("V", "J"), ("own", "s")))
+    data = dataclasses.replace(short_run, metrics=metrics).to_xarray()
+    assert data.V.dims == ("time",) and data.metric_V == 3.0
+    assert data.metric_V.attrs["units"] == "J" and data.own.dims == ("own_axis_0",)
+    law = ij.controllers.PDGravity
+    mine = ij.component(type("Mine", (law,), {"__annotations__": {}}))(Kp=2.0, Kd=1.0)
+    scenario = dataclasses.replace(short_run.scenario, controller=mine)
+    attributes = dataclasses.replace(short_run, scenario=scenario).to_xarray().attrs
+    assert "scenario" not in attributes and "Mine" in attributes["scenario_not_saved"]
+    assert json.loads(attributes["parameters"])["controller.Kp"] == [2.0, 2.0]
     T = short_run.t.size
     state = {"weights": jnp.zeros((T, 3, 4)), "rest": (jnp.ones((T, 2)), jnp.ones(T))}
     run = dataclasses.replace(short_run, controller_state=state)
@@ -84,42 +83,26 @@ def test_states_of_any_structure(short_run, tmp_path):
     assert data.controller_state_rest_1.dims == ("time",)
     ij.save_rollouts(run, tmp_path / "a.nc")
     xarray.testing.assert_identical(load_datasets(tmp_path / "a.nc")["run"], data)
+    values = short_run.metrics.values_by_name | {
+        "many": jnp.arange(3),
+        "is_so": jnp.array(True),
+        "none": jnp.array([-jnp.nan, -0.0, jnp.inf]),
+    }
+    metrics = dataclasses.replace(short_run.metrics, values_by_name=values)
+    run = dataclasses.replace(short_run, metrics=metrics)
+    ij.save_rollouts(run, tmp_path / "a.nc")
+    assert bool(load_datasets(tmp_path / "a.nc")["run"]["is_so"])
 
 
-def test_metrics_with_the_name_of_a_field(short_run):
-    metrics = ij.Metrics({"V": jnp.array(3.0), "own": jnp.zeros(5)}, (("V", "J"), ("own", "s")))
-    data = dataclasses.replace(short_run, metrics=metrics).to_xarray()
-    assert data.V.dims == ("time",)
-    assert data.metric_V == 3.0
-    assert data.metric_V.attrs["units"] == "J"
-    assert data.own.dims == ("own_axis_0",)
-
-
-def test_a_users_law_is_kept_by_its_parameters(short_run):
-    law = ij.controllers.PDGravity
-    mine = ij.component(type("Mine", (law,), {"__annotations__": {}}))(Kp=2.0, Kd=1.0)
-    scenario = dataclasses.replace(short_run.scenario, controller=mine)
-    attributes = dataclasses.replace(short_run, scenario=scenario).to_xarray().attrs
-    assert "scenario" not in attributes
-    assert "Mine" in attributes["scenario_not_saved"]
-    assert json.loads(attributes["parameters"])["controller.Kp"] == [2.0, 2.0]
-
-
-def test_bad_arguments(short_run, tmp_path):
+def test_bad_arguments_and_files(short_run, tmp_path):
     path = tmp_path / "a.nc"
+    turned = r"path: got \w+, expected a path, after the runs.*save_rollouts\(runs, path\)"
     for runs, place, words in (
         (short_run, tmp_path / "a.csv", r"ends in \.nc"),
         *((runs, path, "dict of at least one Rollout") for runs in ({}, [short_run], None)),
         *(({x: short_run}, path, "name of a run") for x in ("a.b", "", "a/b", 3, "attributes")),
         ({"a": 3}, path, "expected a Rollout"),
-        *(
-            (
-                path,
-                run,
-                r"path: got \w+, expected a path, after the runs.*save_rollouts\(runs, path\)",
-            )
-            for run in (short_run, {"a": short_run})
-        ),
+        *((path, run, turned) for run in (short_run, {"a": short_run})),
     ):
         with pytest.raises(ValueError, match=words):
             ij.save_rollouts(runs, place)
@@ -127,17 +110,13 @@ def test_bad_arguments(short_run, tmp_path):
         load_datasets(tmp_path / "a")
     with pytest.raises(ValueError, match="jit"):
         jax.jit(lambda run: rollouts.rollout_to_xarray(run) and 0)(short_run)
-
-
-@pytest.mark.parametrize("ending", ["nc", "npz"])
-def test_bad_files(ending, tmp_path):
-    path = tmp_path / f"a.{ending}"
-    with pytest.raises(FileNotFoundError):
-        load_datasets(path)
-    for content in (b"", b"hello", b"CDF\x01" + bytes(40), b"PK\x03\x04"):
-        path.write_bytes(content)
-        with pytest.raises(ValueError, match="expected a file written by save_rollouts"):
+    for path in (tmp_path / "a.nc", tmp_path / "a.npz"):
+        with pytest.raises(FileNotFoundError):
             load_datasets(path)
+        for content in (b"", b"hello", b"CDF\x01" + bytes(40), b"PK\x03\x04"):
+            path.write_bytes(content)
+            with pytest.raises(ValueError, match="expected a file written by save_rollouts"):
+                load_datasets(path)
 
 
 @pytest.fixture(scope="module")
@@ -152,12 +131,11 @@ def stored(short_run, tmp_path_factory):
 def _is_same(found, expected):
     if found.keys() != expected.keys():
         return False
-    types = all(
-        found[name][label].dtype == x.dtype
+    return all(
+        found[name].identical(one)
+        and all(found[name][label].dtype == x.dtype for label, x in one.variables.items())
         for name, one in expected.items()
-        for label, x in one.variables.items()
     )
-    return types and all(found[name].identical(one) for name, one in expected.items())
 
 
 def _damage(content, rng, kind):
@@ -193,8 +171,7 @@ def test_a_damaged_netcdf_file_is_refused_or_loads_as_it_was(kind, stored, rng, 
 
 
 def test_an_edited_file_is_refused_unless_it_has_no_digest(stored, tmp_path):
-    """Files of older versions have none; a Dataset that a user edits and saves must not hold one
-    that has become stale."""
+    """Files of older versions have none, nor has a Dataset that a user edits and saves."""
     path, expected = stored
     assert not any("digest" in one.attrs for one in expected.values())
     data = xarray.load_dataset(path, engine="scipy")
@@ -210,54 +187,28 @@ def test_an_edited_file_is_refused_unless_it_has_no_digest(stored, tmp_path):
     assert _is_same({"two runs": found["two runs"]}, {"two runs": expected["two runs"]})
 
 
-def test_a_digest_knows_values_that_are_written_in_several_ways(short_run, tmp_path):
-    """A NaN of the other sign, 64-bit integers and truth values are equal after a file of netCDF
-    3."""
-    values = short_run.metrics.values_by_name | {
-        "many": jnp.arange(3),
-        "is_so": jnp.array(True),
-        "none": jnp.array([-jnp.nan, -0.0, jnp.inf]),
-    }
-    run = dataclasses.replace(
-        short_run, metrics=dataclasses.replace(short_run.metrics, values_by_name=values)
-    )
-    ij.save_rollouts(run, tmp_path / "a.nc")
-    assert bool(load_datasets(tmp_path / "a.nc")["run"]["is_so"])
-
-
-@pytest.fixture(scope="module")
-def levels_run():
-    return ij.simulate(pendulum(), duration=0.2, dt=1e-3)
-
-
-def test_signals_of_levels_have_dimensions_and_units_also_in_a_file(levels_run, tmp_path):
+def test_signals_of_levels_have_dimensions_and_units_also_in_a_file(tmp_path):
+    levels_run = ij.simulate(pendulum(), duration=0.2, dt=1e-3)
     data = levels_run.to_xarray()
     for ending in (".nc", ".npz"):
         ij.save_rollouts(levels_run, tmp_path / f"run{ending}")
         assert load_datasets(tmp_path / f"run{ending}")["run"].identical(data)
     assert data.disturbance.dims == ("time", "level", "joint")
     assert data.disturbance.attrs["units"] == "rad/s; rad/s^2; A/s"
-    assert data.x.dims == ("time", "level", "joint")
-    assert data.x.attrs["units"] == "rad; rad/s; A"
+    assert data.x.dims == ("time", "level", "joint") and data.x.attrs["units"] == "rad; rad/s; A"
     assert data.tau.attrs == {"units": "V", "description": "input: input"}
     assert data.level_margin.dims == ("higher_level", "joint")
     assert data.estimate_rmse.dims == ("level", "joint")
-    assert np.array_equal(data.level, [1, 2, 3])
-    assert np.array_equal(data.higher_level, [3])
+    assert np.array_equal(data.level, [1, 2, 3]) and np.array_equal(data.higher_level, [3])
     assert data.level.attrs["description"] == "level of the plant, from 1: angle, speed, current"
     assert data.joint.attrs["description"] == "component of a level, from 0: pendulum"
 
 
 @pytest.mark.slow
-def test_components_of_different_units():
+def test_components_of_different_units_and_estimated_levels_with_rows_of_the_model(tmp_path):
     data = ij.simulate(body(), duration=0.1, dt=1e-2).to_xarray()
     assert data.q.attrs == {"units": "m, m, rad", "description": "pose"}
     assert data.margin.attrs["units"] == "m, m, rad"
-
-
-@pytest.mark.slow
-def test_estimated_levels_of_a_robot_within_a_plant_have_rows_of_the_model(tmp_path):
-    """The plant has four levels, and its model two."""
     plant = rigid_law().plant
     scenario = rigid_law(model=plant.rigid(), observer=ij.observers.StateObserver(bandwidth=100.0))
     run = ij.simulate(scenario, duration=0.02, dt=1e-3)
@@ -267,5 +218,4 @@ def test_estimated_levels_of_a_robot_within_a_plant_have_rows_of_the_model(tmp_p
     assert data.peak_level_error.dims == ("model_level", "joint")
     assert np.array_equal(data.model_level, [1, 2])
     ij.save_rollouts(run, tmp_path / "run.nc")
-    loaded = load_rollouts(tmp_path / "run.nc")
-    assert np.array_equal(loaded.x_hat, run.x_hat)
+    assert np.array_equal(load_rollouts(tmp_path / "run.nc").x_hat, run.x_hat)

@@ -1,7 +1,4 @@
-"""Scenario files: what is saved comes back equal, and what is wrong is a ValueError that says
-where."""
-
-from __future__ import annotations
+"""Scenario files: what is saved comes back equal, and errors say where they are."""
 
 import copy
 import dataclasses
@@ -30,8 +27,7 @@ from iblf_jax.files.study import load_study_file
 def assert_equal(a: ij.Scenario, b: ij.Scenario) -> None:
     assert jax.tree.structure(a) == jax.tree.structure(b)
     for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
-        assert x.shape == y.shape
-        assert x.dtype == y.dtype
+        assert x.shape == y.shape and x.dtype == y.dtype
         assert np.asarray(x).tobytes() == np.asarray(y).tobytes()
 
 
@@ -42,11 +38,8 @@ OF_FUNCTIONS = (
 """Members with fields that are functions, which no file holds."""
 OWN_NUMBERS = (
     *("plant ", "sensor ", "actuator ", "process_noise ", "robot arm", "reference ellipse"),
-    *(
-        "region half_space_of_the_elbow",
-        "region sphere_inside",
-        "law barrier_backstepping_matrices",
-    ),
+    *("region half_space_of_the_elbow", "region sphere_inside"),
+    "law barrier_backstepping_matrices",
 )
 """Families and members with conditions besides signs, which random bits do not fulfil."""
 OWN_NUMBERS_OF_LAW = (
@@ -68,18 +61,15 @@ def assert_comes_back(scenario: ij.Scenario) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("dtype", "decades"), [("float64", 300), ("float32", 30)])
 def test_a_scenario_of_every_member_comes_back_equal(dtype, decades):
-    """With its own numbers, and with random bits in every leaf.
-
-    The queue of a sampled loop follows from its delay.
-    """
+    """With its own numbers, and with random bits in every leaf. The queue of a sampled loop follows
+    from its delay."""
     rng = np.random.default_rng(decades)
 
     def other(x):
         size = 10.0 ** rng.uniform(-decades, decades, x.shape)
         return jnp.asarray(np.abs(rng.standard_normal(x.shape)) * size, dtype)
 
-    cases = scenarios_of_members.scenarios() | {"plant rigid law": rigid_law}
-    for name, make in cases.items():
+    for name, make in (scenarios_of_members.scenarios() | {"plant rigid law": rigid_law}).items():
         if name.endswith(OF_FUNCTIONS):
             continue
         scenario = ij.astype(make(), dtype)
@@ -109,15 +99,12 @@ def test_bounds_are_a_table_or_one_for_each_level(paper, tmp_path):
     ):
         ij.save_scenario(scenario, place)
         text = place.read_text()
-        assert header in text
-        assert ("[[bounds]]" in text) == (header == "\n[[bounds]]\n")
+        assert header in text and ("[[bounds]]" in text) == (header == "\n[[bounds]]\n")
         assert_equal(scenario, ij.load_scenario(place))
 
 
 def of_earlier_version(scenario: ij.Scenario) -> dict[str, Any]:
-    """The tables as versions wrote them that had the bounds of other levels in fields of their
-    own.
-    """
+    """The tables of versions that had the bounds of other levels in fields of their own."""
     tables = scenario_file.scenario_to_dict(scenario)
     first, *levels = tables["bounds"]
     tables["bounds"] = first
@@ -127,6 +114,7 @@ def of_earlier_version(scenario: ij.Scenario) -> dict[str, Any]:
 
 
 def test_tables_of_earlier_versions_load_and_are_refused_where_they_contradict_each_other():
+    """`data/earlier` has files with one of the forms of the law of two levels."""
     flexible = ij.presets.flexible_joint_two_link()
     tables = of_earlier_version(flexible)
     assert "none" in tables["state_bounds"]
@@ -143,21 +131,10 @@ def test_tables_of_earlier_versions_load_and_are_refused_where_they_contradict_e
     ):
         with pytest.raises(ValueError, match=message):
             scenario_file.from_dict(tables | {"state_bounds": levels})
-
-
-def test_the_law_of_two_levels_of_earlier_versions_loads():
-    """`data/earlier` has files with one of its forms."""
-    expected = ij.with_parts(
-        ij.presets.zhang_yan_2024_full_state(),
-        controller=members.two_barriers(
-            K2=[20.0, 15.0],
-            c=8.0,
-            second=ij.barriers.Tan(),
-            weight=[0.5, 2.0],
-            o=0.1,
-            decays=ij.decays.FiniteTime(k_a=1.0),
-        ),
-    )
+    numbers = {"K2": [20.0, 15.0], "c": 8.0, "weight": [0.5, 2.0], "o": 0.1}
+    parts = {"second": ij.barriers.Tan(), "decays": ij.decays.FiniteTime(k_a=1.0)}
+    present = members.two_barriers(**numbers, **parts)
+    expected = ij.with_parts(ij.presets.zhang_yan_2024_full_state(), controller=present)
     law = {"kind": "full_state", "k1": 2.0, "K2": [20.0, 15.0], "c": 8.0, "o": 0.1}
     law |= {"weight": [0.5, 2.0], "decays": [{"kind": "finite_time", "k_a": 1.0}]}
     law |= {"barrier": {"kind": "integral"}, "velocity_barrier": {"kind": "tan"}}
@@ -170,7 +147,28 @@ def test_the_law_of_two_levels_of_earlier_versions_loads():
         scenario_file.from_dict(tables)
 
 
-def test_parameters_of_a_file_have_short_and_earlier_paths():
+def test_the_same_robot_is_written_once_numbers_carry_their_units_and_defaults_are_filled_in(paper):
+    tables = scenario_file.scenario_to_dict(paper)
+    assert "robot" in tables and not {"plant", "model"} & set(tables)
+    tables = scenario_file.scenario_to_dict(ij.with_parameters(paper, {"plant.payload": 0.5}))
+    assert tables["plant"]["payload"] == 0.5 and tables["model"]["payload"] == 0.0
+    text = scenario_file.scenario_to_toml(paper)
+    assert "K2 = [20.0, 20.0]  # N m s/rad\n" in text
+    assert "mass = [2.0, 0.85]  # kg\n" in text
+    tables = scenario_file.scenario_to_dict(paper)
+    tables["controller"] = {"kind": "backstepping", "k1": 2, "K2": 20}
+    tables["observer"] = {"kind": "printed", "kf": 20}
+    tables["initial"] = {"q": 0.8}
+    assert_equal(scenario_file.from_dict(tables).scenario, paper)
+
+
+def test_a_preset_with_arguments_and_parameters_by_short_and_earlier_paths(tmp_path):
+    text = 'preset = "zhang_yan_2024"\n[arguments]\nlaw = "log"\np = 2\n'
+    text += '[parameters]\n"robot.mass[1]" = 1.1\ncontroller.K2 = 30\n'
+    (tmp_path / "a.toml").write_text(text)
+    values = {"robot.mass[1]": 1.1, "controller.K2": 30.0}
+    expected = ij.with_parameters(ij.presets.zhang_yan_2024(law="log", p=2), values)
+    assert_equal(ij.load_scenario(tmp_path / "a.toml"), expected)
     text = """preset = "motor_driven_pendulum"
 [parameters]
 "bounds.lower.value" = -1.3
@@ -179,38 +177,8 @@ def test_parameters_of_a_file_have_short_and_earlier_paths():
 "bounds[2].upper.value" = 2.9
 """
     found = scenario_file.from_dict(tomllib.loads(text)).scenario.bounds
-    assert float(found[0].lower.value[0]) == -1.3
-    assert float(found[1].upper.value[0]) == 2.7
+    assert float(found[0].lower.value[0]) == -1.3 and float(found[1].upper.value[0]) == 2.7
     assert [float(x[0]) for x in (found[2].lower.value, found[2].upper.value)] == [-2.8, 2.9]
-
-
-def test_the_same_robot_is_written_once_and_numbers_carry_their_units(paper):
-    tables = scenario_file.scenario_to_dict(paper)
-    assert "robot" in tables and not {"plant", "model"} & set(tables)
-    other = ij.with_parameters(paper, {"plant.payload": 0.5})
-    tables = scenario_file.scenario_to_dict(other)
-    assert tables["plant"]["payload"] == 0.5
-    assert tables["model"]["payload"] == 0.0
-    text = scenario_file.scenario_to_toml(paper)
-    assert "K2 = [20.0, 20.0]  # N m s/rad\n" in text
-    assert "mass = [2.0, 0.85]  # kg\n" in text
-
-
-def test_scalars_and_defaults_are_filled_in(paper):
-    tables = scenario_file.scenario_to_dict(paper)
-    tables["controller"] = {"kind": "backstepping", "k1": 2, "K2": 20}
-    tables["observer"] = {"kind": "printed", "kf": 20}
-    tables["initial"] = {"q": 0.8}
-    assert_equal(scenario_file.from_dict(tables).scenario, paper)
-
-
-def test_a_preset_with_arguments_and_parameters(tmp_path):
-    text = 'preset = "zhang_yan_2024"\n[arguments]\nlaw = "log"\np = 2\n'
-    text += '[parameters]\n"robot.mass[1]" = 1.1\ncontroller.K2 = 30\n'
-    (tmp_path / "a.toml").write_text(text)
-    values = {"robot.mass[1]": 1.1, "controller.K2": 30.0}
-    expected = ij.with_parameters(ij.presets.zhang_yan_2024(law="log", p=2), values)
-    assert_equal(ij.load_scenario(tmp_path / "a.toml"), expected)
 
 
 def test_a_file_takes_the_tables_of_another_one(paper, tmp_path):
@@ -362,7 +330,6 @@ JUNK = st.one_of(
 
 @functools.cache
 def paper_file() -> str:
-    """The file of the paper's scenario."""
     return scenario_file.scenario_to_toml(ij.presets.zhang_yan_2024())
 
 

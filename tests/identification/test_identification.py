@@ -1,21 +1,23 @@
-"""Parameters from logs that another program made: values and their errors, what a log cannot tell,
+"""Parameters from logs that other programs made: values and their errors, what a log cannot tell,
 and logs that are wrong.
 
-The other program is `independent_log`: the arm of `independent.Loop` with friction in NumPy, moved
-by RK4 under a held torque, its encoders of 14 bits; it shares nothing with the package.
+The other programs, which share nothing with the package, are `independent_log`: the arm of
+`independent.Loop` with friction in NumPy, moved by RK4 under a held torque, its encoders of 14
+bits; and MuJoCo, which moves seven joints under a computed torque with wrong masses.
 """
 
-from __future__ import annotations
-
+import dataclasses
 import json
 import re
 
 import jax
 import jax.numpy as jnp
+import loops_of_plants
 import numpy as np
 import pytest
 import tomli_w
 import xarray
+from arm_cases import as_mjcf
 from conftest import ROOT
 from independent import Loop
 from scipy.signal import savgol_filter
@@ -51,8 +53,7 @@ def smooth(dq, bristle):
 
 
 def sticking(dq, bristle):
-    """Friction of a bristle, which gives way by 1 mrad and breaks away at 1.3 times what it needs
-    to go on (LuGre)."""
+    """A bristle that gives way by 1 mrad and breaks away at 1.3 times the friction (LuGre)."""
     stiffness, most = COULOMB / 1e-3, COULOMB * (1.0 + 0.3 * np.exp(-((dq / 0.01) ** 2)))
     return stiffness * bristle, dq - np.abs(dq) * stiffness * bristle / most
 
@@ -110,7 +111,6 @@ def known(scenario, log):
 
 @pytest.fixture(scope="module")
 def heavier(scenario):
-    """The scenario with the plant's true masses."""
     return ij.with_parameters(scenario, {"plant.mass": MASS})
 
 
@@ -120,7 +120,6 @@ def run(heavier):
 
 
 def counted(run, rows=slice(None)):
-    """A log of rows of a run, in counts."""
     t, q, tau = (np.asarray(x)[rows] for x in (run.t, run.q, run.tau))
     return {"t": t, "q": COUNT * np.round(q / COUNT), "tau": tau}
 
@@ -134,7 +133,8 @@ TRUTH = {"robot.mass": MASS, "disturbance.viscous": VISCOUS, "disturbance.coulom
 
 
 @pytest.mark.slow
-def test_true_values_are_within_their_errors_and_the_fit_is_as_good_as_the_encoder(known, scenario):
+def test_true_values_are_within_their_errors_which_are_drawn_together(known, scenario):
+    """The draws of a study have the covariance of the identification, also between leaves."""
     assert np.max(np.abs(z_scores(known, TRUTH))) < 4.0
     assert np.max(np.abs(known.values["robot.mass"] / MASS - 1.0)) < 1e-3
     # An error that is too large covers anything.
@@ -152,12 +152,20 @@ def test_true_values_are_within_their_errors_and_the_fit_is_as_good_as_the_encod
     np.testing.assert_allclose(known.scenario.disturbance.coulomb, coulomb)
     assert known.scenario.initial.q.dtype == scenario.initial.q.dtype
     np.testing.assert_array_equal(known.scenario.controller.K2, scenario.controller.K2)
+    assert set(known.perturbations) == {"plant.mass", "disturbance.viscous", "disturbance.coulomb"}
+    study = ij.monte_carlo(known.scenario, known.perturbations, runs=2000, duration=0.01, dt=1e-3)
+    drawn = np.concatenate([study.samples[path] for path in known.perturbations], axis=1)
+    size, correlation = np.sqrt(np.diag(known.covariance)[:6]), known.correlation[:6, :6]
+    np.testing.assert_allclose(drawn.std(axis=0), size, rtol=0.1)
+    np.testing.assert_allclose(np.corrcoef(drawn.T), correlation, atol=0.1)
+    assert np.max(np.abs(correlation - np.eye(6))) > 0.3  # else the line above says nothing
+    means = np.concatenate(list(known.values.values()))[:6]
+    np.testing.assert_allclose(drawn.mean(axis=0), means, atol=0.1 * size.max())
 
 
 @pytest.mark.slow
 def test_friction_that_sticks_is_left_to_the_log(scenario):
-    """A bristle's friction is no tanh: about standstill torques are free, what the rest tells is
-    not spoilt, and the report says so."""
+    """A bristle is no tanh: about standstill torques are free, which does not spoil the rest."""
     known = ij.identify(scenario, independent_log(seed=1, friction=sticking, substeps=10), PATHS)
     verdicts = [number.verdict for number in known.numbers]
     assert (set(verdicts[:6]), set(verdicts[6:])) == ({"told"}, {"left free"})
@@ -172,23 +180,8 @@ def test_friction_that_sticks_is_left_to_the_log(scenario):
 
 
 @pytest.mark.slow
-def test_what_a_log_leaves_open_is_drawn_together(known):
-    """The draws of a study have the covariance of the identification, also between leaves."""
-    assert set(known.perturbations) == {"plant.mass", "disturbance.viscous", "disturbance.coulomb"}
-    study = ij.monte_carlo(known.scenario, known.perturbations, runs=2000, duration=0.01, dt=1e-3)
-    drawn = np.concatenate([study.samples[path] for path in known.perturbations], axis=1)
-    size, correlation = np.sqrt(np.diag(known.covariance)[:6]), known.correlation[:6, :6]
-    np.testing.assert_allclose(drawn.std(axis=0), size, rtol=0.1)
-    np.testing.assert_allclose(np.corrcoef(drawn.T), correlation, atol=0.1)
-    assert np.max(np.abs(correlation - np.eye(6))) > 0.3  # else the line above says nothing
-    means = np.concatenate(list(known.values.values()))[:6]
-    np.testing.assert_allclose(drawn.mean(axis=0), means, atol=0.1 * size.max())
-
-
-@pytest.mark.slow
 def test_what_a_log_cannot_tell_is_not_the_start_as_an_answer(scenario, log):
-    """m1, lc1 and I1 enter as two numbers, p1 and p4: these are right in the scenario, and the
-    three are not told."""
+    """m1, lc1 and I1 enter as two numbers, p1 and p4, which are right in the scenario."""
     start = ij.with_parameters(scenario, {"robot.mass[1]": MASS[1]})
     three = ["robot.mass[0]", "robot.centre[0]", "robot.inertia[0]"]
     known = ij.identify(start, log, [*three, *PATHS[1:]], widths=False)
@@ -205,25 +198,38 @@ def test_what_a_log_cannot_tell_is_not_the_start_as_an_answer(scenario, log):
 
 
 @pytest.mark.slow
-def test_a_delay_between_torque_and_position_is_found(scenario, log):
+def test_a_delay_of_the_torque_is_found_and_that_of_the_command_is_a_leaf(scenario, log):
     # Positions of 8 ms later.
     late = {"t": log["t"][:-2], "q": log["q"][2:], "tau": log["tau"][:-2]}
     known = ij.identify(scenario, late, PATHS, widths=False)
     assert abs(known.delay + 8e-3) < 5 * known.delay_error
     assert np.max(np.abs(z_scores(known, TRUTH))) < 5.0
+    commanded = part_of(log | {"tau": np.roll(log["tau"], -1, axis=0)}, slice(0, -1))
+    lab = ij.with_parts(scenario, sampling=ij.Sampling(4e-3, delay=1e-3))
+    known = ij.identify(lab, commanded, [*PATHS, "sampling.delay"], widths=False)
+    assert abs(float(known.scenario.sampling.delay) - 4e-3) < 5 * known.delay_error < 1e-3
+    assert set(known.values) == set(PATHS)
 
 
 @pytest.mark.slow
-def test_irregular_times_and_a_gap(scenario, run, rng):
-    """Rows left out at random, and a third of a second at once; the torque of a continuous loop is
-    interpolated."""
+def test_irregular_times_a_gap_outliers_and_a_log_that_is_held_back(scenario, log, run, rng):
+    """Rows left out at random, and a third of a second at once; the torque is interpolated."""
     rows = np.sort(rng.choice(6000, 3500, replace=False))
-    log = counted(run, rows[(rows < 2000) | (rows > 2300)])
-    assert [len(one.segments) for one in read(log, 2)] == [2]
-    known = ij.identify(scenario, log, ["robot.mass"], torque="interpolated", held_out=0)
+    gap = counted(run, rows[(rows < 2000) | (rows > 2300)])
+    assert [len(one.segments) for one in read(gap, 2)] == [2]
+    known = ij.identify(scenario, gap, ["robot.mass"], torque="interpolated", held_out=0)
     assert np.max(np.abs(z_scores(known, {"robot.mass": MASS}))) < 4.0
     assert np.max(np.abs(known.values["robot.mass"] / MASS - 1.0)) < 1e-3
     assert all(np.isnan(one.held_back) for one in known.fit)
+    q = log["q"].copy()
+    hit = rng.choice(q.size, 40, replace=False)
+    q.ravel()[hit] += rng.choice([-0.05, 0.05], 40)
+    spoilt = log | {"q": q}
+    parts = [part_of(spoilt, slice(0, 700)), part_of(spoilt, slice(760, None))]
+    options = {"held_out": part_of(log, slice(0, 600)), "loss": "huber", "widths": False}
+    both = ij.identify(scenario, parts, PATHS, **options)
+    assert np.max(np.abs(both.values["robot.mass"] / MASS - 1.0)) < 2e-3
+    assert np.sum(~both.kept) == 4 and len(both.logs) == 3
 
 
 def part_of(log, rows):
@@ -236,36 +242,13 @@ def test_the_end_of_each_log_is_held_back_as_its_share_says(rng):
     cut = windows(read([one, one, one], 2), 0.2, [0.0, 0.25, 0.5], hold=True)
     kept = [cut.kept[cut.log == i] for i in range(3)]
     assert len({len(x) for x in kept}) == 1 and len(kept[0]) >= 8
-    assert [int(x.sum()) for x in kept] == [
-        len(kept[0]) - round(s * len(kept[0])) for s in (0, 0.25, 0.5)
-    ]
+    count = len(kept[0])
+    assert [int(x.sum()) for x in kept] == [count - round(s * count) for s in (0, 0.25, 0.5)]
     for i in range(3):
         assert not np.any(np.diff(kept[i].astype(int)) > 0)  # the end, and nothing before it
         np.testing.assert_array_equal(cut.t[cut.log == i], cut.t[cut.log == 0])
     np.testing.assert_allclose(np.diff(cut.t, axis=1), 0.01)
     np.testing.assert_array_equal(cut.y[0], one["q"][np.searchsorted(t, cut.t[0] - 1e-9)])
-
-
-@pytest.mark.slow
-def test_several_logs_with_outliers_and_one_that_is_held_back(scenario, log, rng):
-    q = log["q"].copy()
-    hit = rng.choice(q.size, 40, replace=False)
-    q.ravel()[hit] += rng.choice([-0.05, 0.05], 40)
-    spoilt = log | {"q": q}
-    parts = [part_of(spoilt, slice(0, 700)), part_of(spoilt, slice(760, None))]
-    options = {"held_out": part_of(log, slice(0, 600)), "loss": "huber", "widths": False}
-    both = ij.identify(scenario, parts, PATHS, **options)
-    assert np.max(np.abs(both.values["robot.mass"] / MASS - 1.0)) < 2e-3
-    assert np.sum(~both.kept) == 4 and len(both.logs) == 3
-
-
-@pytest.mark.slow
-def test_a_delay_of_the_command_is_a_leaf(scenario, log):
-    commanded = part_of(log | {"tau": np.roll(log["tau"], -1, axis=0)}, slice(0, -1))
-    lab = ij.with_parts(scenario, sampling=ij.Sampling(4e-3, delay=1e-3))
-    known = ij.identify(lab, commanded, [*PATHS, "sampling.delay"], widths=False)
-    assert abs(float(known.scenario.sampling.delay) - 4e-3) < 5 * known.delay_error < 1e-3
-    assert set(known.values) == set(PATHS)
 
 
 @pytest.mark.slow
@@ -275,10 +258,8 @@ def test_priors_and_limits(scenario, log):
     np.testing.assert_allclose(fixed.values["robot.mass"], MASS, atol=5e-7)
     assert np.max(fixed.standard_errors["robot.mass"]) < 5e-7
     # At the second one, the misfit is so large that nothing else is told.
-    for path, ends in (
-        ("disturbance.coulomb", (0.0, [0.199, 0.15])),
-        ("robot.mass", (None, [1.8, 1.2])),
-    ):
+    limits = {"disturbance.coulomb": (0.0, [0.199, 0.15]), "robot.mass": (None, [1.8, 1.2])}
+    for path, ends in limits.items():
         bound = ij.identify(scenario, log, PATHS, widths=False, limits={path: ends})
         name, at = f"{path}[0]", ends[1][0]
         number = bound.numbers[bound.names.index(name)]
@@ -288,9 +269,6 @@ def test_priors_and_limits(scenario, log):
         assert f"{at:g} " in words and f"The upper end of limits['{path}']" in words
         free = float(re.search(r"asks for about ([\d.]+\d)", words)[1])
         assert free == pytest.approx(TRUTH[path][0], rel=0.02)
-
-
-# ---------------------------------------------- terms that were left out of the fit
 
 
 def with_friction(scenario, viscous, coulomb):
@@ -313,11 +291,8 @@ def other_logs():
 
 
 @pytest.mark.slow
-def test_coulomb_friction_that_was_left_out_is_found_and_what_makes_up_for_it_is_marked(
-    scenario, other_logs
-):
-    """Viscous friction is found about twice too large then: not "told", but biased, by about what
-    it is too large."""
+def test_coulomb_friction_that_was_left_out_biases_what_makes_up_for_it(scenario, other_logs):
+    """Viscous friction is then about twice too large: biased, by about what it is too large."""
     start = ij.with_parameters(scenario, {"disturbance.coulomb": 0.0})
     known = ij.identify(start, other_logs[0], PATHS[:2])
     found = sorted(note for note in known.notes if "depends on the sign of its velocity" in note)
@@ -336,38 +311,13 @@ def test_coulomb_friction_that_was_left_out_is_found_and_what_makes_up_for_it_is
 
 
 @pytest.mark.slow
-def test_a_fit_that_lacks_nothing_has_no_finding(known, scenario, other_logs):
+def test_left_out_gravity_and_inertia_are_named_and_nothing_else(known, scenario, other_logs):
+    """Those of a payload and a rotor, of the torques that are logged: nothing else is wrong."""
     assert not any("The residual torque of" in note or "biased" in note for note in known.notes)
     assert all(number.bias is None for number in known.numbers)
+    truth = with_friction(scenario, VISCOUS, COULOMB)
     for log in other_logs:
-        assert not lacking(with_friction(scenario, VISCOUS, COULOMB), log, PATHS).findings
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("viscous", "coulomb", "paths", "kind", "sizes"),
-    [
-        (VISCOUS, 0.0, PATHS[:2], "sign", COULOMB),
-        (0.0, COULOMB, PATHS[:1], "velocity", VISCOUS),
-        (VISCOUS, 2.0 * COULOMB, PATHS[:2], "sign", -COULOMB),
-    ],
-)
-def test_what_was_left_out_is_named_by_joint_and_size(
-    viscous, coulomb, paths, kind, sizes, scenario, other_logs
-):
-    found = lacking(with_friction(scenario, viscous, coulomb), other_logs[0], paths)
-    expected = {(j, kind) for j, size in enumerate(sizes) if size is not None}
-    assert {(one.joint, one.kind) for one in found.findings} == expected
-    for one in found.findings:
-        np.testing.assert_allclose(one.size, sizes[one.joint], rtol=0.25)
-        assert one.error < 0.2 * abs(one.size) and one.gain > 0.3
-
-
-@pytest.mark.slow
-def test_gravity_and_inertia_that_were_left_out_are_named(scenario, other_logs):
-    """Another payload's worth of gravity, and a rotor: of the torques that are logged, so that
-    nothing else is wrong."""
-    truth, log = with_friction(scenario, VISCOUS, COULOMB), other_logs[0]
+        assert not lacking(truth, log, PATHS).findings
     rate = np.gradient(np.gradient(log["q"], log["t"], axis=0), log["t"], axis=0)
     gravity = np.array([0.0, 0.4]) * np.cos(log["q"])
     rotor = np.array([0.05, 0.0]) * savgol_filter(rate, 31, 2, axis=0)
@@ -376,21 +326,33 @@ def test_gravity_and_inertia_that_were_left_out_are_named(scenario, other_logs):
         assert {(one.joint, one.kind) for one in found} == {expected}
 
 
-# ----------------------------------------------------------------- logs that are wrong
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("viscous", "coulomb", "known", "kind", "sizes"),
+    [
+        (VISCOUS, 0.0, 2, "sign", COULOMB),
+        (0.0, COULOMB, 1, "velocity", VISCOUS),
+        (VISCOUS, 2.0 * COULOMB, 2, "sign", -COULOMB),
+    ],
+)
+def test_what_was_left_out_is_named(viscous, coulomb, known, kind, sizes, scenario, other_logs):
+    found = lacking(with_friction(scenario, viscous, coulomb), other_logs[0], PATHS[:known])
+    expected = {(j, kind) for j, size in enumerate(sizes) if size is not None}
+    assert {(one.joint, one.kind) for one in found.findings} == expected
+    for one in found.findings:
+        np.testing.assert_allclose(one.size, sizes[one.joint], rtol=0.25)
+        assert one.error < 0.2 * abs(one.size) and one.gain > 0.3
 
 
 def scaled(name, factor):
-    """The log with other numbers of one signal."""
     return lambda x: x | {name: factor * x[name]}
 
 
 def exchanged(*names):
-    """The log with the joints of some signals exchanged."""
     return lambda x: x | {name: x[name][:, ::-1] for name in names}
 
 
 def with_rows(name, index, value):
-    """The log with another value in one row of a signal."""
     return lambda x: x | {name: np.concatenate([x[name][:index], [value], x[name][index + 1 :]])}
 
 
@@ -422,27 +384,23 @@ def standing(x):
     return x | {"q": x["q"][:1] + flicker}
 
 
-def velocities_in_degrees(x):
-    return x | {"dq": np.degrees(np.gradient(x["q"], x["t"], axis=0))}
-
-
 WRONG = {
     "degrees": (scaled("q", np.degrees(1.0)), "It would fit in degrees"),
     "newton_millimetres": (scaled("tau", 1e3), "times what .* robot needs .* Convert it to N m"),
     "joints_exchanged": (exchanged("q", "tau"), "with joints 0 and 1 exchanged, q and tau"),
     "one_sign": (scaled("tau", np.array([1.0, -1.0])), r"with tau\[1\] of the other sign, they"),
     "milliseconds": (scaled("t", 1e3), "got .* rad of motion in .* Divide times in ms by 1000"),
-    "rows_without_numbers": (
-        with_rows("q", 7, [np.nan] * 2),
-        r"1 of 2000, the first is row 7 \(in q\)",
-    ),
+    "no_numbers": (with_rows("q", 7, [np.nan] * 2), r"1 of 2000, the first is row 7 \(in q\)"),
     "standing": (standing, "a robot that stands still"),
     "times_turn_back": (with_rows("t", 9, 0.0), "times that increase"),
     "no_torque": (lambda x: {"t": x["t"], "q": x["q"]}, r"no tau, expected t, q and tau: tau\[0\]"),
     "joints": (lambda x: x | {"q": x["q"][:, :1]}, "got 1 joints, expected .* as .* has 2 joints"),
     "short": (lambda x: part_of(x, slice(60)), "0 windows of 0.5 s to fit"),
     "shorter": (lambda x: part_of(x, slice(9)), "got 9 samples, expected at least 50"),
-    "velocities": (velocities_in_degrees, r"expected the rate of q\[\d\]"),
+    "velocities": (
+        lambda x: x | {"dq": np.degrees(np.gradient(x["q"], x["t"], axis=0))},
+        r"expected the rate of q\[\d\]",
+    ),
     "nothing": (lambda x: 3.0, "expected a Dataset, a Rollout, the path"),
 }
 
@@ -474,7 +432,6 @@ def test_a_wrong_path_is_told(paths, options, words, scenario, log):
 
 
 def dataset(log):
-    """The log with names of its dimensions."""
     dims = {"t": ("time",), "q": ("time", "joint"), "tau": ("time", "joint")}
     return xarray.Dataset({name: (dims[name], x) for name, x in log.items()})
 
@@ -489,13 +446,11 @@ def test_units_that_a_dataset_states_are_read_and_a_run_is_a_log(log, short_run)
     np.testing.assert_array_equal(read(data.transpose("joint", "time"), 2)[0].q, log["q"])
 
 
-HEAD = "t, q[0], q[1], tau[0], tau[1]"
-
-
 @pytest.fixture
 def lines(log):
     rows = np.column_stack([log["t"], log["q"], log["tau"]])
-    return [HEAD, *(", ".join(f"{x:.17g}" for x in row) for row in rows)]
+    numbers = (", ".join(f"{x:.17g}" for x in row) for row in rows)
+    return ["t, q[0], q[1], tau[0], tau[1]", *numbers]
 
 
 @pytest.mark.parametrize("name", ["log.csv", "marked.csv", "log.nc"])
@@ -530,7 +485,12 @@ def test_damaged_files_of_logs_are_refused(spoil, words, tmp_path, lines):
         read(tmp_path / "log.csv", 2)
 
 
-# ----------------------------------------------------------------- report, parts
+@pytest.mark.slow
+def test_a_plant_that_is_no_robot_is_refused_with_the_remedy():
+    with pytest.raises(ValueError, match=r"scenario\.plant: got 'FlexibleJoint'.*plant\.robot"):
+        ij.excitation(loops_of_plants.flexible_joint(), ["plant.stiffness"])
+    with pytest.raises(ValueError, match=r"scenario\.plant: got 'MotorPendulum', expected a robot"):
+        ij.identify(loops_of_plants.user_class(), {"t": [0.0]}, ["plant.D"])
 
 
 @pytest.mark.slow
@@ -551,9 +511,10 @@ def test_inertias_stay_those_of_bodies(rng):
     np.testing.assert_allclose(change, slope @ step, rtol=1e-5, atol=1e-9)
 
 
-def test_standard_errors_are_those_of_repeated_noise(rng):
+def test_standard_errors_are_those_of_repeated_noise_and_whiteness_tells_noise(scenario, rng):
     """Windows of a linear model, white and coloured: the errors are the spread of the estimates;
-    what has no information is named."""
+    what has no information is named.  Widths are looked for beside each friction, also where one
+    of them was asked for by itself."""
     K, p = 30, 3
 
     def uncertainty(information, scores, **more):
@@ -587,16 +548,15 @@ def test_standard_errors_are_those_of_repeated_noise(rng):
     np.testing.assert_allclose(3.0 * wider.singular[:2], usual.singular[:2])
     words = statistics.describe_direction(known.directions[:, -1], ("a", "b", "c"))
     assert words == "0.89 b - 0.45 c"
-
-
-def test_whiteness_tells_noise_from_what_a_model_lacks(rng):
     noise, drift = rng.normal(size=(30, 200)), 0.3 * rng.normal(size=(30, 200))
     assert statistics.whiteness(noise).p > 1e-3
     assert statistics.whiteness(noise + np.cumsum(drift, axis=1)).p < 1e-6
+    believed, asked = canonical(scenario), ["disturbance.coulomb", "disturbance.width[0]"]
+    assert with_widths(believed, asked) == [*asked, "disturbance.width[1]"]
 
 
 @pytest.mark.slow
-def test_an_excitation_is_inside_its_bounds_and_tells_more(scenario, heavier, run):
+def test_an_excitation_is_inside_its_bounds_tells_more_and_needs_room(scenario, heavier, run):
     best = ij.excitation(scenario, PATHS, duration=6.0, iterations=15)
     rich = ij.simulate(ij.with_parts(heavier, reference=best), duration=6.0, dt=1e-3)
     assert int(rich.status) == 0 and float(np.min(rich.metrics.margin)) > 0
@@ -604,10 +564,6 @@ def test_an_excitation_is_inside_its_bounds_and_tells_more(scenario, heavier, ru
     known = (ij.identify(scenario, counted(x), PATHS, **options) for x in (rich, run))
     of_best, of_run = (np.sum(np.log(one.singular_values)) for one in known)
     assert of_best > of_run + 1.0  # seven times the determinant of the information
-
-
-@pytest.mark.slow
-def test_an_excitation_needs_room(scenario):
     start = np.asarray(scenario.initial.q)
     lower = ij.bounds.Sinusoid(offset=start - 0.3, amplitude=0.29, frequency=3.0)
     parts = {"bounds": ij.Bounds(lower=lower, upper=ij.bounds.Constant(start + 0.02))}
@@ -618,15 +574,13 @@ def test_an_excitation_needs_room(scenario):
 
 @pytest.mark.slow
 def test_joint_draws_in_a_file_and_in_a_design(tmp_path):
-    """The same table as any perturbation; a group without a name, or rows that do not fit, are
-    refused."""
+    """In the table of any perturbation; groups without a name, or other rows, are refused."""
     rows = {"plant.mass[0]": [0.1, 0.0], "plant.mass[1]": [0.05, 0.02]}
     one = {"value": "joint_normal", "mean": 1.0, "group": "g"}
     run = {"duration": 0.01, "dt": 1e-3}
     data = {"preset": "zhang_yan_2024", "run": run, "study": {"runs": 1024}}
-    file = study_from_dict(
-        data | {"perturbations": {path: one | {"rows": row} for path, row in rows.items()}}, "study"
-    )
+    perturbed = {path: one | {"rows": row} for path, row in rows.items()}
+    file = study_from_dict(data | {"perturbations": perturbed}, "study")
     options = run | {"runs": 1024, "sampler": "sobol"}
     study = ij.monte_carlo(file.scenario, file.perturbations, **options)
     found, L = np.cov(np.stack([study.samples[path] for path in rows])), np.array([*rows.values()])
@@ -674,8 +628,7 @@ def test_a_wrong_file_is_told(change, words, tmp_path):
 
 
 def test_the_tangents_of_a_replay_are_those_of_finite_differences(scenario, log):
-    """By the start, free torques, a mass, friction and the torque's offset in time; and e is the
-    inverse of the acceleration."""
+    """By the start, free torques, a mass, friction and the torque's offset in time."""
     paths = ["plant.mass[1]", "disturbance.coulomb", "disturbance.width"]
     plant, c = coordinates(scenario, paths, {})
     (one,) = read({name: x[:200] for name, x in log.items()}, 2)
@@ -716,7 +669,74 @@ def test_one_joint_of_seven_that_is_mounted_the_other_way_is_named():
         ij.identify(scenario, log, ["robot.mass"], torque="interpolated")
 
 
-def test_the_width_of_each_friction_is_looked_for_beside_it(scenario):
-    """Also where one of the widths was asked for by itself."""
-    believed, asked = canonical(scenario), ["disturbance.coulomb", "disturbance.width[0]"]
-    assert with_widths(believed, asked) == [*asked, "disturbance.width[1]"]
+DAMPING = np.array([1.0, 1.0, 0.8, 0.8, 0.4, 0.3, 0.2])
+ARMATURE = np.array([0.1, 0.1, 0.1, 0.1, 0.05, 0.05, 0.05])
+DRY = np.array([2.0, 2.0, 1.5, 1.5, 0.6, 0.6, 0.3])
+"""Dry friction, which MuJoCo solves for as a soft constraint: a joint sticks, and gives way slowly
+[N m]."""
+FACTOR = np.array([1.0, 1.1, 0.9, 1.08, 0.93, 1.05, 1.4])
+"""True masses by those of the file."""
+MIDDLE = np.array([0.0, 0.5, 0.0, -1.2, 0.0, 0.8, 0.0])
+
+
+def described(arm, mass, dry):
+    import mujoco
+
+    fields = {"mass": mass, "damping": DAMPING, "armature": ARMATURE, "friction": dry}
+    model = mujoco.MjModel.from_xml_string(as_mjcf(dataclasses.replace(arm, **fields)))
+    model.opt.timestep, model.opt.integrator = 5e-4, mujoco.mjtIntegrator.mjINT_RK4
+    return model
+
+
+def log_of_mujoco(arm, duration, dry, seed=0, step=2e-3):
+    """t, q in counts and the held torque."""
+    import mujoco
+
+    rng = np.random.default_rng(seed)
+    A, P = rng.uniform(0.1, 0.3, (3, 7)), rng.uniform(0, 6.28, (3, 7))
+    W = np.array([[1.0], [2.2], [4.0]]) * rng.uniform(0.8, 1.2, (3, 7))
+    nominal = np.asarray(arm.mass)
+    true, known = described(arm, nominal * FACTOR, dry), described(arm, nominal, 0 * dry)
+    moving, thinking = mujoco.MjData(true), mujoco.MjData(known)
+
+    def reference(t):
+        waves = [A * W**k * np.sin(W * t + P + 0.5 * np.pi * k) for k in range(3)]
+        position, rate, push = np.sum(waves, axis=1)
+        return MIDDLE + position, rate, push
+
+    moving.qpos[:], moving.qvel[:], _ = reference(0.0)
+    before, speed, M, rows = None, moving.qvel.copy(), np.zeros((7, 7)), []
+    for k in range(round(duration / step)):
+        t, y = k * step, COUNT * np.round(moving.qpos / COUNT)
+        speed, before = speed if before is None else 0.7 * speed + 0.3 * (y - before) / step, y
+        desired, rate, push = reference(t)
+        thinking.qpos[:], thinking.qvel[:] = y, speed
+        mujoco.mj_forward(known, thinking)
+        mujoco.mj_fullM(known, thinking, M)
+        push = push + 100.0 * (desired - y) + 20.0 * (rate - speed)
+        tau = M @ push + thinking.qfrc_bias + DAMPING * rate
+        rows.append((t, y, tau))
+        moving.qfrc_applied[:] = tau
+        mujoco.mj_step(true, moving, nstep=4)
+    return dict(zip(("t", "q", "tau"), map(np.array, zip(*rows, strict=True)), strict=True))
+
+
+@pytest.mark.release
+@pytest.mark.parametrize("dry", [0.0 * DRY, DRY], ids=["viscous", "dry"])
+def test_seven_joints_of_mujoco(dry):
+    """Numbers within their errors, masses within a percent; the first mass and armature are one."""
+    pytest.importorskip("mujoco")
+    scenario = ij.with_parts(ij.presets.iiwa14(payload=0.0), disturbance=ij.disturbances.Nothing())
+    start = ij.with_parameters(scenario, {"robot.damping": 0.5, "robot.armature": 0.05})
+    truth = {"robot.mass": np.asarray(scenario.plant.mass) * FACTOR, "robot.damping": DAMPING}
+    truth |= {"robot.armature": ARMATURE} | ({"robot.friction": dry} if dry.any() else {})
+    known = ij.identify(start, log_of_mujoco(scenario.plant, 12.0, dry), list(truth))
+    errors = known.standard_errors
+    z = np.concatenate([(known.values[path] - x) / errors[path] for path, x in truth.items()])
+    untold = {number.name for number in known.numbers if number.verdict == "cannot be told"}
+    free = {number.name for number in known.numbers if number.verdict == "left free"}
+    assert free == set(known.names[21 + np.sum(dry > 0) :])
+    assert untold == {"robot.mass[0]", "robot.armature[0]"}
+    assert np.nanmax(np.abs(z)) < 4.0 and np.mean(np.abs(z[np.isfinite(z)]) < 3.0) > 0.9
+    assert np.nanmax(np.abs(known.values["robot.mass"] / truth["robot.mass"] - 1.0)) < 0.01
+    assert all(one.after < 1.15 * COUNT / np.sqrt(12) for one in known.fit)

@@ -48,8 +48,7 @@ def paper_loop(law="integral"):
 
 def general_loop(law):
     """The paper's loop with everything that the bound knows: another plant, friction, a disturbance
-    that depends on the motion, and weights.
-    """
+    that depends on the motion, and weights."""
     scenario = ij.presets.zhang_yan_2024(law=law, variant="corrected")
     disturbance = ij.disturbances.Sum((scenario.disturbance, ij.disturbances.Friction(0.1, 0.05)))
     values = {"plant.payload": 0.1, "plant.centre": [0.18, 0.16], "controller.weight": [0.7, 1.2]}
@@ -61,11 +60,9 @@ GENERAL = {
     "plant.centre[1]": ij.value(ij.interval(0.15, 0.17)),
     "disturbance.parts[1].viscous": ij.factor(ij.interval(0.5, 2.0), shared=True),
 }
+NAMES = ("integral", "log", "tan", "mapping", "prescribed_performance")
 LOOPS = {
-    **{
-        name: lambda name=name: (general_loop(name), GENERAL)
-        for name in ("integral", "log", "tan", "mapping", "prescribed_performance")
-    },
+    **{name: lambda name=name: (general_loop(name), GENERAL) for name in NAMES},
     "pendulum": lambda: (chain_loop(1), {"plant.centre": ij.factor(ij.interval(0.9, 1.1))}),
     "chain": lambda: (chain_loop(3), MASSES),
 }
@@ -103,9 +100,8 @@ def test_the_velocity_at_time_and_errors_is_that_of_the_loop(rng):
     def of_loop(t, q, dq):
         tube = scenario.context.tube(t)
         side = side_of(parts, t, q - tube.q_d)
-        alpha = scenario.controller.barrier.virtual_velocity(
-            tube, q, scenario.controller.k1, scenario.controller.o
-        )
+        law = scenario.controller
+        alpha = law.barrier.virtual_velocity(tube, q, law.k1, law.o)
         at = Errors(t, (q - tube.q_d) / side.k, dq - alpha)
         return position(parts, at), velocity(parts, at)
 
@@ -186,14 +182,11 @@ def with_law(**fields):
 
 
 def widely(*names, low=0.9):
-    """Intervals of parameters of the plant."""
     return {f"plant.{name}": ij.factor(ij.interval(low, 1.1)) for name in names}
 
 
 ARM = paper_loop()
-OTHER_ARM = ij.robots.PlanarChain(
-    mass=[2.0, 0.85], length=[0.35, 0.31], centre=[0.17, 0.15], inertia=0.05
-)
+OTHER_ARM = ij.robots.PlanarChain([2.0, 0.85], [0.35, 0.31], centre=[0.17, 0.15], inertia=0.05)
 MOTOR = ij.actuators.Motor(limit=50.0, stall=60.0, no_load_speed=10.0)
 SPLINE = ij.references.WaypointSpline((0.0, 1.0), [[0.5, 0.5], [0.6, 0.6]])
 REFUSED_LOOPS = {
@@ -217,10 +210,8 @@ REFUSED_PARAMETERS = {
     "positive definite": widely("inertia", "centre", low=0.0),
     "uncertain numbers": widely("mass", "length", "inertia", "centre"),
 }
-REFUSED = {
-    **{text: (scenario, MASSES) for text, scenario in REFUSED_LOOPS.items()},
-    **{text: (paper_loop, parameters) for text, parameters in REFUSED_PARAMETERS.items()},
-}
+REFUSED = {text: (scenario, MASSES) for text, scenario in REFUSED_LOOPS.items()}
+REFUSED |= {text: (paper_loop, numbers) for text, numbers in REFUSED_PARAMETERS.items()}
 
 
 @pytest.mark.parametrize("text", REFUSED)
@@ -230,7 +221,7 @@ def test_what_the_bound_does_not_know_is_refused_with_the_reason(text):
         arm_problem(scenario(), parameters)
 
 
-def test_a_link_of_a_box_can_be_named():
+def test_a_link_of_a_box_can_be_named_and_a_level_at_the_guard_is_refused():
     """`ij.parameters` lists a row by its name and by its number."""
     arm = dataclasses.replace(random_arm(2, 0, prismatic=0.0), links=("upper", "fore arm"))
     scenario = dataclasses.replace(paper_loop(), plant=arm, model=arm)
@@ -244,9 +235,6 @@ def test_a_link_of_a_box_can_be_named():
         "plant.link[upper].mass, plant.link[fore arm].mass": "plant.mass[0], plant.mass[1]",
     }.items():
         assert (of(named).places, of(named).names) == (of(numbered).places, of(numbered).names)
-
-
-def test_a_level_at_the_guard_is_refused():
     problem = arm_problem(paper_loop(), MASSES)
     with pytest.raises(ValueError, match="guard"):
         problem.constants(WEIGHT, 8.0)

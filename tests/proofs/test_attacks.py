@@ -40,10 +40,7 @@ def test_entries_with_one_value_differ_from_the_model_at_the_reference_value():
 @pytest.mark.slow
 def test_levels_of_a_disturbance_with_one_value_differ_from_what_is_known():
     """Beside as many other uncertain numbers as only a chain may have."""
-    waves = (
-        ij.disturbances.Sinusoids(0.3, 2.0, 0.5, 0.1),
-        ij.disturbances.Sinusoids(0.1, 1.0, 0.2),
-    )
+    waves = tuple(ij.disturbances.Sinusoids(*x) for x in ((0.3, 2.0, 0.5, 0.1), (0.1, 1.0, 0.2)))
     scenario = lever(disturbance=ij.disturbances.Levels((None, ij.disturbances.Sum(waves))))
     one, other = (f"disturbance.parts[1].parts[{i}]" for i in range(2))
     others = (f"{one}.phase", f"{other}.amplitude", f"{other}.phase")
@@ -62,9 +59,7 @@ def narrow_between_samples():
         1,
         reference=ij.references.Sinusoid(0.0, 0.0, 1.0),
         bounds=ij.Bounds(lower=ij.bounds.Constant([-0.7]), upper=upper),
-        controller=ij.controllers.Backstepping(
-            k1=2.0, K2=3.0, variant="corrected", barrier=barrier
-        ),
+        controller=ij.controllers.Backstepping(2.0, 3.0, variant="corrected", barrier=barrier),
     )
 
 
@@ -117,20 +112,6 @@ def with_threshold(t, x, size):
     return jnp.where(size > 1.0, 1.0, -1.0) * jnp.sin(x[0])
 
 
-@pytest.mark.parametrize(
-    ("load", "words", "duration"),
-    [
-        (aging, "does not depend on the time", None),
-        (aging, "does not depend on the time", 2.0),
-        (with_threshold, "select a case", None),
-    ],
-)
-def test_plants_with_time_or_cases_are_refused(load, words, duration):
-    plant = Loaded(1.0, load)
-    with pytest.raises(ValueError, match=words):
-        chain_problem(lever(plant=plant, model=plant), within(0.1, "size"), duration=duration)
-
-
 @component
 class Ramp:
     """A position whose acceleration jumps at 1 s."""
@@ -141,7 +122,15 @@ class Ramp:
         return 0.5 + 0.05 * jnp.maximum(t - 1.0, 0.0)[None] ** 2
 
 
-def test_a_reference_whose_acceleration_jumps_is_refused():
+def test_plants_with_time_or_cases_and_a_reference_whose_acceleration_jumps_are_refused():
+    for load, words, duration in (
+        (aging, "does not depend on the time", None),
+        (aging, "does not depend on the time", 2.0),
+        (with_threshold, "select a case", None),
+    ):
+        plant = Loaded(1.0, load)
+        with pytest.raises(ValueError, match=words):
+            chain_problem(lever(plant=plant, model=plant), within(0.1, "size"), duration=duration)
     with pytest.raises(ValueError, match="two continuous derivatives"):
         arm_problem(pendulum(reference=Ramp()), {}, duration=2.0)
 

@@ -36,5 +36,4 @@ def test_each_function_solves_its_equation(rng, n):
     cosines = np.append(np.cos(rhs), 1.0)
     np.testing.assert_allclose(point, cosines * np.append(1.0, np.cumprod(np.sin(rhs))))
     radii = np.sum(np.abs(symmetric), axis=1) - 2.0 * np.diag(symmetric)
-    bound = np.linalg.eigvalsh(symmetric)[0] if n < 3 else -np.max(radii)
-    assert least == pytest.approx(bound)
+    assert least == pytest.approx(np.linalg.eigvalsh(symmetric)[0] if n < 3 else -np.max(radii))

@@ -1,9 +1,6 @@
 """The common period of parts of a scenario, and the parts at a later time."""
 
-from __future__ import annotations
-
 import math
-from fractions import Fraction
 
 import jax.numpy as jnp
 import members
@@ -14,14 +11,12 @@ import iblf_jax as ij
 from iblf_jax.proofs.periods import AperiodicError, period_of, shifted
 
 Q, DQ = jnp.asarray([[0.3, 0.5], [0.2, -0.4]])
+ROBOT = members.TWO_LINK
 PARTS = {
     "reference": (members.REFERENCES["sinusoid"], lambda part, t: part.position(t)),
     "side": (members.SIDES["sinusoid"], lambda part, t: part.at(t, Q)),
     **{
-        name: (
-            members.DISTURBANCES[name],
-            lambda part, t: part.torque(t, Q, DQ, members.TWO_LINK, members.TWO_LINK),
-        )
+        name: (members.DISTURBANCES[name], lambda part, t: part.torque(t, Q, DQ, *[ROBOT] * 2))
         for name in ("model_shaped", "sinusoids", "tip_force", "friction")
     },
 }
@@ -35,19 +30,12 @@ def test_a_part_that_is_moved_in_time_has_its_values_earlier(name):
     s, t = 1.3, 0.4
     expected = value(part, s)
     np.testing.assert_allclose(value(shifted(part, t), s - t), expected, rtol=1e-12)
-    period = period_of({name: part})
-    np.testing.assert_allclose(value(part, s + period), expected, rtol=1e-9)
+    np.testing.assert_allclose(value(part, s + period_of({name: part})), expected, rtol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("frequencies", "common"),
-    [([1.0], 1), ([1.0, 1.5], Fraction(1, 2)), ([0.75, 0.5], Fraction(1, 4)), ([], None)],
-)
-def test_the_period_is_that_of_the_greatest_common_divisor(frequencies, common):
-    parts = {str(w): ij.references.Sinusoid(0.0, 0.1, w) for w in frequencies}
-    assert period_of(parts) == (2.0 * math.pi / common if common else 0.0)
-
-
-def test_a_part_without_a_period_is_named():
+def test_the_period_is_that_of_the_greatest_common_divisor_and_a_part_without_one_is_named():
+    for frequencies, common in (([1.0], 1.0), ([1.0, 1.5], 0.5), ([0.75, 0.5], 0.25), ([], np.inf)):
+        parts = {str(w): ij.references.Sinusoid(0.0, 0.1, w) for w in frequencies}
+        assert period_of(parts) == 2.0 * math.pi / common, frequencies
     with pytest.raises(AperiodicError, match=r"the period of reference \(Quintic\) is not known"):
         period_of({"reference": members.REFERENCES["quintic"]})

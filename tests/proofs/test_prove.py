@@ -1,7 +1,5 @@
 """`ij.prove`: its verdicts, and what they mean for runs and for points of the level set."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import math
@@ -28,30 +26,24 @@ LEVEL = 1.0
 @functools.cache
 def proof(K2=3.0, kf=100.0, percent=3.0, level=LEVEL, **options):
     parameters = within(percent) if percent else {}
-    return ij.prove(
-        pendulum(K2=K2, kf=kf), level=level, parameters=parameters, progress=False, **options
-    )
+    options |= {"level": level, "parameters": parameters, "progress": False}
+    return ij.prove(pendulum(K2=K2, kf=kf), **options)
 
 
 def paper(**gains):
-    scenario = ij.with_parts(
-        ij.presets.zhang_yan_2024(variant="corrected"), disturbance=ij.disturbances.Nothing()
-    )
+    scenario = ij.presets.zhang_yan_2024(variant="corrected")
+    scenario = ij.with_parts(scenario, disturbance=ij.disturbances.Nothing())
     return ij.with_parameters(scenario, gains)
-
-
-def largest_rate(found, count, seed):
-    """The largest V_w' of random points of the level set."""
-    constants = found.problem.constants(found.weight, found.level)
-    return found.problem.rate(found.problem.sample(seed, count), constants).max()
 
 
 def check_proof(found, points, runs, seeds=(11,), duration=None):
     """Nothing contradicts a proof: no point of the level set at which V_w grows, and no run that
     leaves the tube of the level set or the bounds."""
     assert found.proved
-    assert max(largest_rate(found, points, seed) for seed in seeds) < 0.0
-    tube = found.tube
+    problem, tube = found.problem, found.tube
+    constants = problem.constants(found.weight, found.level)
+    for seed in seeds:
+        assert problem.rate(problem.sample(seed, points), constants).max() < 0.0
     for run in found.adversarial_runs(runs, duration=duration):
         t, q = np.asarray(run.t), np.asarray(run.q)
         inside = t <= tube.t[-1]
@@ -63,7 +55,7 @@ def check_proof(found, points, runs, seeds=(11,), duration=None):
 
 
 @pytest.mark.slow
-def test_a_proof_says_what_it_proves_and_nothing_contradicts_it():
+def test_a_proof_says_what_it_proves_is_repeatable_and_nothing_contradicts_it():
     found = proof()
     assert found.verdict == Verdict.PROVED and found.proved
     assert found.is_period and found.duration == pytest.approx(2 * math.pi)
@@ -79,17 +71,12 @@ def test_a_proof_says_what_it_proves_and_nothing_contradicts_it():
     assert "proved" in found.plot(runs=2).get_suptitle()
     data = found.to_xarray()
     assert data.attrs["verdict"] == "proved" and data["range"].shape == (1, 2)
+    again = proof(threads=1, seed=0)
+    assert (again.weight, again.boxes, again.rates) == (found.weight, found.boxes, found.rates)
 
 
 @pytest.mark.slow
-def test_a_proof_is_repeatable():
-    a = proof()
-    b = ij.prove(pendulum(), level=LEVEL, parameters=within(3.0), progress=False, threads=1, seed=0)
-    assert (a.weight, a.boxes, a.rates) == (b.weight, b.boxes, b.rates)
-
-
-@pytest.mark.slow
-def test_every_weight_has_a_point_that_refutes_the_lyapunov_function():
+def test_points_refute_the_lyapunov_function_and_a_run_that_leaves_the_bounds_refutes_them():
     found = proof(K2=20.0, kf=20.0, percent=20.0)
     assert found.verdict == Verdict.NOT_PROVED and found.seconds < 60.0
     assert len(found.growth_points) == len(found.rates) > 10
@@ -97,10 +84,6 @@ def test_every_weight_has_a_point_that_refutes_the_lyapunov_function():
     assert "This refutes the Lyapunov function, not the bounds." in repr(found)
     with pytest.raises(ValueError, match="refuted"):
         found.replay()
-
-
-@pytest.mark.slow
-def test_a_run_that_leaves_the_bounds_refutes_them():
     wide = {MASS: ij.factor(ij.interval(0.3, 5.0))}
     found = ij.prove(pendulum(K2=20.0, kf=20.0), level=3.0, parameters=wide, progress=False)
     assert found.verdict == Verdict.REFUTED
@@ -128,8 +111,7 @@ def test_runs_start_at_the_beginning_where_a_reference_cannot_be_moved_in_time()
         assert _refuted(problem, LEVEL, sampled, 1) is None
     points[0, 0] = 0.0
     state = problem.state_of(points[0], constants)
-    moved = problem.scenario_at(points[0], constants)
-    run = ij.simulate(moved, duration=1e-3, dt=1e-3)
+    run = ij.simulate(problem.scenario_at(points[0], constants), duration=1e-3, dt=1e-3)
     np.testing.assert_allclose(run.q[0], state.q, rtol=1e-12)
     np.testing.assert_allclose(run.dq[0], state.dq, rtol=1e-12)
 
@@ -137,12 +119,10 @@ def test_runs_start_at_the_beginning_where_a_reference_cannot_be_moved_in_time()
 @pytest.mark.slow
 def test_a_small_budget_leaves_it_undecided():
     found = proof(K2=20.0, kf=20.0, percent=WIDE, max_boxes=2_000)
-    assert found.verdict == Verdict.UNDECIDED
-    assert 0.0 < found.done < 1.0
+    assert found.verdict == Verdict.UNDECIDED and 0.0 < found.done < 1.0
     box = found.worst_box
     assert set(box.intervals) == set(found.problem.names)
-    assert list(box.narrowed) == ["plant.mass[0]"]
-    assert box.narrowed["plant.mass[0]"] <= box.bound
+    assert list(box.narrowed) == ["plant.mass[0]"] and box.narrowed["plant.mass[0]"] <= box.bound
     left, units = found.units_left
     assert 0 < left <= units
     assert found.left_value < 0.0
@@ -172,12 +152,23 @@ WIDE = 5.0
 
 
 @pytest.mark.slow
-def test_a_time_interval_that_is_no_period():
+def test_a_time_interval_that_is_no_period_and_a_chosen_level_whose_set_contains_the_start():
     found = proof(weight=2e-3, duration=2.0)
     assert found.proved and not found.is_period
-    assert list(found.rates) == [2e-3]
-    assert "for 0 <= t <= 2 s" in repr(found)
+    assert list(found.rates) == [2e-3] and "for 0 <= t <= 2 s" in repr(found)
     assert found.tube.t[-1] == 2.0
+    found = proof(level=None)
+    assert found.proved
+    start, largest = found.level_choice
+    assert start <= found.level <= largest
+    # With f_hat = 0 the start has the error f(0), the largest for the heaviest plant.
+    run = ij.simulate(ij.with_parameters(pendulum(), {MASS: 2.06}), duration=1e-3, dt=1e-3)
+    f_tilde = float((run.disturbance - run.disturbance_estimate)[0, 0])
+    e2 = float(run.e2[0, 0])
+    M0 = 2.0 * 0.175**2 + 0.06
+    V1 = -math.log1p(-(float(run.xi[0, 0]) ** 2))
+    assert start == pytest.approx(V1 + 0.5 * M0 * e2**2 + 0.5 * found.weight * f_tilde**2, rel=1e-6)
+    assert "The level was chosen: the start has V_w <=" in repr(found)
 
 
 @pytest.mark.release  # a program of its own
@@ -192,7 +183,7 @@ def test_constant_reference_and_bounds():
 
 
 @pytest.mark.slow
-def test_the_largest_level_and_box_are_proved_next_to_what_is_not():
+def test_the_largest_level_and_box_and_gains_for_a_guarantee_are_proved():
     common = {"accuracy": 0.5, "max_boxes": 30_000, "progress": False, "weight": 2e-3}
     loop = pendulum(K2=20.0, kf=20.0)
     found = ij.largest_level(loop, parameters=within(3.0), between=(0.2, 6.0), **common)
@@ -202,15 +193,25 @@ def test_the_largest_level_and_box_are_proved_next_to_what_is_not():
     assert box.proved
     low, high = box.ranges["plant.mass[0]"]
     assert 1.6 < low < 2.0 < high < 2.4
+    ranges = {"controller.K2": (1.0, 40.0), "observer.kf": (10.0, 100.0)}
+    options = {"level": LEVEL, "parameters": within(20.0), "tries": 60, "progress": False}
+    found = ij.gains_for_guarantee(loop, ranges, **options)
+    assert found.rate_before > 0.0 > found.rate and found.proof.proved
+    assert set(found.gains) == {*ranges}
 
 
-def test_deviations_are_scaled_about_the_value_that_changes_nothing():
+def test_deviations_are_scaled_about_the_value_that_changes_nothing_and_parsed_from_words():
     scenario = pendulum()
     factor = scaled(scenario, MASS, ij.factor(ij.interval(0.9, 1.3)), 0.5)
     offset = scaled(scenario, MASS, ij.offset(ij.interval(-0.2, 0.4)), 0.5)
     given = scaled(scenario, MASS, ij.value(ij.interval(1.0, 4.0)), 0.5)
     ends = [np.ravel(x.distribution.support()) for x in (factor, offset, given)]
     np.testing.assert_allclose(ends, [[0.95, 1.15], [-0.1, 0.2], [1.5, 3.0]])
+    (path, given) = perturbations(["plant.mass[0], plant.inertia[0]=offset:-0.1:0.2"]).popitem()
+    assert path == "plant.mass[0], plant.inertia[0]" and given.kind == "offset"
+    for word in ("plant.mass", "plant.mass=factor:1", "plant.mass=scale:1:2"):
+        with pytest.raises(ValueError, match="PATH=KIND:LOW:HIGH"):
+            perturbations([word])
 
 
 @pytest.mark.parametrize(
@@ -222,40 +223,21 @@ def test_deviations_are_scaled_about_the_value_that_changes_nothing():
         ({"weight": 0.0}, "weight"),
         ({"max_boxes": 0}, "max_boxes"),
         ({"disturbance_rate": -1.0}, "disturbance_rate"),
+        ({"parameters": None}, r"parameters: got None.*ij\.interval.*{}"),
+        (
+            {"scenario": lever(), "level": None, "parameters": {}},
+            r"level: got None.*V\[0\].*ij\.largest_level",
+        ),
+        (
+            {"parameters": {MASS: ij.factor(ij.uniform(0.9, 1.1))}},
+            r"Write ij\.factor\(ij\.interval\(0\.9, 1\.1\)\)",
+        ),
     ],
 )
 def test_bad_input_is_named(options, words):
-    given = {"level": LEVEL, "parameters": within(1.0)} | options
+    given = {"scenario": pendulum(), "level": LEVEL, "parameters": within(1.0)} | options
     with pytest.raises(ValueError, match=words):
-        ij.prove(pendulum(), **given)
-
-
-def test_a_call_without_level_or_parameters_says_how_to_choose_them():
-    with pytest.raises(ValueError, match=r"level: got None.*V\[0\].*ij\.largest_level"):
-        ij.prove(lever(), parameters={})
-    with pytest.raises(ValueError, match=r"parameters: got None.*ij\.interval.*{}"):
-        ij.prove(pendulum(), level=LEVEL)
-    of_study = {MASS: ij.factor(ij.uniform(0.9, 1.1))}
-    with pytest.raises(ValueError, match=r"Write ij\.factor\(ij\.interval\(0\.9, 1\.1\)\)"):
-        ij.prove(pendulum(), level=LEVEL, parameters=of_study)
-
-
-@pytest.mark.slow
-def test_without_a_level_the_set_contains_the_start():
-    found = proof(level=None)
-    assert found.proved
-    start, largest = found.level_choice
-    assert start <= found.level <= largest
-    # With f_hat = 0 the start has the error f(0), the largest for the heaviest plant.
-    scenario = ij.with_parameters(pendulum(), {MASS: 2.06})
-    run = ij.simulate(scenario, duration=1e-3, dt=1e-3)
-    f_tilde = float((run.disturbance - run.disturbance_estimate)[0, 0])
-    e2 = float(run.e2[0, 0])
-    M0 = 2.0 * 0.175**2 + 0.06
-    V1 = -math.log1p(-(float(run.xi[0, 0]) ** 2))
-    expected = V1 + 0.5 * M0 * e2**2 + 0.5 * found.weight * f_tilde**2
-    assert start == pytest.approx(expected, rel=1e-6)
-    assert "The level was chosen: the start has V_w <=" in repr(found)
+        ij.prove(**given)
 
 
 @pytest.mark.slow
@@ -265,25 +247,6 @@ def test_the_command_proves(tmp_path, capsys):
     words = ["prove", str(path), "--level", "1.0", "--quiet", "--weight", "0.002"]
     assert main([*words, "--parameter", "plant.mass=factor:0.97:1.03"]) == 0
     assert "PROVED" in capsys.readouterr().out
-
-
-def test_the_parameters_of_the_command():
-    found = perturbations(["plant.mass[0], plant.inertia[0]=offset:-0.1:0.2"])
-    (path, given) = found.popitem()
-    assert path == "plant.mass[0], plant.inertia[0]" and given.kind == "offset"
-    for word in ("plant.mass", "plant.mass=factor:1", "plant.mass=scale:1:2"):
-        with pytest.raises(ValueError, match="PATH=KIND:LOW:HIGH"):
-            perturbations([word])
-
-
-@pytest.mark.slow
-def test_gains_for_a_guarantee_are_proved():
-    ranges = {"controller.K2": (1.0, 40.0), "observer.kf": (10.0, 100.0)}
-    options = {"level": LEVEL, "parameters": within(20.0), "tries": 60, "progress": False}
-    found = ij.gains_for_guarantee(pendulum(K2=20.0, kf=20.0), ranges, **options)
-    assert found.rate_before > 0.0 > found.rate
-    assert found.proof.proved
-    assert set(found.gains) == {*ranges}
 
 
 @pytest.mark.release  # a program of its own

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from proof_cases import pendulum, within
 from test_arm_proofs import coordinates_of, paper_loop
-from test_torque import TwoLinks
+from test_torque import TwoLinks, limited
 
 import iblf_jax as ij
 from iblf_jax.kernels.enclosure import enclose
@@ -57,48 +57,32 @@ def read_by(sensor, observer=POLES):
     return dataclasses.replace(sampled(pendulum(), observer=observer), sensor=sensor)
 
 
-def limited(scenario):
-    law = ij.controllers.Saturated(scenario.controller, limit=100.0)
-    return dataclasses.replace(scenario, controller=law)
-
-
-@pytest.mark.parametrize(
-    ("text", "scenario"),
-    {
+def test_a_sampling_that_is_missing_or_that_the_bound_does_not_know_is_refused():
+    filtered = ij.sensors.FilteredDifference(100.0)
+    for text, scenario in {
         "scenario.sampling.trigger": sampled(pendulum(), trigger=ij.EventTrigger(relative=0.1)),
         "Normal noise has no bound": read_by(encoder(noise=1e-4)),
         "scenario.sensor.velocity.noise": read_by(encoder(velocity=ij.sensors.Measured(0.1))),
-        "positions of several samples": read_by(
-            encoder(velocity=ij.sensors.FilteredDifference(100.0))
-        ),
-        "with torque limits": limited(read_by(ROUGH)),
-    }.items(),
-)
-def test_a_sampling_that_the_bound_does_not_know_is_refused(text, scenario):
-    with pytest.raises(ValueError, match=re.escape(text)):
-        arm_problem(scenario, within(1.0))
-
-
-def test_a_further_disturbance_is_refused():
+        "positions of several samples": read_by(encoder(velocity=filtered)),
+        "with torque limits": limited(read_by(ROUGH), 100.0),
+    }.items():
+        with pytest.raises(ValueError, match=re.escape(text)):
+            arm_problem(scenario, within(1.0))
     with pytest.raises(ValueError, match="None with a sampling"):
         arm_problem(sampled(pendulum()), within(1.0), disturbance_rate=1.0)
-
-
-# --- equations of their own -------------------------------------------------------------------
+    with pytest.raises(ValueError, match=r"scenario\.sampling: got None.*ij\.Sampling\(period"):
+        ij.largest_period(pendulum(), level=0.5, parameters={}, between=(1e-3, 2e-3))
 
 
 class SampledTwoLinks(TwoLinks):
     """The sampled loop without the package; derivatives are those of analytic functions by complex
-    steps.  A state is (t, q, v, phi); factors are those of the true masses.
-    """
+    steps. A state is (t, q, v, phi); factors are those of the true masses."""
 
-    step = 1e-30
+    step, joints, weight = 1e-30, 2, WEIGHT
 
-    def __init__(self, gain, weight=WEIGHT, momentum_gain=0.0, measured=None):
-        self.gain = gain
+    def __init__(self, gain, momentum_gain=0.0, measured=None):
+        self.gain, self.momentum_gain = gain, momentum_gain
         self.measured = measured or (lambda q: q)
-        self.momentum_gain = momentum_gain
-        self.weight = weight
 
     def along(self, function, state, rates):
         """The derivative of a function along rates of its arguments."""
@@ -178,8 +162,7 @@ class SampledTwoLinks(TwoLinks):
         read = self.measured(q)
         M0, _, _ = self.dynamics(q, np.ones_like(q))
         M0_read, _, _ = self.dynamics(read, np.ones_like(q))
-        change = np.einsum("bij,bj->bi", M0_read - M0, v)
-        estimate = phi + (self.gain + self.momentum_gain) * change
+        estimate = phi + (self.gain + self.momentum_gain) * np.einsum("bij,bj->bi", M0_read - M0, v)
         return self.law(t, read, v, estimate), estimate, self.momentum_term(read, v)
 
     def moved(self, state, sample, factor, age, steps=8):
@@ -195,41 +178,35 @@ class SampledTwoLinks(TwoLinks):
         return state
 
     def rate_of_lyapunov(self, state, sample, factor):
-        """V_w' of a held torque."""
         rates = self.rates(state, sample, factor)
         return self.along(lambda *x: self.lyapunov(*x, factor), state, rates)
 
     def starts(self, count, level, seed, *, near=0.0):
         """States of {V_w <= level} and factors; with `near`, of small position errors where the
-        sides of the tube differ most.
-        """
-        generator = np.random.default_rng(seed)
+        sides of the tube differ most."""
+        generator, n = np.random.default_rng(seed), self.joints
         t = generator.uniform(0.0, 2.0 * np.pi, count)
+        s = generator.normal(size=(count, 3 * n))
         if near:
             t = UNEVEN + 0.1 * (t - np.pi) + np.pi * generator.integers(0, 2, count)
-        s = generator.normal(size=(count, 6))
-        if near:
-            s[:, :2] *= near
+            s[:, :n] *= near
         s /= np.linalg.norm(s, axis=1, keepdims=True)
         q, e2, f_tilde = self.states(t, s, level, self.weight)
-        factor = 1.0 + 0.01 * generator.choice([-1.0, -0.3, 0.0, 1.0], (count, 2))
+        factor = 1.0 + 0.01 * generator.choice([-1.0, -0.3, 0.0, 1.0], (count, n))
         state = (t, q, self.alpha(t, q) + e2, np.zeros_like(q))
         return self.with_f_tilde(state, f_tilde, factor), factor
 
     def without_errors(self, state):
-        """The sample of exact measurements."""
         _, q, v, phi = state
         return self.law(*state), phi, self.momentum_term(q, v)
 
     def differences(self, state, sample):
-        """D and L of a state after a sample."""
         (u, phi, n), (tau, phi_k, n_k) = self.without_errors(state), sample
         return tau - u, n - n_k + phi - phi_k
 
     def with_f_tilde(self, state, f_tilde, factor):
-        """The state with the estimate that gives f_tilde, which is affine in it with the slope
-        -M0 M^-1.
-        """
+        """The state with the estimate that gives f_tilde, which is affine in it with the slope -M0
+        M^-1."""
         t, q, v, phi = state
         M0, _, _ = self.dynamics(q, np.ones_like(q))
         M, _, _ = self.dynamics(q, factor)
@@ -256,19 +233,15 @@ class SampledTwoLinks(TwoLinks):
         flipped = np.linalg.cholesky(M0[:, ::-1, ::-1])[:, ::-1, ::-1]
         scaled = np.einsum("bji,bj->bi", flipped, e2)
         f_tilde = self.f_tilde(*state, factor)
-        s = np.concatenate(
-            [
-                np.sign(e1) * np.sqrt(V1 / level[:, None]),
-                scaled / np.sqrt(2.0 * level)[:, None],
-                f_tilde * np.sqrt(0.5 * self.weight / level)[:, None],
-            ],
-            axis=1,
-        )
-        return np.concatenate([t[:, None], s, factor], axis=1), level
+        roots = np.sqrt([1.0 / level, 0.5 / level, 0.5 * self.weight / level])[:, :, None]
+        s = roots * [np.sign(e1) * np.sqrt(V1), scaled, f_tilde]
+        return np.concatenate([t[:, None], *s, factor], axis=1), level
 
 
 class SampledPendulum(SampledTwoLinks):
     """The pendulum, whose reference and bounds are those of the first of two links."""
+
+    joints = 1
 
     def tube(self, t):
         return [x[:, :1] for x in super().tube(t)]
@@ -283,24 +256,6 @@ class SampledPendulum(SampledTwoLinks):
     def momentum_term(self, q, v):
         return -self.dynamics(q, np.ones_like(q))[2]
 
-    def starts(self, count, level, seed, *, near=0.0):
-        generator = np.random.default_rng(seed)
-        t = generator.uniform(0.0, 2.0 * np.pi, count)
-        s = generator.normal(size=(3, count, 1))
-        if near:
-            t = UNEVEN + 0.1 * (t - np.pi) + np.pi * generator.integers(0, 2, count)
-            s[0] *= near
-        s /= np.linalg.norm(s, axis=0)
-        q_d, _, _, k_l, k_u, _, _ = self.tube(t)
-        q = q_d + np.sign(s[0]) * np.sqrt(-np.expm1(-level * s[0] ** 2)) * np.where(
-            s[0] > 0.0, k_u, k_l
-        )
-        M0 = self.dynamics(q, np.ones_like(q))[0][..., 0]
-        v = self.alpha(t, q) + np.sqrt(2.0 * level / M0) * s[1]
-        factor = 1.0 + 0.01 * generator.choice([-1.0, 0.0, 1.0], (count, 1))
-        f_tilde = np.sqrt(2.0 * level / self.weight) * s[2]
-        return self.with_f_tilde((t, q, v, np.zeros_like(q)), f_tilde, factor), factor
-
 
 def added(state, rates, size):
     """state + size rates; `size` is a number, or one for each run, (count, 1)."""
@@ -308,14 +263,9 @@ def added(state, rates, size):
     return tuple(x + h * rate for x, rate, h in zip(state, rates, sizes, strict=True))
 
 
-def gain_of(observer, kf=KF, period=PERIOD):
-    return kf if observer == EULER else -np.expm1(-kf * period) / period
-
-
 def own_loop(observer, kf=KF, period=PERIOD, measured=None, links=SampledTwoLinks):
-    gain = gain_of(observer, kf, period)
-    momentum_gain = kf - gain if observer == EXACT else 0.0
-    return links(gain, momentum_gain=momentum_gain, measured=measured)
+    gain = kf if observer == EULER else -np.expm1(-kf * period) / period
+    return links(gain, momentum_gain=kf - gain if observer == EXACT else 0.0, measured=measured)
 
 
 @functools.cache
@@ -453,9 +403,8 @@ def enclosed(runs, function, size, generator, *, period=PERIOD, more=()):
 @functools.cache
 def own_runs(near=0.0, ends_without_f_tilde=False, count=60, observer=POLES, rough=False):
     """With `near`, runs begin near e1 = 0 where the sides of the tube differ most, and paths cross
-    it; one can choose that the runs end with f_tilde = 0.
-    With rounded positions they are those of the pendulum.
-    """
+    it; one can choose that the runs end with f_tilde = 0. With rounded positions they are those of
+    the pendulum."""
     generator = np.random.default_rng(3)
     problem, loop = problem_of_paper_loop(observer), own_loop(observer)
     if rough:
@@ -473,8 +422,7 @@ def own_runs(near=0.0, ends_without_f_tilde=False, count=60, observer=POLES, rou
     end = path[-1]
     sides = [np.sign(loop.errors(*x[:3])[0]) for x in (start, end)]
     assert not near or np.any(sides[0] != sides[1], axis=1).mean() > 0.1
-    rates = np.abs([loop.held_rates(state, sample, factor) for state in path])
-    limits = rates.max(axis=0)
+    limits = np.abs([loop.held_rates(state, sample, factor) for state in path]).max(axis=0)
     if rough:
         limits = np.concatenate([limits, np.abs(loop.differences(start, sample))])
     limits = 1.05 * np.moveaxis(limits, 1, 0)
@@ -512,8 +460,7 @@ def enclosures_of(runs, size, *, period=PERIOD, D=None, L=None):
     function = Enclosures(bound.structure, bound.places, ())
     zero = np.zeros_like(runs.factor)
     more = [zero if x is None else x for x in (D, L)]
-    generator = np.random.default_rng(1)
-    ends = enclosed(runs, function, size, generator, period=period, more=more)
+    ends = enclosed(runs, function, size, np.random.default_rng(1), period=period, more=more)
     low, high = (Found(*some) for some in ends)
     # The bounds of rates of a single run are too small to enclose some paths.
     assert np.isnan(low.xi).any(axis=1).mean() < 0.1
@@ -539,9 +486,7 @@ def affine(found, name, f_tilde):
 @pytest.mark.slow
 @pytest.mark.parametrize(("observer", "rough"), KINDS)
 @pytest.mark.parametrize(("near", "ends_without_f_tilde"), [(0.0, False), (0.02, True)])
-def test_enclosures_contain_the_path_and_the_means_of_runs(
-    near, ends_without_f_tilde, observer, rough
-):
+def test_enclosures_contain_paths_and_means_of_runs(near, ends_without_f_tilde, observer, rough):
     """The bounds of the rates are hardly above those of each run."""
     runs = own_runs(near, ends_without_f_tilde, observer=observer, rough=rough)
     loop, end, age = runs.loop, runs.end, runs.age
@@ -681,11 +626,11 @@ def rounded(q):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("observer", "sensor", "measured"), [*((x, None, None) for x in STEPS), (POLES, ROUGH, rounded)]
-)
-def test_runs_of_the_package_are_those_of_other_equations(observer, sensor, measured):
+@pytest.mark.parametrize("case", [*STEPS, f"{POLES} with rounded positions"])
+def test_runs_of_the_package_are_those_of_other_equations(case):
     """A run from a point of the level set, with the estimate of its last sample."""
+    observer, _, is_rounded = case.partition(" with ")
+    sensor, measured = (ROUGH, rounded) if is_rounded else (None, None)
     problem, loop = problem_of_paper_loop(observer, sensor), own_loop(observer, measured=measured)
     state, factor = loop.starts(1, LEVEL, 5)
     points, level = loop.points(state, factor)
@@ -747,9 +692,6 @@ def test_level_of_the_start_is_that_of_the_first_sample(observer):
     np.testing.assert_allclose(found.half_square, 0.5 * estimate**2, rtol=1e-12)
 
 
-# --- verdicts ----------------------------------------------------------------------------------
-
-
 @functools.cache
 def proof(period, observer=POLES, counts=None, **options):
     given = {"level": 0.5, "weight": WEIGHT, "parameters": within(1.0), "progress": False}
@@ -766,18 +708,15 @@ def test_a_sampled_pendulum_is_proved_and_its_runs_stay_inside_the_bounds():
     text = repr(found)
     assert "of the loop sampled every 0.001 s is invariant" in text
     assert "A run starts at a sample" in text
-    assert "continuous" not in found.sentence()
-    assert np.all(found.held_rates > 0.0)
+    assert "continuous" not in found.sentence() and np.all(found.held_rates > 0.0)
     for run in found.adversarial_runs(8, duration=0.5):
-        assert run.ok
-        assert np.max(np.abs(run.xi)) <= found.tube.xi.max()
+        assert run.ok and np.max(np.abs(run.xi)) <= found.tube.xi.max()
 
 
 @pytest.mark.release
 def test_runs_of_two_links_stay_in_a_proved_set_at_all_times():
     scenario = sampled(paper_loop(), 0.5 * PERIOD)
-    found = ij.prove(scenario, level=LEVEL, weight=WEIGHT, parameters=MASSES, progress=False)
-    assert found.proved
+    assert ij.prove(scenario, level=LEVEL, weight=WEIGHT, parameters=MASSES, progress=False).proved
     loop = own_loop(POLES, kf=100.0, period=0.5 * PERIOD)
     state, factor = loop.starts(10_000, LEVEL, 6)
     for _ in range(600):
@@ -792,8 +731,7 @@ def test_a_pendulum_with_the_exact_step_and_rounded_positions_is_proved():
     """Own runs, with any errors up to half of a count, do not leave the set at any time."""
     counts = 10_000.0
     found = proof(PERIOD, EXACT, counts)
-    assert found.proved
-    assert 'a step of the kind "exact"' in repr(found)
+    assert found.proved and 'a step of the kind "exact"' in repr(found)
     assert "positions with errors of at most 0.000314 rad, and exact velocities" in repr(found)
     assert found.torque is None and found.held_rates.shape == (5, 1)
     error, generator = np.pi / counts, np.random.default_rng(8)
@@ -806,16 +744,14 @@ def test_a_pendulum_with_the_exact_step_and_rounded_positions_is_proved():
 
     loop = own_loop(EXACT, 100.0, measured=measured, links=SampledPendulum)
     state, factor = loop.starts(400, 0.5, 6)
-    start = loop.lyapunov(*state, factor)
-    np.testing.assert_allclose(start, 0.5, rtol=1e-9)
+    np.testing.assert_allclose(loop.lyapunov(*state, factor), 0.5, rtol=1e-9)
     for _ in range(300):
         sample = loop.sample(state)
         for _ in range(2):
             state = loop.moved(state, sample, factor, 0.5 * PERIOD, steps=2)
             assert np.all(loop.lyapunov(*state, factor) < 0.5)
     for run in found.adversarial_runs(2, duration=0.2):
-        assert run.ok
-        assert np.max(np.abs(run.xi)) <= found.tube.xi.max()
+        assert run.ok and np.max(np.abs(run.xi)) <= found.tube.xi.max()
 
 
 @pytest.mark.slow
@@ -823,8 +759,7 @@ def test_a_run_that_leaves_the_set_refutes_it():
     """V_w of the run by equations of its own."""
     period = 20e-3
     found = proof(period, runs=4)
-    assert found.verdict == Verdict.REFUTED
-    assert "is not invariant for all t" in found.sentence()
+    assert found.verdict == Verdict.REFUTED and "is not invariant for all t" in found.sentence()
     assert "at a sample, and stays inside the bounds; replay() returns it." in repr(found)
     with pytest.warns(ij.SimulationWarning, match="sampled too slowly"):
         run = found.replay(record_every=round(period / found.violation.dt))
@@ -841,11 +776,6 @@ def test_a_run_that_leaves_the_set_refutes_it():
     np.testing.assert_allclose(V[0], 0.5, rtol=1e-9)
     np.testing.assert_allclose(V.max(), found.violation.value, rtol=1e-4)
     assert found.violation.value > 0.5
-
-
-def test_a_longest_period_needs_a_sampled_loop():
-    with pytest.raises(ValueError, match=r"scenario\.sampling: got None.*ij\.Sampling\(period"):
-        ij.largest_period(pendulum(), level=0.5, parameters={}, between=(1e-3, 2e-3))
 
 
 @pytest.mark.slow

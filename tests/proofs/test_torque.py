@@ -30,9 +30,6 @@ def proof(limit=None, weight=3e-3, **options):
     return ij.prove(scenario, weight=weight, **options)
 
 
-# --- the bound --------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", each({"pendulum"}))
 def test_bound_over_boxes_contains_the_torque_of_their_points(name):
@@ -43,8 +40,7 @@ def test_bound_over_boxes_contains_the_torque_of_their_points(name):
     ends = np.full(n, -1.0), np.full(n, 3.0)
     for share in (0.0, 0.3, 1.0):
         points = problem.sample(2, 500)
-        inside = problem.constants(WEIGHT, max(level * share**2, 1e-12))
-        torque = problem.torques(points, inside)
+        torque = problem.torques(points, problem.constants(WEIGHT, max(level * share**2, 1e-12)))
         rows = np.array([coordinates_of(point, n) for point in points])
         x = np.insert(rows, rows.shape[1] - n - 1, max(share, 1e-6 / level**0.5), axis=1)
         lower, upper, _ = problem.whole_set
@@ -87,9 +83,8 @@ class TwoLinks:
         return M, p3 * sin, G
 
     def coriolis(self, h, v, u):
-        return np.stack(
-            [-h * (v[:, 1] * u[:, 0] + v.sum(axis=1) * u[:, 1]), h * v[:, 0] * u[:, 0]], -1
-        )
+        first = -h * (v[:, 1] * u[:, 0] + v.sum(axis=1) * u[:, 1])
+        return np.stack([first, h * v[:, 0] * u[:, 0]], -1)
 
     def tube(self, t):
         """q_d, q_d', q_d", k_l, k_u and their rates."""
@@ -120,15 +115,15 @@ class TwoLinks:
         return np.einsum("bij,bj->bi", M, acceleration) + self.coriolis(h, v, v) + G
 
     def states(self, t, s, level, weight):
-        """q, e2 and f_tilde where V_w = level |s|^2, s (count, 6)."""
+        """q, e2 and f_tilde where V_w = level |s|^2, s (count, 3 n)."""
         q_d, _, _, k_l, k_u, _, _ = self.tube(t)
-        xi = np.sign(s[:, :2]) * np.sqrt(-np.expm1(-level * s[:, :2] ** 2))
+        first, second, third = np.split(s, 3, axis=1)
+        xi = np.sign(first) * np.sqrt(-np.expm1(-level * first**2))
         q = q_d + xi * np.where(xi > 0.0, k_u, k_l)
         M0, _, _ = self.dynamics(q, np.ones_like(q))
-        scaled = np.sqrt(2.0 * level) * s[:, 2:4]
         root = np.swapaxes(np.linalg.cholesky(M0), 1, 2)
-        e2 = np.linalg.solve(root, scaled[..., None])[..., 0]
-        return q, e2, np.sqrt(2.0 * level / weight) * s[:, 4:]
+        e2 = np.linalg.solve(root, np.sqrt(2.0 * level) * second[..., None])[..., 0]
+        return q, e2, np.sqrt(2.0 * level / weight) * third
 
     def random(self, count, level, weight, width, seed):
         """Torques at points of {V_w <= level}, every second one on its boundary."""
@@ -163,13 +158,13 @@ def test_the_torque_of_two_links_is_bounded_and_the_bound_is_tight(level):
     of_package = found.problem.torques(points, constants)
     factor = np.array([[state.parameters[f"plant.mass[{i}]"] for i in range(2)]]) / torque.mass
     t, q = np.array([state.t]), state.q[None]
-    e2 = state.dq[None] - torque.alpha(t, q)
-    expected = torque.torque(t, q, e2, state.f_tilde[None], factor)
+    expected = torque.torque(t, q, state.dq[None] - torque.alpha(t, q), state.f_tilde[None], factor)
     np.testing.assert_allclose(of_package, expected, rtol=1e-6)
 
 
 @pytest.mark.slow
-def test_no_run_exceeds_the_bound_and_the_law_commands_what_the_plant_needs():
+def test_no_run_exceeds_the_bound_and_a_proof_includes_that_the_torque_stays_within_its_limits():
+    """The law commands what the plant needs."""
     found = proof()
     for run in found.adversarial_runs(4):
         assert np.all(np.asarray(run.tau) <= found.torque.highest)
@@ -180,58 +175,45 @@ def test_no_run_exceeds_the_bound_and_the_law_commands_what_the_plant_needs():
         scenario = found.problem.scenario_at(point, constants)
         with_start = ij.simulate(scenario, duration=1e-3, dt=1e-3)
         np.testing.assert_allclose(np.asarray(with_start.tau)[0], expected, rtol=1e-9)
-
-
-# --- limits -----------------------------------------------------------------------------------
-
-
-def test_limits_of_law_and_motor_are_joined():
-    scenario = pendulum()
-    assert without_limits(scenario)[1] is None
-    loop = limited(scenario, 50.0, lower_limit=-20.0, actuator=Motor(limit=45.0))
-    free, limits = without_limits(loop)
-    np.testing.assert_array_equal(limits, [[-20.0], [45.0]])
-    assert type(free.actuator) is Ideal
-    assert type(free.controller) is ij.controllers.Backstepping
-    slow = dataclasses.replace(scenario, actuator=Motor(limit=45.0, bandwidth=1e3))
-    assert type(without_limits(slow)[0].actuator) is Motor
-
-
-@pytest.mark.parametrize(
-    ("scenario", "options", "words"),
-    [
-        (limited(pendulum(), 50.0, edge="smooth"), {}, r"controller\.edge"),
-        (
-            limited(pendulum(), 9.0, lower_limit=8.0, actuator=Motor(limit=7.0)),
-            {},
-            "limits that overlap",
-        ),
-        (limited(pendulum(), 50.0), {"disturbance_rate": 1.0}, "any torque"),
-    ],
-)
-def test_what_changes_the_torque_inside_its_limits_is_refused(scenario, options, words):
-    with pytest.raises(ValueError, match=words):
-        ij.prove(scenario, level=0.5, parameters=within(1.0), **options)
-
-
-@pytest.mark.slow
-def test_a_proof_includes_that_the_torque_stays_within_its_limits():
-    free = proof()
-    highest = float(free.torque.found_highest[0])
-    assert "Guaranteed on the whole set [N m]: |tau| <=" in repr(free)
+    highest = float(found.torque.found_highest[0])
+    assert "Guaranteed on the whole set [N m]: |tau| <=" in repr(found)
     # Between the extreme that was found and the bound without limits
     within_limits = proof(limit=1.02 * highest)
     assert within_limits.proved
-    assert within_limits.torque.highest[0] == 1.02 * highest < free.torque.highest[0]
+    assert within_limits.torque.highest[0] == 1.02 * highest < found.torque.highest[0]
     assert "and the torque stays within its limits" in within_limits.sentence()
     assert not any("saturation" in x for x in within_limits.assumptions)
-    assert any("saturation" in x for x in free.assumptions)
+    assert any("saturation" in x for x in found.assumptions)
     beyond = proof(limit=0.999 * highest)
     assert beyond.verdict == Verdict.NOT_PROVED and beyond.growth_points == ()
     assert "beyond the limits" in repr(beyond)
     few = proof(limit=1.0001 * highest, max_boxes=3_000)
     assert few.verdict == Verdict.UNDECIDED and few.done == 1.0
     assert "not proved to stay within its limits" in repr(few)
+
+
+def test_limits_of_law_and_motor_are_joined_or_refused_and_excess_is_negative_inside():
+    scenario = pendulum()
+    assert without_limits(scenario)[1] is None
+    loop = limited(scenario, 50.0, lower_limit=-20.0, actuator=Motor(limit=45.0))
+    free, limits = without_limits(loop)
+    np.testing.assert_array_equal(limits, [[-20.0], [45.0]])
+    assert type(free.actuator) is Ideal and type(free.controller) is ij.controllers.Backstepping
+    slow = dataclasses.replace(scenario, actuator=Motor(limit=45.0, bandwidth=1e3))
+    assert type(without_limits(slow)[0].actuator) is Motor
+    apart = limited(scenario, 9.0, lower_limit=8.0, actuator=Motor(limit=7.0))
+    for refused, options, words in (
+        (limited(scenario, 50.0, edge="smooth"), {}, r"controller\.edge"),
+        (apart, {}, "limits that overlap"),
+        (limited(scenario, 50.0), {"disturbance_rate": 1.0}, "any torque"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            ij.prove(refused, level=0.5, parameters=within(1.0), **options)
+    ends = np.array([-5.0, -1.0]), np.array([7.0, 2.0])
+    torque = TorqueRange(np.full(2, -np.inf), np.full(2, np.inf), *ends, 0)
+    assert torque.excess(np.array([[-6.0, -6.0], [8.0, 8.0]])) == pytest.approx(-1.0 / 14.0)
+    assert torque.excess(np.array([[-4.0, -6.0], [8.0, 8.0]])) == pytest.approx(1.0 / 12.0)
+    assert not torque.is_proved
 
 
 @pytest.mark.slow
@@ -248,11 +230,3 @@ def test_the_weight_and_the_largest_level_respect_the_limits():
         for scenario in (pendulum(), limited(pendulum(), 25.0))
     ]
     assert levels[1] < levels[0]
-
-
-def test_excess_is_negative_inside():
-    ends = np.array([-5.0, -1.0]), np.array([7.0, 2.0])
-    torque = TorqueRange(np.full(2, -np.inf), np.full(2, np.inf), *ends, 0)
-    assert torque.excess(np.array([[-6.0, -6.0], [8.0, 8.0]])) == pytest.approx(-1.0 / 14.0)
-    assert torque.excess(np.array([[-4.0, -6.0], [8.0, 8.0]])) == pytest.approx(1.0 / 12.0)
-    assert not torque.is_proved

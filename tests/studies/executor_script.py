@@ -4,8 +4,6 @@
 that start by spawn import this file again, so that everything is under the guard at its end.
 """
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import signal
@@ -45,15 +43,9 @@ class Spring:
         return ij.controllers.Command(tau, tube.dq_d, 0.0 * q, no, no), ()
 
 
-def own_law():
-    """The paper's scenario with a law of this file."""
-    scenario = ij.presets.zhang_yan_2024()
-    return ij.with_parts(scenario, controller=Spring(60.0, 20.0))
-
-
 def study_of_own_law(**more):
-    """A few runs of it."""
-    return ij.monte_carlo(own_law(), cases.perturbations(), runs=300, **cases.options() | more)
+    scenario = ij.with_parts(ij.presets.zhang_yan_2024(), controller=Spring(60.0, 20.0))
+    return ij.monte_carlo(scenario, cases.perturbations(), runs=300, **cases.options() | more)
 
 
 def after_units(path, count, action):

@@ -1,13 +1,9 @@
 """Studies by other executors: the same bits as in this process, lost workers, Ctrl-C, stores that
 are resumed by another executor, classes of a script."""
 
-from __future__ import annotations
-
 import concurrent.futures
 import concurrent.futures.process
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -49,8 +45,16 @@ class LosesWorkers(concurrent.futures.Executor):
 
 
 @pytest.mark.slow
-def test_a_study_is_bit_identical(threads):
+def test_studies_are_bit_identical_and_errors_of_a_task_are_the_users(threads):
     assert cases.same(cases.named(cases.study()), cases.named(cases.study(executor=threads)))
+    options = {"points": 4} | cases.options()
+    here = ij.sensitivity(SCENARIO, cases.perturbations(), **options)
+    there = ij.sensitivity(SCENARIO, cases.perturbations(), executor=threads, **options)
+    np.testing.assert_array_equal(here.total_order, there.total_order)
+    assert here.runs == there.runs
+    # An error of a task is not taken for a lost worker.
+    with pytest.raises(ValueError, match="from the task"):
+        cases.study(executor=LosesWorkers(0, ValueError("from the task")))
 
 
 @pytest.mark.slow
@@ -61,15 +65,6 @@ def test_a_store_is_bit_identical_whoever_writes_it(threads, table, writer, tmp_
     assert cases.table(store=options.path).identical(table)
 
 
-@pytest.mark.slow
-def test_sensitivity_is_bit_identical(threads):
-    options = {"points": 4} | cases.options()
-    here = ij.sensitivity(SCENARIO, cases.perturbations(), **options)
-    there = ij.sensitivity(SCENARIO, cases.perturbations(), executor=threads, **options)
-    np.testing.assert_array_equal(here.total_order, there.total_order)
-    assert here.runs == there.runs
-
-
 class KilledWorkerError(Exception):
     """As Dask's, which is recognised by its module."""
 
@@ -77,23 +72,13 @@ class KilledWorkerError(Exception):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "error",
-    [concurrent.futures.BrokenExecutor("a worker died"), KilledWorkerError("a worker died")],
-)
-def test_a_lost_worker_ends_the_call_and_another_executor_resumes(error, table, threads, tmp_path):
+@pytest.mark.parametrize("kind", [concurrent.futures.BrokenExecutor, KilledWorkerError])
+def test_a_lost_worker_ends_the_call_and_another_executor_resumes(kind, table, threads, tmp_path):
     path = tmp_path / "sweep.zarr"
     with pytest.raises(ij.studies.WorkerError, match=r"lost.*died.*start the same call again"):
-        cases.table(store=path, executor=LosesWorkers(3, error))
+        cases.table(store=path, executor=LosesWorkers(3, kind("a worker died")))
     assert ij.load_sweep(path).attrs["computed_cases"] <= 3 * cases.UNIT
     assert cases.table(store=path, executor=threads).identical(table)
-
-
-@pytest.mark.slow
-def test_errors_of_a_task_are_the_users(threads):
-    """They are not taken for a lost worker."""
-    with pytest.raises(ValueError, match="from the task"):
-        cases.study(executor=LosesWorkers(0, ValueError("from the task")))
 
 
 @pytest.mark.slow
@@ -121,9 +106,7 @@ def test_ctrl_c_stops_after_a_unit(threads, table, tmp_path, monkeypatch):
         ("compiler", "another", "vmap"),
     ],
 )
-def test_a_worker_that_would_compute_other_numbers_is_refused(
-    name, value, remedy, threads, monkeypatch
-):
+def test_a_worker_of_another_kind_is_refused(name, value, remedy, threads, monkeypatch):
     client = workers.environment("vmap")
     other = client | {name: value}
     monkeypatch.setattr(workers, "environment", lambda executor: client if called() else other)
@@ -137,14 +120,11 @@ def test_a_worker_that_would_compute_other_numbers_is_refused(
         cases.study(runs=4, seed=77, executor=threads)
 
 
-def test_a_workers_path_that_is_not_shared_is_named(tmp_path):
+def test_a_workers_path_that_is_not_shared_and_a_store_of_an_earlier_version(tmp_path):
+    """The store was made by the code of commit d674b34: 4 points with 3 runs each."""
     shared = workers.SharedStore(str(tmp_path / "nothing.zarr"), {})
     with pytest.raises(ij.StoreError, match=r"no store here.*writer='client' does not"):
         workers._open_shared(shared)
-
-
-def test_a_store_of_an_earlier_version_is_read():
-    """Made by the code of commit d674b34: 4 points with 3 runs each."""
     folder = Path(__file__).parents[1] / "data"
     found = ij.load_sweep(folder / "sweep_d674b34.zarr")
     with np.load(folder / "sweep_d674b34.npz") as expected:
@@ -165,18 +145,14 @@ def test_units_that_another_process_writes_are_skipped(table, tmp_path, monkeypa
             cases.table(store=path, executor=ij.studies.LocalExecutor(chunk=1))
 
     monkeypatch.setattr(store.Store, "write", write_all_at_first)
-    one_at_a_time = ij.studies.LocalExecutor(chunk=1)
-    assert cases.table(store=options, executor=one_at_a_time).identical(table)
+    assert cases.table(store=options, executor=ij.studies.LocalExecutor(chunk=1)).identical(table)
     assert len(seen) <= 12 + 2, "units that are written are not computed again"
 
 
 @pytest.mark.slow
 def test_two_processes_share_a_store(compiled, tmp_path, table):
-    path = str(tmp_path / "sweep.zarr")
-    both = [
-        cases.start(compiled, str(tmp_path / f"{i}.npz"), "--store", path, "--shared")
-        for i in (0, 1)
-    ]
+    words = ("--store", str(tmp_path / "sweep.zarr"), "--shared")
+    both = [cases.start(compiled, str(tmp_path / f"{i}.npz"), *words) for i in (0, 1)]
     for i, process in enumerate(both):
         _, errors = process.communicate(timeout=600)
         assert process.returncode == 0, errors
@@ -187,13 +163,8 @@ def test_two_processes_share_a_store(compiled, tmp_path, table):
 def test_dask_and_a_process_pool(tmp_path):
     """Two Dask workers, then a pool: see the script for what happens to them."""
     pytest.importorskip("distributed")
-    script = Path(__file__).parent / "executor_script.py"
-    done = subprocess.run(
-        [sys.executable, str(script), str(tmp_path)],
-        env=cases.environment(tmp_path / "compiled"),
-        capture_output=True,
-        text=True,
-        timeout=900,
-    )
-    assert done.returncode == 0, done.stderr[-3000:]
-    assert done.stdout.splitlines() == ["own law", "killed worker", "Ctrl-C", "process pool"]
+    script = str(Path(__file__).parent / "executor_script.py")
+    process = cases.start_python(tmp_path / "compiled", script, str(tmp_path))
+    shown, errors = process.communicate(timeout=900)
+    assert process.returncode == 0, errors[-3000:]
+    assert shown.splitlines() == ["own law", "killed worker", "Ctrl-C", "process pool"]

@@ -4,25 +4,17 @@ The cases are independent of the package: their probabilities come from SciPy's 
 quadrature.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
 import pytest
 from scipy import integrate, stats
 
+from iblf_jax.studies.rare_events import limit_state
 from iblf_jax.studies.rare_events.crude import crude_monte_carlo
 from iblf_jax.studies.rare_events.design_points import Pieces, design_points
 from iblf_jax.studies.rare_events.importance import importance_sampling, tail_shape
-from iblf_jax.studies.rare_events.limit_state import (
-    NO_RUN,
-    Level,
-    binomial_interval,
-    log_normal_interval,
-    stagnate,
-    upper_bound,
-)
+from iblf_jax.studies.rare_events.limit_state import stagnate, upper_bound
 from iblf_jax.studies.rare_events.subset import subset_simulation
 
 
@@ -56,9 +48,7 @@ def quadratic(dimension, beta, curvature):
         return stats.norm.pdf(y) * stats.norm.sf(beta + curvature * y * y)
 
     probability = integrate.quad(density, -12, 12)[0]
-    return Case(
-        dimension, probability, lambda z: (beta + curvature * z[:, 1] ** 2 - z[:, 0])[:, None]
-    )
+    return Case(dimension, probability, lambda z: beta + curvature * z[:, 1:2] ** 2 - z[:, :1])
 
 
 def series(dimension, beta):
@@ -97,14 +87,12 @@ def test_subset_simulation_estimates_known_probabilities(name):
     product = np.prod([level.probability for level in found[0].levels])
     assert found[0].probability == pytest.approx(product)
     thresholds = [level.threshold for level in found[0].levels]
-    assert np.all(np.diff(thresholds) < 0)
-    assert thresholds[-1] == 0
+    assert np.all(np.diff(thresholds) < 0) and thresholds[-1] == 0
     assert np.all(found[0].failures.margins <= 0)
 
 
 def test_one_in_a_million_from_thirty_thousand_runs():
-    """The aim: coefficient of variation 0.3 or better from at most 30,000 runs, in large batches;
-    the same bits for the same seed."""
+    """Coefficient of variation 0.3 or better, in large batches; the same bits for the same seed."""
     case, sizes = CASES["1e-6 in 50"], []
 
     def counted(z):
@@ -112,8 +100,7 @@ def test_one_in_a_million_from_thirty_thousand_runs():
         return case.margin(z)
 
     found = subset_simulation(counted, 50, runs=4000, seed=1, **OPTIONS)
-    assert sum(sizes) <= 30_000
-    assert min(sizes) >= 400
+    assert sum(sizes) <= 30_000 and min(sizes) >= 400
     assert found.coefficient_of_variation < 0.3
     again = by_subset(case, 1)
     assert again.probability == found.probability
@@ -126,24 +113,19 @@ def test_importance_sampling_estimates_known_probabilities(name):
     case = CASES[name]
     found = by_importance(case, 0)
     assert abs(found.probability / case.probability - 1) < 4 * found.coefficient_of_variation
-    assert found.coefficient_of_variation < 0.1
-    assert found.notes == ()
+    assert found.coefficient_of_variation < 0.1 and found.notes == ()
 
 
-def test_design_points_of_all_regions():
+def test_design_points_of_all_regions_and_from_known_failures():
+    """A margin without a gradient at the origin has a design point that only a failure leads to."""
     points, evaluations = design_points(CASES["two regions"].of_pieces, np.zeros((0, 10)))
     assert evaluations < 40
     np.testing.assert_allclose(np.sort(points[:, 0]), [-4.5, 4.5])
     np.testing.assert_allclose(points[:, 1:], 0, atol=1e-12)
 
-
-def test_a_search_begins_at_known_failures():
-    """A margin without a gradient at the origin has a design point that only a failure leads to."""
-
     def of_pieces(z):
         ramp = np.maximum(z[:, 0] - 1, 0)
-        gradient = np.where(z[:, :1] > 1, [[-1.0, 0.0]], 0.0)
-        return Pieces((3 - ramp)[:, None], gradient[:, None, :])
+        return Pieces((3 - ramp)[:, None], np.where(z[:, :1] > 1, [[-1.0, 0.0]], 0.0)[:, None, :])
 
     none, _ = design_points(of_pieces, np.zeros((0, 2)))
     assert len(none) == 0
@@ -152,74 +134,54 @@ def test_a_search_begins_at_known_failures():
 
 
 def test_degenerate_weights_are_flagged():
-    """A failure region that bends towards the origin has no finite variance of its weights; a few
-    samples show it in most cases."""
+    """A failure region that bends towards the origin has weights without a finite variance."""
     case = quadratic(5, 4.5, -0.1)
-    flagged = [bool(by_importance(case, seed).notes) for seed in range(20)]
-    assert np.mean(flagged) > 0.7
+    assert np.mean([bool(by_importance(case, seed).notes) for seed in range(20)]) > 0.7
     assert tail_shape(stats.genpareto.rvs(0.9, size=4000, random_state=1)) > 0.5
     assert tail_shape(stats.genpareto.rvs(-0.3, size=4000, random_state=1)) < 0.2
-    assert tail_shape(np.ones(100)) == -np.inf
-    assert tail_shape(np.ones(3)) == np.inf
+    assert tail_shape(np.ones(100)) == -np.inf and tail_shape(np.ones(3)) == np.inf
 
 
-def test_an_estimate_without_failures_is_an_upper_bound():
-    """All margins equal; margins that come no nearer; no failure among independent draws."""
+def test_an_estimate_without_failures_is_an_upper_bound_with_notes():
+    """All margins equal; margins that come no nearer; no failure among independent draws.  A load
+    below 1 has margins above 0.1; the same load without its limit can fail.  No failure far from
+    the origin bounds the failures behind the origin by little; around the origin itself the bound
+    is that of independent draws."""
 
     def constant(z):
         return np.ones(len(z))
 
     found = subset_simulation(constant, 3, runs=500, seed=0, **OPTIONS)
-    assert found.is_upper_bound
-    assert found.probability == pytest.approx(1 - 0.05 ** (1 / 500))
-    assert found.low == 0
-    assert "upper bound" in found.notes[0]
+    assert found.is_upper_bound and found.probability == pytest.approx(1 - 0.05 ** (1 / 500))
+    assert found.low == 0 and "upper bound" in found.notes[0]
     assert "no level nearer to failure" in found.notes[1]
 
     def floor(z):
         return np.maximum(1 - z[:, 0], 0.1)
 
     found = subset_simulation(floor, 3, runs=500, seed=0, **OPTIONS)
-    assert found.is_upper_bound
-    assert found.probability < stats.norm.sf(0.9)
+    assert found.is_upper_bound and found.probability < stats.norm.sf(0.9)
     crude = crude_monte_carlo(constant, 3, runs=100, seed=0, confidence=0.95)
     assert crude.is_upper_bound
     assert crude.high == crude.probability == pytest.approx(1 - 0.05 ** (1 / 100))
     around = importance_sampling(constant, np.ones((1, 3)), runs=100, seed=0, confidence=0.95)
-    assert around.is_upper_bound
-    assert around.notes
-
-
-def test_margins_of_bounded_draws_that_approach_a_limit_are_noted():
-    """A load below 1 has margins above 0.1; the same load without its limit can fail."""
-
-    def bounded(z):
-        return 0.2 - 0.1 * stats.norm.cdf(z[:, 0])
+    assert around.is_upper_bound and around.notes
 
     def note_of(margin):
         found = subset_simulation(margin, 2, runs=500, seed=0, **OPTIONS)
         assert found.is_upper_bound
         return " ".join(found.notes)
 
-    assert "approach 0.1 and not 0" in note_of(bounded)
+    assert "approach 0.1 and not 0" in note_of(lambda z: 0.2 - 0.1 * stats.norm.cdf(z[:, 0]))
     assert "approach" not in note_of(lambda z: 20.0 - z[:, 0])
 
-
-def test_the_bound_of_samples_around_a_distant_point_holds():
-    """No failure far from the origin bounds the failures behind the origin by little; around the
-    origin itself the bound is that of independent draws."""
-
-    def behind(z):
-        return z[:, 0] + 2.0
-
-    far = importance_sampling(behind, np.array([[5.0, 0.0]]), runs=4096, seed=0, confidence=0.95)
-    assert far.is_upper_bound
-    assert stats.norm.sf(2.0) < far.probability == far.high <= 1
     options = {"runs": 4096, "seed": 0, "confidence": 0.95}
-    here = importance_sampling(lambda z: np.ones(len(z)), np.zeros((1, 2)), **options)
-    assert here.probability == pytest.approx(upper_bound(4096, 0.95))
-    half = importance_sampling(lambda z: np.ones(len(z)), np.zeros((1, 2)), runnable=0.5, **options)
-    assert half.probability == pytest.approx(2 * upper_bound(4096, 0.95))
+    far = importance_sampling(lambda z: z[:, 0] + 2.0, np.array([[5.0, 0.0]]), **options)
+    assert far.is_upper_bound and stats.norm.sf(2.0) < far.probability == far.high <= 1
+    for share in (1.0, 0.5):
+        options = {"runs": 4096, "seed": 0, "confidence": 0.95, "runnable": share}
+        here = importance_sampling(constant, np.zeros((1, 2)), **options)
+        assert here.probability == pytest.approx(upper_bound(4096, 0.95) / share)
 
 
 MARGINS = {
@@ -238,10 +200,8 @@ MARGINS = {
 def test_margins_that_are_no_smooth_function(name):
     """The mean of ten estimates is exact within four of its standard errors."""
     margin, quantile = MARGINS[name]
-    found = [
-        subset_simulation(margin, 3, runs=4000, seed=seed, **OPTIONS).probability
-        for seed in range(10)
-    ]
+    options = {"runs": 4000} | OPTIONS
+    found = [subset_simulation(margin, 3, seed=seed, **options).probability for seed in range(10)]
     ratios = np.array(found) / stats.norm.sf(quantile)
     assert np.mean(ratios) == pytest.approx(1, abs=4 * max(np.std(ratios), 0.05) / np.sqrt(10))
 
@@ -261,30 +221,39 @@ def test_draws_that_cannot_be_run_are_excluded():
     points = np.array([[3.5, 0.0]])
     around = importance_sampling(margin, points, runs=4000, seed=0, confidence=0.95, runnable=0.5)
     assert around.low < exact < around.high
-    options = {"runs": 9, "seed": 0, "confidence": 0.9}
 
     def never(z):
         return np.full(len(z), np.nan)
 
-    for nothing in (
-        crude_monte_carlo(never, 2, **options),
-        importance_sampling(never, points, runnable=0.0, **options),
-    ):
+    options = {"runs": 9, "seed": 0, "confidence": 0.9}
+    around = importance_sampling(never, points, runnable=0.0, **options)
+    for nothing in (crude_monte_carlo(never, 2, **options), around):
         assert nothing.probability == nothing.high == 1
-        assert nothing.is_upper_bound
-        assert nothing.notes == (NO_RUN,)
+        assert nothing.is_upper_bound and nothing.notes == (limit_state.NO_RUN,)
 
 
-def test_intervals():
+def test_intervals_and_levels_that_end_above_the_limit_stagnate():
+    """Thresholds that converge, a last level that none is below, and too few levels."""
     reference = stats.binomtest(7, 200).proportion_ci(0.9, "exact")
-    assert binomial_interval(7, 200, 0.9) == pytest.approx((reference.low, reference.high))
-    assert binomial_interval(0, 50, 0.95)[0] == 0
-    assert binomial_interval(50, 50, 0.95)[1] == 1
-    low, high = log_normal_interval(1e-6, 0.2, 0.95)
+    expected = pytest.approx((reference.low, reference.high))
+    assert limit_state.binomial_interval(7, 200, 0.9) == expected
+    assert limit_state.binomial_interval(0, 50, 0.95)[0] == 0
+    assert limit_state.binomial_interval(50, 50, 0.95)[1] == 1
+    low, high = limit_state.log_normal_interval(1e-6, 0.2, 0.95)
     assert low * high == pytest.approx(1e-12)
     assert high / 1e-6 == pytest.approx(np.exp(1.959964 * np.sqrt(np.log(1.04))))
-    assert log_normal_interval(0.9, 2.0, 0.95)[1] == 1
+    assert limit_state.log_normal_interval(0.9, 2.0, 0.95)[1] == 1
     assert stats.binom.pmf(0, 300, upper_bound(300, 0.95)) == pytest.approx(0.05)
+
+    def levels(*thresholds, last=0.1):
+        shares = [0.1] * (len(thresholds) - 1) + [last]
+        return [
+            limit_state.Level(x, p, np.zeros(1), 0.1, 0.5)
+            for x, p in zip(thresholds, shares, strict=True)
+        ]
+
+    assert stagnate(levels(1.0, 0.5, 0.1001, 0.1000)) and stagnate(levels(1.0, 0.5, last=1.0))
+    assert not stagnate(levels(1.0, 0.8, 0.6, 0.4)) and not stagnate(levels(1.0, 0.0))
 
 
 @pytest.mark.release
@@ -300,22 +269,6 @@ def test_statistics_of_two_hundred_repetitions(name, method):
     assert abs(np.mean(ratios) - 1) < 4 * spread / np.sqrt(len(found))
     reported = np.mean([x.coefficient_of_variation for x in found])
     assert reported == pytest.approx(spread / np.mean(ratios), rel=0.25)
-    covered = np.mean([x.low <= case.probability <= x.high for x in found])
-    assert covered >= 0.89
+    assert np.mean([x.low <= case.probability <= x.high for x in found]) >= 0.89
     largest = 0.3 if case.probability > 5e-7 else 0.4
     assert method is by_importance or spread < largest
-
-
-def test_levels_that_end_above_the_limit_stagnate():
-    """Thresholds that converge, a last level that none is below, and a search with too few
-    levels.
-    """
-
-    def levels(*thresholds, last=0.1):
-        shares = [0.1] * (len(thresholds) - 1) + [last]
-        return [Level(x, p, np.zeros(1), 0.1, 0.5) for x, p in zip(thresholds, shares, strict=True)]
-
-    assert stagnate(levels(1.0, 0.5, 0.1001, 0.1000))
-    assert stagnate(levels(1.0, 0.5, last=1.0))
-    assert not stagnate(levels(1.0, 0.8, 0.6, 0.4))
-    assert not stagnate(levels(1.0, 0.0))

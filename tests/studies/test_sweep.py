@@ -1,7 +1,4 @@
-"""Sweeps: the labelled result, common random numbers, designs, refusals; stores: killed, torn,
-foreign, full, unwritable."""
-
-from __future__ import annotations
+"""Sweeps: results, common random numbers, designs, refusals; stores: killed, torn, foreign."""
 
 import contextlib
 import errno
@@ -11,11 +8,11 @@ import pickle
 import random
 import shutil
 import signal
-import subprocess
 import sys
 import time
 from pathlib import Path
 
+import loops_of_plants
 import numpy as np
 import pytest
 import study_cases as cases
@@ -51,63 +48,63 @@ def once(**more):
     return ij.sweep(SCENARIO, more.pop("grid", cases.GRID), **cases.options() | more)
 
 
-# ------------------------------------------------------------------------------------ the result
-
-
 @pytest.mark.slow
-def test_dataset_is_labelled(table):
-    assert dict(table.margin.sizes) == {
-        "controller.K2": 3,
-        "observer.kf": 2,
-        "run": 500,
-        "joint": 2,
-    }
+def test_a_table_is_labelled_and_its_points_are_the_studies_of_their_scenarios(table):
+    """Common random numbers: run r of every point draws what run r of a study does."""
+    expected = {"controller.K2": 3, "observer.kf": 2, "run": 500, "joint": 2}
+    assert dict(table.margin.sizes) == expected
     assert table["controller.K2"].attrs["units"] == "N m s/rad"
-    assert table.margin.attrs["units"] == "rad"
-    assert table["plant.mass[1]"].dims == ("run",)
+    assert table.margin.attrs["units"] == "rad" and table["plant.mass[1]"].dims == ("run",)
     assert table.status.attrs["flag_meanings"].startswith("bound_violated not_finite")
     config = json.loads(table.attrs["config"])
-    assert config["seed"] == 3
-    assert config["versions"]["iblf_jax"] == ij.__version__
+    assert config["seed"] == 3 and config["versions"]["iblf_jax"] == ij.__version__
     assert config["scenario"]["plant.mass"] == pytest.approx([2.0, 0.85])
-
-
-@pytest.mark.slow
-def test_points_are_the_studies_of_their_scenarios(table):
-    """Common random numbers: run r of every point draws what run r of a study does."""
     for K2, kf in ((10.0, 20.0), (40.0, 10.0)):
         there = ij.with_parameters(SCENARIO, {"controller.K2": K2, "observer.kf": kf})
         study = ij.monte_carlo(there, cases.perturbations(), runs=500, **cases.options())
         point = table.sel({"controller.K2": K2, "observer.kf": kf})
         np.testing.assert_allclose(point.margin, study.metrics.margin, atol=1e-6)
         np.testing.assert_array_equal(point.status, study.status)
-        np.testing.assert_allclose(
-            table["plant.mass[1]"], study.samples["plant.mass[1]"], rtol=1e-6
-        )
+        mass = study.samples["plant.mass[1]"]
+        np.testing.assert_allclose(table["plant.mass[1]"], mass, rtol=1e-6)
 
 
 @pytest.mark.slow
-def test_designs_and_vectors():
-    ways = {
-        "controller.K2": ij.uniform(10.0, 40.0),
-        "observer.kf": ij.factor(ij.log_uniform(0.5, 2.0), shared=True),
-    }
+def test_designs_vectors_and_empty_grids():
+    kf = ij.factor(ij.log_uniform(0.5, 2.0), shared=True)
+    ways = {"controller.K2": ij.uniform(10.0, 40.0), "observer.kf": kf}
     for design in ("random", "latin_hypercube"):
         found = once(grid=ways, design=ij.studies.Design(design, points=5))
         assert found.sizes == {"point": 5, "joint": 2}
         assert np.all((found["controller.K2"] > 10) & (found["controller.K2"] < 40))
         np.testing.assert_array_equal(found["observer.kf"][:, 0], found["observer.kf"][:, 1])
-
-
-@pytest.mark.slow
-def test_vectors_in_a_grid_and_a_point_that_cannot_work():
     found = once(grid={"controller.K2": [[10.0, 20.0], [30.0, 40.0]], "initial.q": [0.8, 2.0]})
     assert found["controller.K2_values"].values.tolist() == [[10, 20], [30, 40]]
     assert found.margin.sizes == {"controller.K2": 2, "initial.q": 2, "joint": 2}
     assert np.all(found.status.sel({"initial.q": 0.8}) == 0)
-    assert np.all(found.status.sel({"initial.q": 2.0}) & int(ij.Status.BOUND_VIOLATED)), (
-        "a flag, not an error"
-    )
+    violated = found.status.sel({"initial.q": 2.0}) & int(ij.Status.BOUND_VIOLATED)
+    assert np.all(violated), "a flag, not an error"
+    ways = {"controller.K2": ij.factor(ij.uniform(0.9, 1.1))}
+    data = once(grid={}, perturbations=ways, runs=2)
+    assert dict(data["margin"].sizes) == {"run": 2, "joint": 2} and data.attrs["cases"] == 2
+
+
+@pytest.mark.slow
+def test_executors_give_the_same_numbers_and_a_sweep_over_a_gain_of_a_level_is_stored(tmp_path):
+    brief = {"duration": 0.08, "dt": 1e-3}
+    scenario = loops_of_plants.flexible_joint()
+    draws = {"plant.stiffness": ij.factor(ij.uniform(0.8, 1.2))}
+    few = {"runs": 8, "progress": False} | brief
+    runs = [ij.monte_carlo(scenario, draws, backend=name, **few) for name in ("native", "vmap")]
+    for name in runs[0].metrics:
+        first, second = (np.asarray(run.metrics[name], float) for run in runs)
+        np.testing.assert_allclose(first, second, rtol=1e-7, atol=1e-9, err_msg=name)
+    options = {"store": str(tmp_path / "sweep.zarr"), "progress": False} | brief
+    grid = {"controller.k[2]": [20.0, 30.0]}
+    first = ij.sweep(loops_of_plants.user_class(), grid, **options)
+    again = ij.sweep(loops_of_plants.user_class(), grid, **options)
+    np.testing.assert_array_equal(first["rmse"], again["rmse"])
+    assert first.sizes["controller.k[2]"] == 2
 
 
 @pytest.mark.parametrize(
@@ -132,24 +129,12 @@ def test_bad_grids_are_refused(grid, more, message):
         ij.sweep(SCENARIO, grid, duration=0.01, **more)
 
 
-# ---------------------------------------------------------------------------------------- stores
-
-
-@pytest.mark.slow
-def test_store_opens_with_xarray_and_load(written, table):
-    xarray = pytest.importorskip("xarray")
-    flat = xarray.open_zarr(written, chunks=None)
-    assert flat.margin.dims == ("case", "joint")
-    assert ij.load_sweep(written).identical(table)
-
-
+LOADED = ij.with_parameters(SCENARIO, {"plant.payload": 1.0})
 OTHER_CALLS = {
     "seed: the store has 3, this call 4": {"seed": 4},
     "duration: the store has 0.02, this call 0.04": {"duration": 0.04},
     "unit: the store has 256, this call 512": {"unit": 512},
-    "scenario.plant.payload: the store has 0.0, this call 1.0": {
-        "scenario": ij.with_parameters(SCENARIO, {"plant.payload": 1.0})
-    },
+    "scenario.plant.payload: the store has 0.0, this call 1.0": {"scenario": LOADED},
     "structure.controller.*corrected": {"scenario": ij.presets.zhang_yan_2024(variant="corrected")},
     "backend": {"backend": "vmap"},
 }
@@ -157,7 +142,7 @@ OTHER_CALLS = {
 
 
 @pytest.mark.slow
-def test_another_call_is_refused(finished):
+def test_a_store_opens_with_xarray_and_load_and_another_call_is_refused(written, finished, table):
     before = cases.arrays(ij.load_sweep(finished))
     for message, change in OTHER_CALLS.items():
         with pytest.raises(ij.StoreError, match=message) as caught:
@@ -166,6 +151,9 @@ def test_another_call_is_refused(finished):
     assert cases.same(before, cases.arrays(ij.load_sweep(finished)))
     # What it ran on, not what was asked for.
     assert ij.load_sweep(finished).attrs["backend"] in ("native", "vmap")
+    flat = pytest.importorskip("xarray").open_zarr(written, chunks=None)
+    assert flat.margin.dims == ("case", "joint")
+    assert ij.load_sweep(written).identical(table)
 
 
 @pytest.mark.skipif(native.unavailable() is not None, reason="no C++ compiler")
@@ -173,10 +161,8 @@ def test_another_processor_is_named(finished, table, monkeypatch):
     if ij.load_sweep(finished).attrs["backend"] != "native":
         pytest.skip("the store is not tied to a processor")
     monkeypatch.setattr(toolchain, "processor", lambda: "model name : Another 9000\nflags : avx")
-    with pytest.raises(
-        ij.StoreError,
-        match=r"kernel.processor: the store has .*Another 9000.*machine of the same kind.*vmap",
-    ) as caught:
+    words = r"kernel.processor: the store has .*Another 9000.*machine of the same kind.*vmap"
+    with pytest.raises(ij.StoreError, match=words) as caught:
         cases.table(store=finished)
     assert "program" not in str(caught.value)
 
@@ -185,7 +171,8 @@ def chunks(path, name="margin"):
     return sorted(file for file in (path / name / "c").rglob("*") if file.is_file())
 
 
-def test_torn_missing_and_foreign_chunks_are_found_and_mended(finished, table, tmp_path):
+def test_torn_missing_and_foreign_chunks_are_found(finished, table, tmp_path):
+    """At last whole units copied from a store of another seed, marks included."""
     torn, missing, foreign = chunks(finished)[:3]
     torn.write_bytes(torn.read_bytes()[:-7])
     missing.unlink()
@@ -194,10 +181,6 @@ def test_torn_missing_and_foreign_chunks_are_found_and_mended(finished, table, t
         ij.load_sweep(finished)
     with pytest.warns(UserWarning, match="3 units are damaged"):
         assert cases.table(store=finished).identical(table)
-
-
-def test_chunks_of_another_store_do_not_fit(finished, tmp_path):
-    """Whole units copied from a store of another seed, marks included."""
     other = tmp_path / "other.zarr"
     cases.table(store=other, seed=4)
     for source in other.rglob("c/0*"):
@@ -210,7 +193,7 @@ def test_chunks_of_another_store_do_not_fit(finished, tmp_path):
         ij.load_sweep(finished)
 
 
-def test_what_is_no_store_is_refused(tmp_path):
+def test_what_is_no_store_or_cannot_be_written_is_refused(tmp_path, finished, monkeypatch):
     (tmp_path / "file").write_text("hello")
     (tmp_path / "folder").mkdir()
     (tmp_path / "folder" / "notes.txt").write_text("mine")
@@ -223,6 +206,20 @@ def test_what_is_no_store_is_refused(tmp_path):
     assert (tmp_path / "folder" / "notes.txt").read_text() == "mine"
     with pytest.raises(ij.StoreError, match="no store here"):
         ij.load_sweep(tmp_path / "nothing")
+    with pytest.raises(ij.StoreError, match="cannot be written"):
+        cases.table(store=tmp_path / "file" / "sweep.zarr")
+    if os.getuid() == 0:
+        plain = os.access
+        monkeypatch.setattr(
+            store.os, "access", lambda path, mode: Path(path) != finished and plain(path, mode)
+        )
+    else:
+        finished.chmod(0o500)
+    with pytest.raises(ij.StoreError, match=r"cannot be written \(Permission denied\)"):
+        cases.table(store=finished)
+    monkeypatch.setitem(sys.modules, "zarr", None)
+    with pytest.raises(ij.StoreError, match=r"\.\[sweep\]"):
+        cases.table(store=tmp_path / "sweep.zarr")
 
 
 class Payload:
@@ -244,29 +241,24 @@ def crafted(path, marker, kind):
     array |= {"dtype": "|O", "fill_value": ""}
     array |= {"filters": [{"id": "vlen-utf8"}, {"id": "pickle"}]}
     group = {"zarr_format": 3, "node_type": "group", "attributes": attributes}
-    inline = {
-        "kind": "inline",
-        "must_understand": False,
-        "metadata": {"margin": array, "done": done},
-    }
-    for folder, each in (("margin", array), ("done", done)):
+    arrays = {"margin": array, "done": done}
+    inline = {"kind": "inline", "must_understand": False, "metadata": arrays}
+    for folder, each in arrays.items():
         (path / folder).mkdir(parents=True)
         (path / folder / ".zarray").write_text(json.dumps(each))
     if kind == "format 2":
         (path / ".zgroup").write_text('{"zarr_format": 2}')
         (path / ".zattrs").write_text(json.dumps(attributes))
     else:
-        (path / "zarr.json").write_text(
-            json.dumps(
-                group | ({"consolidated_metadata": inline} if kind == "hidden in format 3" else {})
-            )
-        )
+        hidden = {"consolidated_metadata": inline} if kind == "hidden in format 3" else {}
+        (path / "zarr.json").write_text(json.dumps(group | hidden))
     (path / "margin" / "0").write_bytes(pickle.dumps(Payload(marker)))
 
 
-@pytest.mark.parametrize(
-    "kind", ["format 2", "hidden in format 3", "format 2 in a group of format 3"]
-)
+KINDS = ("format 2", "hidden in format 3", "format 2 in a group of format 3")
+
+
+@pytest.mark.parametrize("kind", KINDS)
 def test_a_store_that_would_run_code_is_not_opened(tmp_path, monkeypatch, kind):
     """Issue 12: metadata of zarr's older format may name the codec `pickle`, which numcodecs before
     0.16.6 obeys, later where told."""
@@ -276,17 +268,15 @@ def test_a_store_that_would_run_code_is_not_opened(tmp_path, monkeypatch, kind):
     monkeypatch.setattr(numcodecs.pickles, "ALLOW_UNSAFE_PICKLE_DECODE", True, raising=False)
     path, marker = tmp_path / "sweep.zarr", tmp_path / "marker"
     crafted(path, marker, kind)
-    with zarr.config.set(
-        {"array.allow_unsafe_pickle_decode": True}
-    ):  # asked for by zarr too, since 3.4
+    # Since 3.4 zarr has to be asked too.
+    with zarr.config.set({"array.allow_unsafe_pickle_decode": True}):
         for read in (ij.load_sweep, lambda place: cases.table(store=place)):
-            with pytest.raises(
-                ij.StoreError, match=r"sweep.zarr.*(not a store|is damaged)"
-            ) as caught:
+            words = r"sweep.zarr.*(not a store|is damaged)"
+            with pytest.raises(ij.StoreError, match=words) as caught:
                 read(path)
             assert "\n" not in str(caught.value)
         assert not marker.exists()
-        if kind != "format 2 in a group of format 3":
+        if kind != KINDS[2]:
             with contextlib.suppress(Exception):  # what comes out is no array
                 zarr.open_group(str(path), mode="r")["margin"][:]
             assert marker.exists(), "this store is no danger, so the test shows nothing"
@@ -309,78 +299,41 @@ def test_a_store_that_would_run_code_is_not_opened(tmp_path, monkeypatch, kind):
     ],
 )
 def test_a_description_that_is_wrong_is_refused(finished, change):
-    group, margin = (
-        json.loads((finished / name / "zarr.json").read_text()) for name in ("", "margin")
-    )
+    files = [finished / name / "zarr.json" for name in ("", "margin")]
+    group, margin = (json.loads(file.read_text()) for file in files)
     change(group["attributes"], margin)
-    (finished / "zarr.json").write_text(json.dumps(group))
-    (finished / "margin" / "zarr.json").write_text(json.dumps(margin))
+    for file, content in zip(files, (group, margin), strict=True):
+        file.write_text(json.dumps(content))
     with pytest.raises(ij.StoreError, match=r"sweep.zarr: .*damaged") as caught:
         ij.load_sweep(finished)
-    assert "\n" not in str(caught.value)
-    assert len(str(caught.value)) < 600 + len(str(finished))
+    assert "\n" not in str(caught.value) and len(str(caught.value)) < 600 + len(str(finished))
 
 
-@pytest.mark.slow
-def test_an_empty_grid_is_one_point():
-    ways = {"controller.K2": ij.factor(ij.uniform(0.9, 1.1))}
-    data = ij.sweep(ij.presets.zhang_yan_2024(), {}, perturbations=ways, runs=2, **cases.options())
-    assert dict(data["margin"].sizes) == {"run": 2, "joint": 2}
-    assert data.attrs["cases"] == 2
-
-
-def test_unwritable_paths_are_refused(tmp_path, finished, monkeypatch):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(ij.StoreError, match="cannot be written"):
-        cases.table(store=tmp_path / "file" / "sweep.zarr")
-    if os.getuid() == 0:
-        plain = os.access
-        monkeypatch.setattr(
-            store.os, "access", lambda path, mode: Path(path) != finished and plain(path, mode)
-        )
-    else:
-        finished.chmod(0o500)
-    with pytest.raises(ij.StoreError, match=r"cannot be written \(Permission denied\)"):
-        cases.table(store=finished)
-
-
-def test_without_zarr_the_extra_is_named(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "zarr", None)
-    with pytest.raises(ij.StoreError, match=r"\.\[sweep\]"):
-        cases.table(store=tmp_path / "sweep.zarr")
-
-
-def test_a_disk_that_is_full_from_the_start_keeps_no_half_of_a_store(tmp_path, monkeypatch):
-    import zarr
-
-    def full(*words, **options):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(zarr, "consolidate_metadata", full)
-    with pytest.raises(store.StoreWriteError, match="no space left"):
-        cases.table(store=tmp_path / "sweep.zarr")
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_disk_full_keeps_what_was_written(tmp_path, table, monkeypatch):
+def test_a_full_disk_keeps_what_was_written(tmp_path, table, monkeypatch):
     import zarr
 
     path, plain, count = tmp_path / "sweep.zarr", zarr.Array.__setitem__, []
 
-    def full(self, *words):
+    def full(*words, **options):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    def full_soon(self, *words):
         count.append(1)
-        if len(count) > 40:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        return plain(self, *words)
+        return (full if len(count) > 40 else plain)(self, *words)
 
     with monkeypatch.context() as patch:
-        patch.setattr(zarr.Array, "__setitem__", full)
+        patch.setattr(zarr.Array, "__setitem__", full_soon)
         with pytest.raises(ij.StoreError, match=r"no space left.*units are written and valid"):
             cases.table(store=path)
     part = ij.load_sweep(path)
     assert 0 < part.attrs["computed_cases"] < part.attrs["cases"]
     assert np.array_equal(np.isnan(part.margin[..., 0]), part.status == -1)
     assert cases.table(store=path).identical(table)
+    shutil.rmtree(path)
+    monkeypatch.setattr(zarr, "consolidate_metadata", full)
+    with pytest.raises(store.StoreWriteError, match="no space left"):
+        cases.table(store=path)
+    assert list(tmp_path.iterdir()) == []
 
 
 def cut_in(monkeypatch, count, deed):
@@ -401,15 +354,12 @@ def cut_in(monkeypatch, count, deed):
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 25])
 def test_a_store_that_is_deleted_meanwhile_is_begun_anew(tmp_path, table, monkeypatch, count):
-    """Noticed at the unit at hand; nothing of it stays that would be in the way of the same
-    call."""
+    """Noticed at the unit at hand; nothing stays that would be in the way of the same call."""
     path = tmp_path / "sweep.zarr"
     with monkeypatch.context() as patch:
         cut_in(patch, count, lambda: shutil.rmtree(path))
-        with pytest.raises(
-            store.StoreWriteError,
-            match=r"was deleted while it was in use\. Start the same call again",
-        ):
+        words = r"was deleted while it was in use\. Start the same call again"
+        with pytest.raises(store.StoreWriteError, match=words):
             cases.table(store=path)
     assert list(tmp_path.iterdir()) == []
     assert cases.table(store=path).identical(table)
@@ -428,12 +378,12 @@ def test_a_store_that_is_deleted_at_the_very_end_is_noticed(tmp_path, monkeypatc
         cases.table(store=path)
 
 
-@pytest.mark.parametrize("what", ["an array", "another store"])
-def test_a_store_that_is_changed_meanwhile_is_not_written_on(tmp_path, finished, monkeypatch, what):
+@pytest.mark.parametrize("words", ["lost arrays", "was replaced"])
+def test_a_store_that_is_changed_is_not_written_on(tmp_path, finished, monkeypatch, words):
     path = tmp_path / "new" / "sweep.zarr"
 
     def deed():
-        if what == "an array":
+        if words == "lost arrays":
             shutil.rmtree(path / "margin")
         else:
             shutil.rmtree(path)
@@ -443,48 +393,41 @@ def test_a_store_that_is_changed_meanwhile_is_not_written_on(tmp_path, finished,
             (path / "zarr.json").write_text(json.dumps(settings))
 
     cut_in(monkeypatch, 9, deed)
-    with pytest.raises(
-        store.StoreWriteError, match="lost arrays" if what == "an array" else "was replaced"
-    ):
+    with pytest.raises(store.StoreWriteError, match=words):
         cases.table(store=path)
+
+
+KILLED_CREATION = """
+import os, signal, sys; from pathlib import Path; from iblf_jax.studies import store
+os.rename = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
+variables = {"x": store.Variable((2,), "float64", ("joint",), "rad")}
+store.open_store(Path(sys.argv[1]), {}, variables, 4, 2)
+"""
 
 
 @pytest.mark.slow
 def test_the_draft_of_a_killed_creation_is_removed_by_the_next(tmp_path, table):
-    """At once, not after an hour; the store's name may hold what a pattern would mean something
-    else by."""
+    """At once, not after an hour; the store's name may hold the signs of a pattern."""
     path = tmp_path / "sweep[1].zarr"
-    code = (
-        "import os, signal, sys; from pathlib import Path; from iblf_jax.studies import"
-        " store\nos.rename = lambda *_: os.kill(os.getpid(),"
-        " signal.SIGKILL)\nstore.open_store(Path(sys.argv[1]), {}, {'x': store.Variable((2,),"
-        " 'float64', ('joint',), 'rad')}, 4, 2)"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code, str(path)],
-        env=cases.environment(tmp_path / "compiled"),
-        timeout=300,
-    )
-    assert done.returncode == -signal.SIGKILL
+    process = cases.start_python(tmp_path / "compiled", "-c", KILLED_CREATION, str(path))
+    process.communicate(timeout=300)
+    assert process.returncode == -signal.SIGKILL
     (left,) = tmp_path.iterdir()
-    assert left.name.endswith(".partial")
-    assert (left / "store" / "x").is_dir()
-    assert cases.table(store=path).identical(table)
-    assert list(tmp_path.iterdir()) == [path]
+    assert left.name.endswith(".partial") and (left / "store" / "x").is_dir()
+    assert cases.table(store=path).identical(table) and list(tmp_path.iterdir()) == [path]
 
 
-# --------------------------------------------------------------------------- killed, interrupted
-
-
-def killed_until_done(path, compiled, table, kills, seed):
-    """Kills the sweep at random moments, then lets it finish."""
-    rng, out, errors = random.Random(seed), path.parent / "out.npz", path.parent / "errors.txt"
+@pytest.mark.slow
+@pytest.mark.parametrize("kills", [4, pytest.param(20, marks=pytest.mark.release)])
+def test_many_kills(tmp_path, compiled, table, kills):
+    """At random moments; then the sweep may finish."""
+    rng, path = random.Random(kills), tmp_path / "sweep.zarr"
+    out, errors = tmp_path / "out.npz", tmp_path / "errors.txt"
     with cases.Forks(compiled, errors) as forks:
         for count in range(kills):
             process = forks.start(str(out), "--store", str(path), "--slow", "0.15")
-            first = (
-                forks.line() if count % 2 else ""
-            )  # every second time, not before a unit is written
+            # Every second time, not before a unit is written.
+            first = forks.line() if count % 2 else ""
             assert not first.startswith("ended"), errors.read_text()
             time.sleep(rng.uniform(0.0, 1.0 if first else 4.0))
             with contextlib.suppress(ProcessLookupError):
@@ -500,44 +443,32 @@ def killed_until_done(path, compiled, table, kills, seed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kills", [4, pytest.param(20, marks=pytest.mark.release)])
-def test_many_kills(tmp_path, compiled, table, kills):
-    killed_until_done(tmp_path / "sweep.zarr", compiled, table, kills, seed=kills)
-
-
-@pytest.mark.slow
 def test_killed_after_a_unit_only_the_rest_is_computed(tmp_path, compiled, table):
-    path = tmp_path / "sweep.zarr"
-    process = cases.start(
-        compiled, str(tmp_path / "x.npz"), "--store", str(path), "--die-after", "5"
-    )
+    path, out = tmp_path / "sweep.zarr", tmp_path / "x.npz"
+    process = cases.start(compiled, str(out), "--store", str(path), "--die-after", "5")
     process.communicate(timeout=300)
     assert process.returncode == -signal.SIGKILL
     assert ij.load_sweep(path).attrs["computed_cases"] == 5 * cases.UNIT
-    computed = []
-    plain = store.Store.write
+    computed, plain = [], store.Store.write
+
+    def write(self, unit, data):
+        computed.append(unit)
+        plain(self, unit, data)
+
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            store.Store,
-            "write",
-            lambda self, unit, data: (computed.append(unit), plain(self, unit, data)),
-        )
+        patch.setattr(store.Store, "write", write)
         assert cases.table(store=path).identical(table)
     assert computed == list(range(5, 12))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("number", "word"), [(signal.SIGINT, "Ctrl-C"), (signal.SIGTERM, "SIGTERM")]
-)
-def test_a_signal_stops_after_the_unit_and_says_how_to_go_on(
-    tmp_path, table, monkeypatch, capsys, number, word
-):
+@pytest.mark.parametrize("word", ["Ctrl-C", "SIGTERM"])
+def test_a_signal_stops_after_the_unit(tmp_path, table, monkeypatch, capsys, word):
     path, plain = tmp_path / "sweep.zarr", store.Store.write
 
     def write(self, unit, data):
         if unit == 2:
-            os.kill(os.getpid(), number)
+            os.kill(os.getpid(), signal.SIGINT if word == "Ctrl-C" else signal.SIGTERM)
         plain(self, unit, data)
 
     monkeypatch.setattr(store.Store, "write", write)
@@ -550,15 +481,12 @@ def test_a_signal_stops_after_the_unit_and_says_how_to_go_on(
     assert cases.table(store=path).identical(table)
 
 
-def handlers() -> list:
-    return [signal.getsignal(number) for number in interrupt.STOP_SIGNALS]
-
-
 @pytest.mark.parametrize("event", range(40))
 def test_handlers_are_given_back_wherever_a_second_signal_comes(event, monkeypatch):
     """Ctrl-C twice at any line of __enter__ and __exit__, which then do not come to their end."""
     monkeypatch.setattr(sys, "stderr", None)
-    before, files, seen = handlers(), interrupt.StopRequest.__enter__.__code__.co_filename, 0
+    before = {number: signal.getsignal(number) for number in interrupt.STOP_SIGNALS}
+    files, seen = interrupt.StopRequest.__enter__.__code__.co_filename, 0
 
     def trace(frame, what, value):
         nonlocal seen
@@ -576,8 +504,8 @@ def test_handlers_are_given_back_wherever_a_second_signal_comes(event, monkeypat
     try:
         with contextlib.suppress(KeyboardInterrupt), interrupt.StopRequest():
             pass
-        assert handlers() == before
+        assert {number: signal.getsignal(number) for number in before} == before
     finally:
         sys.settrace(old)
-        for number, handler in zip(interrupt.STOP_SIGNALS, before, strict=True):
+        for number, handler in before.items():
             signal.signal(number, handler)

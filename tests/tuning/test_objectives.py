@@ -1,15 +1,13 @@
 """Objectives made of any metric, and the checker for objectives and for quantities of one's own."""
 
-from __future__ import annotations
-
 import dataclasses
-from pathlib import Path
 from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import ROOT
 
 import iblf_jax as ij
 from iblf_jax.engine.metric_folds import folded
@@ -41,14 +39,10 @@ class Swing:
 def test_a_result_of_a_metric_is_weighted_and_summed(rng):
     """On the samples of a run, against the metrics themselves."""
     run = samples(rng)
-    tracking, swing, torque = (
-        folded((fold,), run) for fold in (ij.metrics.Tracking(), Swing(), ij.metrics.Torque())
-    )
-    parts = (
-        MetricResult(ij.metrics.Tracking(), "iae"),
-        MetricResult(Swing(), "swing", [2.0, 0.5]),
-        MetricResult(ij.metrics.Torque(), "effort"),
-    )
+    folds = (ij.metrics.Tracking(), Swing(), ij.metrics.Torque())
+    tracking, swing, torque = (folded((fold,), run) for fold in folds)
+    results = (("iae",), ("swing", [2.0, 0.5]), ("effort",))
+    parts = tuple(MetricResult(fold, *x) for fold, x in zip(folds, results, strict=True))
     found = folded((Quantities(parts),), run)
     expected = [tracking["iae"].sum(), swing["swing"] @ np.array([2.0, 0.5]), torque["effort"]]
     np.testing.assert_allclose(found["tuning_exact"], expected, rtol=1e-12)
@@ -59,7 +53,6 @@ FILE = 'preset = "zhang_yan_2024"\n[tune]\nparameters = ["controller.k1"]\n[[obj
 
 
 def loaded(tmp_path, words, kind="metric"):
-    """The objective of a tuning file that ends with these words."""
     (tmp_path / "tune.toml").write_text(f'{FILE}kind = "{kind}"\n{words}')
     return load_tuning_file(tmp_path / "tune.toml")["objective"]
 
@@ -70,6 +63,10 @@ OF_SETTLING = 'name = "overshoot"\nfold = { kind = "settling", tolerance = 0.02 
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
+        ('name = "iaee"', r"objective\[0\].name: got 'iaee'.*Did you mean iae"),
+        ('fold = "tracking"', r"objective\[0\].name: got nothing, expected the name of one of its"),
+        ('fold = "traking"\nname = "iae"', r"objective\[0\].fold.kind.*Did you mean tracking"),
+        ('fold = "margin"\nname = "iae"', "got 'iae', expected one of 'margin'"),
         ('name = "iae"', ij.objectives.metric(ij.metrics.Tracking(), "iae")),
         (
             'name = "effort_above_gravity"\nweight = 2.0',
@@ -84,23 +81,13 @@ OF_SETTLING = 'name = "overshoot"\nfold = { kind = "settling", tolerance = 0.02 
     ],
 )
 def test_a_tuning_file_names_any_metric(words, expected, tmp_path):
+    if isinstance(expected, str):
+        with pytest.raises(ValueError, match=expected):
+            loaded(tmp_path, words)
+        return
     found = loaded(tmp_path, words)
     assert jax.tree.structure(found) == jax.tree.structure(expected)
     jax.tree.map(np.testing.assert_array_equal, found, expected)
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ('name = "iaee"', r"objective\[0\].name: got 'iaee'.*Did you mean iae"),
-        ('fold = "tracking"', r"objective\[0\].name: got nothing, expected the name of one of its"),
-        ('fold = "traking"\nname = "iae"', r"objective\[0\].fold.kind.*Did you mean tracking"),
-        ('fold = "margin"\nname = "iae"', "got 'iae', expected one of 'margin'"),
-    ],
-)
-def test_a_tuning_file_with_a_wrong_metric_is_refused(words, message, tmp_path):
-    with pytest.raises(ValueError, match=message):
-        loaded(tmp_path, words)
 
 
 @pytest.mark.slow
@@ -108,8 +95,7 @@ def test_a_metric_is_tuned_for_and_is_none_of_a_file(paper, tmp_path):
     goal, effort = ij.objectives.metric(Swing(), "swing"), ij.tuning.Effort(iterations=3)
     best = ij.tune(paper, ["controller.k1"], goal, effort=effort, **TUNING)
     # The objective of the scenario's own gains is 1.
-    assert best.objective < 0.5
-    assert "swing" in str(best.report)
+    assert best.objective < 0.5 and "swing" in str(best.report)
     with pytest.raises(ValueError, match="Swing"):
         best.save(tmp_path / "mine")
 
@@ -123,12 +109,15 @@ def rejects(objective, *words, **options):
 
 
 @pytest.mark.slow
-def test_the_packages_own_objectives_pass():
+def test_objectives_and_a_quantity_of_ones_own_pass_and_a_term_without_a_scale_does_not(paper):
     o = ij.objectives
     goal = o.tracking() + 0.5 * o.effort() + o.torque_rate() + o.settle() + o.peak_torque()
     goal += o.margin() + o.metric(Swing(), "swing") + o.violation_probability_below(0.1)
     goal += o.error_below(0.05, after=1.0) + o.peak_torque_below(30.0) + o.margin_above(0.01)
     ij.testing.check_objective(goal)
+    ij.testing.check_objective(ij.component(Square)(), duration=0.5)
+    words = ("its value at the start", "scale of its own")
+    rejects(o.tracking(after=1.0), *words, scenario=paper, duration=0.5)
 
 
 class Square:
@@ -148,15 +137,6 @@ class Square:
 
     def hessian(self, products, pieces, slopes):
         return products
-
-
-def changed(**methods):
-    return ij.component(type("Mine", (Square,), {"__annotations__": {}, **methods}))()
-
-
-@pytest.mark.slow
-def test_a_quantity_of_ones_own_passes():
-    ij.testing.check_objective(ij.component(Square)(), duration=0.5)
 
 
 BROKEN = {
@@ -182,32 +162,16 @@ BROKEN = {
 @pytest.mark.parametrize("name", BROKEN)
 def test_broken_quantities(name):
     method, function, words = BROKEN[name]
-    rejects(changed(**{method: function}), words, duration=0.5)
+    mine = type("Mine", (Square,), {"__annotations__": {}, method: function})
+    rejects(ij.component(mine)(), words, duration=0.5)
 
 
-def test_what_is_no_objective_at_all():
+def test_what_cannot_be_tuned_for_is_rejected():
     rejects(3.0, "JAX does not know its class")
     rejects(ij.metrics.Tracking(), "finish(acc) gives dict")
     rejects(ij.tuning.objectives.Objective(), "neither terms nor requirements")
-
-
-def test_a_metric_that_cannot_be_tuned_for():
-    whole_number = ij.objectives.metric(Swing(), "samples")
-    rejects(whole_number, "finish(acc)", "a result that can be differentiated")
-
-
-@pytest.mark.slow
-def test_a_term_without_a_scale_that_is_zero_at_the_start(paper):
-    rejects(
-        ij.objectives.tracking(after=1.0),
-        "its value at the start",
-        "scale of its own",
-        scenario=paper,
-        duration=0.5,
-    )
-
-
-# --------------------------------------------------------- which joints, weights, limits of each
+    words = ("finish(acc)", "a result that can be differentiated")
+    rejects(ij.objectives.metric(Swing(), "samples"), *words)
 
 
 def exact(objective, run):
@@ -228,24 +192,13 @@ def three_joints():
     return samples(np.random.default_rng(11), 3, 0.01)
 
 
-SELECTIONS = [
-    ((2, 0), [0, 2]),
-    (np.array([0, 2]), [0, 2]),
-    (1, [1]),
-    (-1, [2]),
-    (slice(1, None), [1, 2]),
-    ("0:3:2", [0, 2]),
-    (["joint 1", 2], [1, 2]),
-    ([True, False, True], [0, 2]),
-    (np.array([False, True, False]), [1]),
-    (range(2), [0, 1]),
-    (None, [0, 1, 2]),
-]
+SELECTIONS = [((2, 0), [0, 2]), (np.array([0, 2]), [0, 2]), (1, [1]), (-1, [2]), (range(2), [0, 1])]
+SELECTIONS += [(slice(1, None), [1, 2]), ("0:3:2", [0, 2]), (["joint 1", 2], [1, 2])]
+SELECTIONS += [([True, False, True], [0, 2]), (np.array([False, True, False]), [1])]
+SELECTIONS += [(None, [0, 1, 2])]
 
 
-@pytest.mark.parametrize(
-    ("joints", "expected"), SELECTIONS, ids=[str(joints) for joints, _ in SELECTIONS]
-)
+@pytest.mark.parametrize(("joints", "expected"), SELECTIONS, ids=str)
 def test_joints_selects_joints_everywhere(joints, expected, three_joints):
     """Whole numbers are indices, never weights; against NumPy on the samples."""
     o, run = ij.objectives, three_joints
@@ -266,8 +219,7 @@ def test_joints_selects_joints_everywhere(joints, expected, three_joints):
 
 @pytest.mark.slow
 def test_limits_of_single_joints_and_weights(three_joints):
-    """A requirement with a limit for each joint is broken by the joint that is nearest to its own,
-    or beyond."""
+    """A limit for each joint is broken by the joint that is nearest to its own, or beyond."""
     o, run = ij.objectives, three_joints
     peak, error = (np.abs(np.asarray(x)).max(axis=0) for x in (run.tau, run.e1))
     cases = np.array([[1.1, 1.2, 1.3], [1.1, 0.9, 1.3], [0.5, 2.0, 2.0]])
@@ -282,8 +234,7 @@ def test_limits_of_single_joints_and_weights(three_joints):
     np.testing.assert_allclose(excesses(some, run), expected, rtol=1e-9)
     # Margins, of positions that are inside their bounds.
     q = run.x[:, :1]
-    upper = q + jnp.array([0.1, 0.3, 0.4])
-    kept = dataclasses.replace(run, level_lower=q - 0.2, level_upper=upper)
+    kept = dataclasses.replace(run, level_lower=q - 0.2, level_upper=q + jnp.array([0.1, 0.3, 0.4]))
     margins = [o.margin_above([0.05, 0.1, 0.1]), o.margin_above([0.05, 0.25, 0.1])]
     margins += [o.margin_above([0.125, 0.1], joints=[0, 2])]
     np.testing.assert_allclose(excesses(margins, kept), [1 - 2.0, 1 - 0.8, 1 - 0.8], rtol=1e-9)
@@ -298,10 +249,7 @@ def test_limits_of_single_joints_and_weights(three_joints):
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (
-            lambda o: o.peak_torque_below(-5.0),
-            r"peak_torque_below: limit: got -5.*> 0.*peak_torque_below\(limit=140.0\)",
-        ),
+        (lambda o: o.peak_torque_below(-5.0), r"below: limit: got -5.*> 0.*_below\(limit=140.0\)"),
         (lambda o: o.peak_torque_below("much"), r"peak_torque_below: limit: got 'much'"),
         (lambda o: o.velocity_margin_above(np.nan), "velocity_margin_above: limit"),
         (lambda o: o.margin(-0.1), "margin: target"),
@@ -344,26 +292,21 @@ def test_joints_that_the_robot_does_not_have(goal, message, paper):
 
 
 def test_a_tuning_file_selects_joints_by_name_index_and_slice(tmp_path):
+    """A file of the version before `weights` means what it meant."""
+
     def quantity(words):
         return loaded(tmp_path, words, kind="tracking").quantities[-1]
 
     assert quantity("joints = [1]").joints == (1,)
     assert quantity('joints = ["joint 0"]').joints == ("joint 0",)
     assert quantity('joints = "1:"').joints == ("1:",)
-    limits = quantity(
-        'weights = [1.0, 0.5]\n[[requirement]]\nkind = "peak_torque_below"\nlimit = [14.0, 2.0]'
-    )
+    torque = '[[requirement]]\nkind = "peak_torque_below"\nlimit = [14.0, 2.0]'
+    limits = quantity(f"weights = [1.0, 0.5]\n{torque}")
     np.testing.assert_allclose(1 / limits.weights, [14.0, 2.0])
     assert quantity("joints = [0, 1]").joints == (0, 1)
     with pytest.raises(ValueError, match=r"objective\[\d\].*joints.*weights="):
         quantity("joints = [1.0, 0.5]")
-
-
-def test_a_result_that_was_saved_with_weights_as_joints_means_what_it_meant():
-    """A file of the version before `weights`: tracking, peak_torque, a metric, and two
-    requirements."""
-    file = Path(__file__).parents[1] / "data" / "tuning_before_weights.json"
-    found = ij.load(file).setup.objective
+    found = ij.load(ROOT / "tests" / "data" / "tuning_before_weights.json").setup.objective
     weights = [np.asarray(quantity.weights).tolist() for quantity in found.quantities]
     assert weights == [[1.0, 0.25], [1.0, 3.0], [0.0, 2.0], [0.0, 1.0], 1.0]
     assert all(quantity.joints is None for quantity in found.quantities)

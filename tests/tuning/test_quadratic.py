@@ -1,7 +1,5 @@
 """Small quadratic programmes: their solutions where rounding ends the method early."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -36,10 +34,8 @@ def drawn_set(seed: int) -> tuple[Constraints, list[Subproblem]]:
     largest_only = bool(rng.integers(0, 2)) and requirements > 0
     drawn = []
     for _ in range(int(rng.integers(1, 7))):
-        normal = rng.normal(size=(size, size))
-        curvatures = 10.0 ** rng.uniform(-6, 2, size)
-        axes = np.linalg.qr(normal)[0]
-        matrix = axes * curvatures @ axes.T
+        axes = np.linalg.qr(rng.normal(size=(size, size)))[0]
+        matrix = axes * 10.0 ** rng.uniform(-6, 2, size) @ axes.T
         radius = 10.0 ** rng.uniform(-3, 0.5)
         low = -radius * rng.choice([1, 1, 1, 0], size)
         high = radius * rng.choice([1, 1, 1, 0], size)
@@ -53,7 +49,6 @@ def drawn_set(seed: int) -> tuple[Constraints, list[Subproblem]]:
 
 
 def programmes_of(seed: int, monkeypatch: pytest.MonkeyPatch) -> Programmes:
-    """The programmes of a drawn set."""
     formed = []
     solve = quadratic.solve
 
@@ -69,8 +64,12 @@ def programmes_of(seed: int, monkeypatch: pytest.MonkeyPatch) -> Programmes:
 
 @pytest.mark.parametrize("seed", [*range(4), *FORMERLY_UNSOLVED])
 def test_every_programme_is_solved(seed, monkeypatch):
+    """With multipliers >= 0, and with zeros for unknowns that only other programmes have."""
     programmes = programmes_of(seed, monkeypatch)
-    assert np.all(residuals(programmes, quadratic.solve(programmes)) < 1e-6)
+    found = quadratic.solve(programmes)
+    assert np.all(residuals(programmes, found) < 1e-6) and np.all(found.y >= 0)
+    has_entries = np.any(programmes.H, axis=1) | np.any(programmes.A, axis=1) | (programmes.c != 0)
+    assert np.all(found.x[~has_entries] == 0.0)
 
 
 def test_the_best_iterate_is_returned_where_a_factorisation_fails(monkeypatch):

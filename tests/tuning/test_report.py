@@ -1,7 +1,5 @@
 """The report on a tuning: its order, the check at half the step, and why fresh runs failed."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 
@@ -12,7 +10,7 @@ import iblf_jax as ij
 from iblf_jax import objectives
 from iblf_jax.cli.tune import _has_failed
 from iblf_jax.studies.statistics import probability
-from iblf_jax.tuning import confirmation
+from iblf_jax.tuning import confirmation, step_check
 from iblf_jax.tuning.confirmation import confirmation_of
 from iblf_jax.tuning.failures import FailedRuns, FreshRuns, Influence, failed_runs, most_influential
 from iblf_jax.tuning.objectives import complete
@@ -21,34 +19,32 @@ from iblf_jax.tuning.report import Change, TuningReport, Verdict
 from iblf_jax.tuning.result import TuneResult, TuneSetup
 from iblf_jax.tuning.robust import Risk
 from iblf_jax.tuning.samples import Sample, SampleRequest
-from iblf_jax.tuning.step_check import (
-    STEP_TOLERANCE,
-    RequirementAtSteps,
-    StepCheck,
-    check_step_size,
-    excess_at_half_step,
-    has_rate_of_held_torque,
-)
+from iblf_jax.tuning.step_check import RequirementAtSteps, StepCheck, has_rate_of_held_torque
 
 BRIEF = {"duration": 0.2, "dt": 2e-3, "method": "euler"}
-DRAWS = {
-    "plant.mass[1]": ij.factor(ij.uniform(0.5, 2.0)),
-    "initial.q": ij.offset(ij.uniform(-0.01, 0.01)),
-}
+DRAWS = {"plant.mass[1]": ij.factor(ij.uniform(0.5, 2.0))}
+DRAWS |= {"initial.q": ij.offset(ij.uniform(-0.01, 0.01))}
 
 
-def test_a_large_change_is_shown_as_a_factor_and_one_by_chance_as_not_significant():
+def test_changes_in_words_allowed_violations_and_numbers_that_go_through_json():
     assert str(Change("objective", 1.0, 1.5, None, None)).endswith("1 -> 1.5 (+50.0 %)")
     diverged = str(Change("objective", 1.08, 1.6251e24, None, None))
     assert diverged == "objective: 1.08 -> 1.6251e+24 (a factor of 1.5e+24)"
     by_chance = Change("objective", 1.0, 0.9, -0.3, 0.1)
     assert by_chance.significant is False and "NOT significant" in str(by_chance)
     report = dataclasses.replace(made_up_report(0, {}), changes=(by_chance,))
-    assert "do not show that tuning helped" in str(report)
-    assert not report.improved
-
-
-# ---------------------------------------------------------------- the most influential perturbation
+    assert "do not show that tuning helped" in str(report) and not report.improved
+    report = made_up_report(1, {"violation probability < 0.05": "pass"})
+    assert report.failed
+    allowed = dataclasses.replace(report.verdicts[0], event="violated")
+    assert not dataclasses.replace(report, verdicts=(allowed,)).failed
+    report = made_up_report(5, {"a": "fail"}, made_up_check(at_steps(-0.01, 0.02)))
+    numbers = json.loads(json.dumps(report.to_dict()))
+    assert numbers["step_check"]["requirements"][0]["excess"] == [-0.01, 0.02]
+    first, second = numbers["failures"]
+    assert first["requirement"] is None and second["requirement"] == "a"
+    assert first["influence"]["statistic"] == 0.97 and first["first"] == [3, 8]
+    assert numbers["headline"] == report.headline
 
 
 def drawn(names: str, runs: int = 400, seed: int = 0) -> dict[str, np.ndarray]:
@@ -93,16 +89,23 @@ def test_the_perturbation_that_decides_is_found_with_its_side(paper, failing, si
     assert f"rank statistic {influence.statistic:.3g}" in str(found)
 
 
-def test_a_weak_influence_is_called_unclear(paper):
+def test_a_weak_influence_is_called_unclear_and_numbers_of_one_draw_are_named_together(paper):
     rng = np.random.default_rng(1)
     numbers = drawn(NAMES, 2000)
     failed = rng.uniform(size=2000) < 0.2 + 0.3 * (numbers["plant.mass[0]"] - 0.5)
     found = explained(paper, numbers, failed)
     assert found.is_explained and 0.55 < found.influence.statistic < 0.75
     assert "no single perturbation separates them clearly; most influential" in str(found)
+    numbers = drawn("plant.mass[0] plant.length[0]", 100)
+    numbers["plant.mass[1]"] = 3.0 * numbers["plant.mass[0]"]
+    numbers["plant.length[1]"] = -numbers["plant.mass[0]"]
+    found = most_influential(numbers, numbers["plant.mass[1]"] > 4.0, paper)
+    assert found.path == "plant.mass[0]"
+    assert set(found.drawn_with) == {"plant.mass[1]", "plant.length[1]"}
+    assert "with the same draw: plant.mass[1], plant.length[1]" in str(found)
 
 
-def test_few_failures_name_no_cause(paper):
+def test_failures_without_a_cause_name_none(paper):
     numbers = drawn(NAMES, 1000)
     order = np.argsort(numbers["plant.mass[1]"])
     for count, words in ((1, f"run {order[-1]}"), (2, "runs ")):
@@ -116,32 +119,15 @@ def test_few_failures_name_no_cause(paper):
     three = explained(paper, numbers, failed)
     assert three.is_explained and three.influence.p_value < 1e-6
     assert three.first == tuple(sorted(order[-3:]))
-
-
-def test_no_runs_are_left_or_nothing_differs(paper):
     everything = np.ones(50, bool)
-    some = np.arange(50) < 5
     assert explained(paper, drawn(NAMES, 50), ~everything) is None
     assert "no run is left to compare" in str(explained(paper, drawn(NAMES, 50), everything))
     for numbers in ({}, {"plant.mass[0]": np.ones(50)}):
-        found = explained(paper, numbers, some)
+        found = explained(paper, numbers, np.arange(50) < 5)
         assert found.influence is None and not found.is_explained
         assert str(found).endswith("no perturbation differs between the runs")
-    found = explained(paper, {}, some, diverged=True, outside=True)
+    found = explained(paper, {}, np.arange(50) < 5, diverged=True, outside=True)
     assert "(5 of them started outside; 5 of them diverged)" in str(found)
-
-
-def test_numbers_of_one_draw_are_named_together(paper):
-    numbers = drawn("plant.mass[0] plant.length[0]", 100)
-    numbers["plant.mass[1]"] = 3.0 * numbers["plant.mass[0]"]
-    numbers["plant.length[1]"] = -numbers["plant.mass[0]"]
-    found = most_influential(numbers, numbers["plant.mass[1]"] > 4.0, paper)
-    assert found.path == "plant.mass[0]"
-    assert set(found.drawn_with) == {"plant.mass[1]", "plant.length[1]"}
-    assert "with the same draw: plant.mass[1], plant.length[1]" in str(found)
-
-
-# ------------------------------------------------------------------------------------ half the step
 
 
 def goal_of(limit: float, allowed: float = 0.25):
@@ -155,13 +141,12 @@ def test_the_step_check_covers_all_runs_of_a_tuning(paper):
     draws = {"perturbations": DRAWS, "runs": 8, "seed": 5}
     options = TuningRunOptions(**BRIEF, **draws, risk=Risk("worst")).checked()
     gains, goal = {"controller.K2": np.array([10.0, 15.0])}, goal_of(12.0)
-    check = check_step_size(paper, gains, goal, options, batch=16)
+    check = step_check.check_step_size(paper, gains, goal, options, batch=16)
     assert (check.runs, check.seed) == (8, 5)
     assert (check.violated, check.untrusted) == ((0, 0), (0, 0))
     tuned = ij.with_parameters(paper, gains)
     for i, dt in enumerate((2e-3, 1e-3)):
-        timing = BRIEF | {"dt": dt}
-        metrics = ij.monte_carlo(tuned, **draws, progress=False, **timing).metrics
+        metrics = ij.monte_carlo(tuned, **draws, progress=False, **BRIEF | {"dt": dt}).metrics
         peak, ise = (np.asarray(x) for x in (metrics.peak_torque, metrics.ise))
         assert check.peak_torque[i] == pytest.approx(peak.max(axis=0))
         assert check.margin[i] == pytest.approx(float(np.min(metrics.margin)))
@@ -173,10 +158,10 @@ def test_the_step_check_covers_all_runs_of_a_tuning(paper):
         assert torque.excess[i] == pytest.approx((worst - 12.0) / 12.0)
         assert margin.value[i] == pytest.approx(check.margin[i])
     assert check.objective[0] != check.objective[1]
-    half = excess_at_half_step(paper, gains, goal, options)
+    half = step_check.excess_at_half_step(paper, gains, goal, options)
     assert half == check.worst
     assert half.requirement == "peak torque < 12 N m" and half.violated == 0
-    assert half.is_broken == (half.excess > STEP_TOLERANCE)
+    assert half.is_broken == (half.excess > step_check.STEP_TOLERANCE)
 
 
 def at_steps(full: float, half: float, name: str = "peak torque < 10 N m") -> RequirementAtSteps:
@@ -185,19 +170,15 @@ def at_steps(full: float, half: float, name: str = "peak torque < 10 N m") -> Re
 
 
 def made_up_check(*requirements, violated=(0, 0), objective=(1.0, 1.0), seed=0) -> StepCheck:
-    torques = ((1.0, 2.0), (1.0, 2.1))
-    runs = 1 if seed is None else 64
-    return StepCheck(
-        runs, seed, 1e-3, objective, requirements, (0.1, 0.09), torques, violated, (0, 0)
-    )
+    given = (1 if seed is None else 64, seed, 1e-3, objective, requirements, (0.1, 0.09))
+    return StepCheck(*given, ((1.0, 2.0), (1.0, 2.1)), violated, (0, 0))
 
 
-def test_a_requirement_that_half_the_step_breaks_is_named_with_its_amount():
+def test_what_half_the_step_changes_is_named_with_its_amount():
     broken = at_steps(-0.01, 0.02)
     assert broken.is_broken == (False, True)
-    assert str(broken) == (
-        "peak torque < 10 N m: 9.9 N m, at dt / 2 10.2 N m: kept at dt, BROKEN at dt / 2 by 0.2 N m"
-    )
+    values = "peak torque < 10 N m: 9.9 N m, at dt / 2 10.2 N m"
+    assert str(broken) == f"{values}: kept at dt, BROKEN at dt / 2 by 0.2 N m"
     assert str(at_steps(0.03, 0.02)).endswith("BROKEN by 0.3 N m")
     assert str(at_steps(-0.1, -0.1)).endswith(": kept")
     margin = dataclasses.replace(at_steps(-0.1, -0.1, "p < 0.1"), event="violated", averaged=7)
@@ -211,59 +192,38 @@ def test_a_requirement_that_half_the_step_breaks_is_named_with_its_amount():
     assert made_up_check(at_steps(0.3, 0.3), broken).worst == (0.3, "peak torque < 10 N m", 0)
     assert made_up_check().worst == (-np.inf, "", 0)
     assert not made_up_check(at_steps(0.3, 0.3), seed=None).warnings_of_requirements()
-
-
-def test_an_objective_that_depends_on_the_step_is_warned_of():
     assert "WARNING" not in str(made_up_check(objective=(1.0, 1.009)))
     for half in (1.011, np.nan):
         assert "more than 1% apart: take a smaller dt" in str(made_up_check(objective=(1.0, half)))
     # It is not the remedy for the rate of a held torque.
     jumping = dataclasses.replace(made_up_check(objective=(1.0, 2.0)), torque_jumps=True)
-    assert "an actuator with a lag" in str(jumping)
-    assert "take a smaller dt" not in str(jumping)
+    assert "an actuator with a lag" in str(jumping) and "take a smaller dt" not in str(jumping)
 
 
 def test_a_held_torque_is_one_of_a_sampled_loop_without_a_lag(paper):
     sampled = ij.with_parts(paper, sampling=ij.Sampling(period=2e-3))
     rate = objectives.tracking() + objectives.torque_rate()
-    limited, slow = (
-        ij.with_parts(sampled, actuator=ij.actuators.Motor(**fields))
-        for fields in ({"limit": 50.0}, {"bandwidth": 200.0})
-    )
     assert has_rate_of_held_torque(sampled, rate)
-    assert has_rate_of_held_torque(limited, rate)
-    assert not has_rate_of_held_torque(slow, rate)
+    for fields, is_held in (({"limit": 50.0}, True), ({"bandwidth": 200.0}, False)):
+        driven = ij.with_parts(sampled, actuator=ij.actuators.Motor(**fields))
+        assert has_rate_of_held_torque(driven, rate) is is_held
     assert not has_rate_of_held_torque(sampled, objectives.tracking() + objectives.effort())
     assert not has_rate_of_held_torque(paper, rate)
 
 
-# ---------------------------------------------------------------------------------------- the order
-
-
-def made_up_report(
-    violated: int, verdicts: dict[str, str], check: StepCheck | None = None, seed: int | None = 1
-) -> TuningReport:
+def made_up_report(violated, verdicts, check=None, seed=1) -> TuningReport:
     def of(count):
         return probability(np.arange(100) < count, np.ones(100, bool), 0.95, "independent", 1)
 
     cause = Influence("plant.mass[1]", "kg", "larger", 0.97, 1e-6, 1.38, 1.02)
     events = [(None, violated), *((name, 7) for name, kind in verdicts.items() if kind == "fail")]
     changes = [Change(f"{x} (mean)", 1.0, 0.5, -0.6, -0.4) for x in ("objective", "tracking")]
+    judged = [Verdict(name, 0.1, of(0), of(0), kind) for name, kind in verdicts.items()]
     failed = [FailedRuns(name, x, 100, 0, 0, (3, 8), cause) for name, x in events if x]
-    return TuningReport(
-        runs=100,
-        seed=seed,
-        confidence=0.95,
-        changes=tuple(changes),
-        verdicts=tuple(Verdict(name, 0.1, of(0), of(0), kind) for name, kind in verdicts.items()),
-        violation=(of(0), of(violated)),
-        margin=(0.1, -0.1),
-        peak_torque=((1.0,), (2.0,)),
-        at_limits=("k1 is at an end",),
-        step_check=check,
-        notes=("stopped: converged",),
-        failures=tuple(failed),
-    )
+    parts = {"changes": tuple(changes), "verdicts": tuple(judged), "failures": tuple(failed)}
+    parts |= {"violation": (of(0), of(violated)), "margin": (0.1, -0.1), "step_check": check}
+    parts |= {"at_limits": ("k1 is at an end",), "notes": ("stopped: converged",)}
+    return TuningReport(runs=100, seed=seed, confidence=0.95, peak_torque=((1.0,), (2.0,)), **parts)
 
 
 MASS = "plant.mass[1], median 1.38 kg in them, 1.02 kg in the others (rank statistic 0.97)"
@@ -278,19 +238,10 @@ def test_violated_bounds_come_first_then_requirements_then_the_objective():
         f"5 of 100 runs left their bounds; most influential: {MASS}",
         "WARNING: of 64 runs of the tuning, leave their bounds or diverge: 0 at dt, 2 at dt / 2",
     ]
-    order = [
-        "smallest margin: 0.1",
-        "requirement b",
-        f"    most influential: {MASS}",
-        "requirement a",
-        "WARNING: the 64 runs of the tuning: c",
-        "objective (mean)",
-        "tracking (mean)",
-        "peak torque",
-        "k1 is at an end",
-        "WARNING: the 64 runs of the tuning at dt / 2: objective",
-        "stopped: converged",
-    ]
+    order = ["smallest margin: 0.1", "requirement b", f"    most influential: {MASS}"]
+    order += ["requirement a", "WARNING: the 64 runs of the tuning: c", "objective (mean)"]
+    order += ["tracking (mean)", "peak torque", "k1 is at an end"]
+    order += ["WARNING: the 64 runs of the tuning at dt / 2: objective", "stopped: converged"]
     places = [str(report).index(words) for words in order]
     assert places == sorted(places)
 
@@ -327,23 +278,19 @@ def test_bounds_and_requirements_decide_headline_and_exit_code(report, headline,
     assert report.failed is failed and _has_failed(report) is failed
 
 
-def test_the_title_is_the_verdict_with_what_failed_first():
+def test_the_title_is_the_verdict_with_what_failed_first_and_an_unstable_loop_is_in_the_headline():
     assert made_up_report(0, {}).title == "100 of 100 fresh runs keep the bounds"
     assert made_up_report(1, {}, seed=None).title == "the nominal run leaves its bounds"
     failed = made_up_report(5, {"a": "pass", "b": "fail"}).title
     assert failed == "1 of 2 requirements FAILED; 95 of 100 fresh runs keep the bounds"
     undecided = made_up_report(0, {"a": "undecided"})
     [verdict] = undecided.verdicts
-    assert undecided.title == (
-        f"100 of 100 fresh runs keep the bounds; {verdict.runs_needed} runs are needed to claim"
-        f" {100 * (1 - verdict.allowed):g} %"
-    )
+    claim = f"runs are needed to claim {100 * (1 - verdict.allowed):g} %"
+    kept = "100 of 100 fresh runs keep the bounds"
+    assert undecided.title == f"{kept}; {verdict.runs_needed} {claim}"
     assert f"but {verdict.runs_needed} such runs are needed" in str(verdict)
     check = made_up_check(violated=(0, 1))
     assert made_up_report(0, {}, check).title == "the runs of the tuning leave their bounds"
-
-
-def test_a_sampled_loop_that_is_unstable_in_some_runs_is_in_headline_and_text():
     stable = dataclasses.replace(made_up_report(0, {}), sampling_radius=(0.998, 0.995))
     assert "largest sampling_radius: 0.998 -> 0.995; stable below 1\n" in str(stable)
     assert stable.headline == "bounds kept"
@@ -371,29 +318,8 @@ def test_the_largest_radius_of_the_fresh_runs_is_that_of_a_study_with_the_same_s
     assert report.unstable[0] == 0 and report.unstable[1] > 0
 
 
-def test_violations_within_a_requirement_on_their_probability_are_no_failure():
-    report = made_up_report(1, {"violation probability < 0.05": "pass"})
-    assert report.failed
-    allowed = dataclasses.replace(report.verdicts[0], event="violated")
-    assert not dataclasses.replace(report, verdicts=(allowed,)).failed
-
-
-def test_a_report_as_numbers_goes_through_json():
-    report = made_up_report(5, {"a": "fail"}, made_up_check(at_steps(-0.01, 0.02)))
-    numbers = json.loads(json.dumps(report.to_dict()))
-    assert numbers["step_check"]["requirements"][0]["excess"] == [-0.01, 0.02]
-    first, second = numbers["failures"]
-    assert first["requirement"] is None and second["requirement"] == "a"
-    assert first["influence"]["statistic"] == 0.97 and first["first"] == [3, 8]
-    assert numbers["headline"] == report.headline
-
-
-# ------------------------------------------------------------------------------------ confirmation
-
-
 def rounds_of(monkeypatch, failing, confirm=0.01, most=6):
-    """The rounds of a confirmation whose runs exceed the limit by `failing(round)`, (N,), and of
-    which every tenth cannot be run."""
+    """Rounds whose runs exceed the limit by `failing(round)`, (N,); every tenth cannot be run."""
     goal = complete(objectives.tracking() + objectives.peak_torque_below(10.0), [1.0])
     options = TuningRunOptions(**BRIEF, perturbations=DRAWS).checked()
     found = confirmation_of(confirm, 0.95, goal, options)
@@ -433,16 +359,15 @@ def test_a_confirmation_that_cannot_be_is_refused():
     goal = objectives.tracking() + objectives.peak_torque_below(10.0, allowed=0.02)
     drawn = {"perturbations": DRAWS}
     too_many = "0.02 or more, which is the share that may break peak torque.*allowed=0.01"
-    for confirm, goal_of_it, options, words in (
+    for confirm, goal_of_it, more, words in (
         (1.5, goal, drawn, "between 0 and 1"),
         (0.05, goal, {}, "give perturbations"),
         (0.01, goal, drawn, too_many),
         (1e-12, objectives.tracking(), drawn, "ij.failure_probability"),
     ):
+        options = TuningRunOptions(**BRIEF, **more).checked()
         with pytest.raises(ValueError, match=words):
-            confirmation_of(
-                confirm, 0.95, goal_of_it, TuningRunOptions(**BRIEF, **options).checked()
-            )
+            confirmation_of(confirm, 0.95, goal_of_it, options)
 
 
 @pytest.mark.slow
@@ -458,9 +383,6 @@ def test_gains_that_fail_in_fresh_runs_are_tightened_until_they_are_confirmed(pa
     assert str(ij.load(best.save(tmp_path / "tuning")).confirmation) == str(found)
 
 
-# ----------------------------------------------------------------------------------- made from runs
-
-
 def study_of_report(scenario, draws):
     """A study with the seed of the report of `result_of`."""
     return ij.monte_carlo(scenario, draws, runs=200, seed=7, progress=False, **BRIEF)
@@ -471,30 +393,22 @@ def result_of(scenario, gains, objective, **options) -> TuneResult:
     run = TuningRunOptions(**BRIEF, **options).checked()
     setup = TuneSetup(**vars(run), objective=objective, report=Report(runs=200, seed=7))
     first = np.concatenate([np.ravel(x) for x in gains.values()])
-    history = {
-        "valid": np.ones((1, 1), bool),
-        "x": first[None, None],
-        "z": np.log(first)[None, None],
-        "evaluations": np.ones(1, int),
-        "terms": np.ones((1, 1, len(objective.terms))),
-        "excess": np.ones((1, 1, len(objective.requirements))),
-    }
+    history = {"x": first[None, None], "z": np.log(first)[None, None]}
+    history |= {"valid": np.ones((1, 1), bool), "evaluations": np.ones(1, int)}
+    history |= {"terms": np.ones((1, 1, len(objective.terms)))}
+    history |= {"excess": np.ones((1, 1, len(objective.requirements)))}
     history |= dict.fromkeys(("loss", "objective", "margin", "gradient_norm"), np.ones((1, 1)))
     names = tuple(f"{path}[{i}]" for path, x in gains.items() for i in range(len(x)))
     ended = (names, history, 0, "converged", "sqp", "forward", 1.0, setup)
     return TuneResult(ij.with_parameters(scenario, gains), scenario, gains, *ended)
 
 
-@pytest.fixture(scope="module")
-def loose(paper):
-    """Gains that exceed the torque where the second joint starts far from the reference."""
-    gains = {"controller.K2": np.array([20.0, 20.0])}
-    return result_of(paper, gains, goal_of(16.0), perturbations=DRAWS, runs=4)
-
-
 @pytest.mark.slow
-def test_failed_fresh_runs_are_those_of_a_study_with_the_seed_of_the_report(paper, loose):
-    """The run numbers, and the medians of the perturbation, against `monte_carlo`."""
+def test_failed_fresh_runs_are_those_of_a_study_with_the_seed_of_the_report(paper):
+    """The torque is exceeded where the second joint starts far from the reference.  Then the upper
+    bound is 0.1 rad above the start, which is drawn up to 0.12 rad away."""
+    gains = {"controller.K2": np.array([20.0, 20.0])}
+    loose = result_of(paper, gains, goal_of(16.0), perturbations=DRAWS, runs=4)
     (found,) = loose.report.failures
     study = study_of_report(paper, DRAWS)
     broken = np.asarray(study.metrics.peak_torque).max(axis=1) >= 16.0
@@ -507,11 +421,6 @@ def test_failed_fresh_runs_are_those_of_a_study_with_the_seed_of_the_report(pape
     medians = [np.median(start[broken]), np.median(start[~broken])]
     assert [found.influence.failed, found.influence.kept] == pytest.approx(medians)
     assert found.cause_in_words() in str(loose.report)
-
-
-@pytest.mark.slow
-def test_runs_that_were_drawn_outside_their_bounds_are_counted(paper):
-    """The upper bound is 0.1 rad above the start, which is drawn up to 0.12 rad away."""
     drawn_start = {"initial.q": ij.offset(ij.uniform([0.0, -0.12], [1e-6, 0.12]))}
     gains = {"controller.K2": np.array([4.0, 1.0])}
     result = result_of(paper, gains, goal_of(12.0), perturbations=drawn_start, runs=2)

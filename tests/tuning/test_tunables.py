@@ -36,39 +36,43 @@ def lab():
     return canonical(ij.with_parts(paper, **parts))
 
 
-def ends(scenario, path):
-    """The default range of one leaf in its unit, and its reasons."""
-    blocks, box = layout(scenario, [path], DT, "rk4")
+def ends(scenario, parameter):
+    """The range of a parameter in its unit, and its reasons."""
+    blocks, box = layout(scenario, [parameter], DT, "rk4")
     return in_units(blocks, box.low), in_units(blocks, box.high), box.reasons[0]
 
 
-def limits_of(scenario, parameter):
-    """The ends of the range of a parameter in its unit."""
-    blocks, box = layout(scenario, [parameter], DT, "rk4")
-    return in_units(blocks, box.low), in_units(blocks, box.high)
-
-
-def test_limits_are_one_number_for_each_entry(lab):
+def test_limits_are_for_each_entry_periods_have_no_derivative_and_some_scales_are_announced(lab):
     given = np.array([[1.0, 2.0], [np.inf, 9.0]])
-    np.testing.assert_allclose(limits_of(lab, ij.tunable("controller.K2", *given)), given)
+    np.testing.assert_allclose(ends(lab, ij.tunable("controller.K2", *given))[:2], given)
     # One number for all joints keeps the limits of each.
     tied = ij.tunable("controller.K2", [0.1, 1.0], [9.0, 7.0], tied=True)
-    np.testing.assert_allclose(limits_of(lab, tied), [[1], [7]])
-    with pytest.raises(ValueError, match=r"controller.K2.*between its limits.*Widen"):
-        limits_of(lab, ij.tunable("controller.K2", [1.0, 3.5], 9.0))
-    with pytest.raises(ValueError, match=r"K2.*low.*one number, or shape \(2,\)"):
-        limits_of(lab, ij.tunable("controller.K2", [1.0, 3.5, 2.0], 9.0))
+    np.testing.assert_allclose(ends(lab, tied)[:2], [[1], [7]])
+    for low, words in (
+        ([1.0, 3.5], r"controller.K2.*between its limits.*Widen"),
+        ([1.0, 3.5, 2.0], r"K2.*low.*one number, or shape \(2,\)"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            ends(lab, ij.tunable("controller.K2", low, 9.0))
+    with pytest.warns(UserWarning, match="no derivative by it"):
+        blocks, box = layout(lab, [ij.tunable("sampling.period", 0.8e-3, 3.2e-3)], DT, "rk4")
+    assert by_values(blocks) == [0]
+    np.testing.assert_allclose(in_units(blocks, box.low), 1e-3)
+    np.testing.assert_allclose(in_units(blocks, box.high), 3e-3)
+    found = [float(values_at(blocks, z)["sampling.period"]) for z in along(blocks, box, box.z, 9)]
+    np.testing.assert_allclose(found, [2.5e-3, 1.5e-3, 3e-3, 1e-3])
+    slope = jax.jacfwd(lambda z: values_at(blocks, z)["sampling.period"])(box.z)
+    assert np.all(np.asarray(slope) == 0)
+    with pytest.raises(ValueError, match="at least two multiples of dt"):
+        layout(lab, [ij.tunable("sampling.period", 1.8e-3, 2.2e-3)], DT, "rk4")
+    goal = ij.objectives.tracking() + ij.objectives.effort(scale=1.0)
+    with pytest.warns(UserWarning, match=r"scale of tracking is its value .* by 0.2 rad"):
+        complete(goal, [4.0, 3.0], margin=-0.2)
+    assert complete(goal, [4.0, 3.0], margin=0.1).terms[0].scale == 4.0
 
 
 @pytest.mark.slow
-def test_a_limit_that_is_infinite_cannot_be_tuned():
-    arm = ij.with_parameters(ij.presets.ur5(), {"plant.effort": np.inf})
-    with pytest.raises(ValueError, match=r"plant.effort.*finite numbers that tuning can start"):
-        layout(arm, ["plant.effort"], DT, "rk4")
-
-
-@pytest.mark.slow
-def test_theorem_2_limits_gains_from_below_where_it_holds(lab):
+def test_ranges_of_gains_and_filters_keep_the_theorem_and_the_loop_stable(lab):
     paper = canonical(ij.presets.zhang_yan_2024())
     for path in ("controller.k1", "controller.K2", "observer.kf"):
         start = np.asarray(get(lab, path))
@@ -78,20 +82,8 @@ def test_theorem_2_limits_gains_from_below_where_it_holds(lab):
         assert ends(paper, path)[2][0] == ranges.BY_THEOREM
     light = ij.with_parameters(paper, {"controller.weight": [1.0, 0.1]})
     low, _, (below, _) = ends(light, "controller.K2")
-    assert below == ranges.BY_SIGN
-    assert np.all(low == 0)
+    assert below == ranges.BY_SIGN and np.all(low == 0)
     assert ends(light, "observer.kf")[2][0] == ranges.BY_THEOREM
-
-
-def test_scales_of_a_start_that_leaves_its_bounds_are_announced():
-    goal = ij.objectives.tracking() + ij.objectives.effort(scale=1.0)
-    with pytest.warns(UserWarning, match=r"scale of tracking is its value .* by 0.2 rad"):
-        complete(goal, [4.0, 3.0], margin=-0.2)
-    assert complete(goal, [4.0, 3.0], margin=0.1).terms[0].scale == 4.0
-
-
-@pytest.mark.slow
-def test_default_ranges_of_filters_keep_the_loop_stable(lab):
     for path in ("sensor.velocity.cutoff", "actuator.bandwidth"):
         low, high, (below, above) = ends(lab, path)
         assert below == ranges.BY_PERIOD
@@ -105,29 +97,22 @@ def test_default_ranges_of_filters_keep_the_loop_stable(lab):
     _, high, (_, above) = ends(fast, "sensor.velocity.cutoff")
     assert above == ranges.BY_NYQUIST
     np.testing.assert_allclose(high, [np.pi / 2e-3, 2020.0])
-
-
-@pytest.mark.slow
-def test_the_range_of_an_unstable_start_ends_close_to_it_and_says_so(lab):
     unstable = ij.with_parameters(lab, {"controller.K2": 20.0})
     assert ranges.sampled_too_slowly(unstable)
     _, high, (_, above) = ends(unstable, "controller.k1")
     np.testing.assert_allclose(high, 1.01 * np.asarray(get(unstable, "controller.k1")))
-    assert above == ranges.AT_START[ranges.BY_PERIOD]
-    assert "unstable already at the start" in above
+    assert above == ranges.AT_START[ranges.BY_PERIOD] and "unstable already at the start" in above
     assert ends(lab, "controller.k1")[2][1] == ranges.BY_PERIOD
-    coarse = canonical(ij.presets.zhang_yan_2024())
-    _, box = layout(coarse, ["controller.k1"], 0.1, "rk4")
+    _, box = layout(paper, ["controller.k1"], 0.1, "rk4")
     assert box.reasons[0][1] == ranges.AT_START[ranges.BY_STEP]
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:sampling.period is a whole number")
-def test_the_period_is_a_multiple_of_the_step_within_what_loop_and_queue_allow(lab):
+def test_period_and_delay_are_within_what_loop_and_queue_allow(lab):
     low, high, (below, above) = ends(lab, "sampling.period")
     low, high = low[0], high[0]
-    assert below == ranges.BY_QUEUE
-    assert above == ranges.BY_PERIOD
+    assert below == ranges.BY_QUEUE and above == ranges.BY_PERIOD
     np.testing.assert_allclose(low / DT, np.round(low / DT))
     np.testing.assert_allclose(high / DT, np.round(high / DT))
     assert 1.2e-3 / low < 2 <= 1.2e-3 / (low - DT)
@@ -135,10 +120,6 @@ def test_the_period_is_a_multiple_of_the_step_within_what_loop_and_queue_allow(l
     assert ranges.sampled_too_slowly(ij.with_parameters(lab, {"sampling.period": high + DT}))
     no_delay = ij.with_parameters(lab, {"sampling.delay": 0.0})
     assert ends(no_delay, "sampling.period")[2][0] == ranges.BY_ONE_STEP
-
-
-@pytest.mark.slow
-def test_a_delay_needs_a_queue_that_holds_its_commands(lab):
     low, high, (below, _) = ends(lab, "sampling.delay")
     assert (low, below) == (0.0, ranges.BY_SIGN)
     assert 1.2e-3 < high < 4e-3
@@ -148,7 +129,7 @@ def test_a_delay_needs_a_queue_that_holds_its_commands(lab):
 
 
 @pytest.mark.slow
-def test_numbers_of_a_plant_keep_the_loop_within_the_step():
+def test_ranges_of_a_plant_keep_the_step_and_those_of_bounds_contain_the_start():
     flexible = canonical(loops_of_plants.flexible_joint())
     stiffness, inertia = "model.stiffness", "plant.motor_inertia"
     low, high, (below, above) = ends(flexible, stiffness)
@@ -161,37 +142,21 @@ def test_numbers_of_a_plant_keep_the_loop_within_the_step():
     assert (below, above) == (ranges.BY_STEP, ranges.BY_FACTOR)
     assert conditions.violated({inertia: 0.95 * low}) == ranges.BY_STEP
     assert ends(flexible, "plant.robot.mass")[2] == (ranges.BY_SIGN, ranges.UNLIMITED)
-
-
-@pytest.mark.slow
-def test_bounds_of_levels_contain_the_start():
     drive = canonical(loops_of_plants.electric_drive())
     current = start_levels(drive)[2]
     low, _, reasons = ends(drive, "bounds[2].upper.value")
     assert reasons == (ranges.BY_LEVEL, ranges.UNLIMITED)
     np.testing.assert_allclose(low, current + ranges.LEAST_SHARE * (60.0 - current))
-    one = ends(drive, "bounds[2].upper.value[1]")[0]
-    np.testing.assert_allclose(one, low[1:])
+    np.testing.assert_allclose(ends(drive, "bounds[2].upper.value[1]")[0], low[1:])
     _, high, reasons = ends(drive, "bounds[1].lower.value")
     assert reasons == (ranges.UNLIMITED, ranges.BY_LEVEL)
     np.testing.assert_allclose(high, -4.0 * ranges.LEAST_SHARE)
     # A start outside its bounds is refused.
     narrow = ij.with_parameters(drive, {"bounds[2].upper.value": low})
     assert float(ij.simulate(narrow, **SHORT).x[0, 2, 0]) < low[0]
-
-
-def test_a_period_says_that_it_has_no_derivative(lab):
-    with pytest.warns(UserWarning, match="no derivative by it"):
-        blocks, box = layout(lab, [ij.tunable("sampling.period", 0.8e-3, 3.2e-3)], DT, "rk4")
-    assert by_values(blocks) == [0]
-    np.testing.assert_allclose(in_units(blocks, box.low), 1e-3)
-    np.testing.assert_allclose(in_units(blocks, box.high), 3e-3)
-    found = [float(values_at(blocks, z)["sampling.period"]) for z in along(blocks, box, box.z, 9)]
-    np.testing.assert_allclose(found, [2.5e-3, 1.5e-3, 3e-3, 1e-3])
-    slope = jax.jacfwd(lambda z: values_at(blocks, z)["sampling.period"])(box.z)
-    assert np.all(np.asarray(slope) == 0)
-    with pytest.raises(ValueError, match="at least two multiples of dt"):
-        layout(lab, [ij.tunable("sampling.period", 1.8e-3, 2.2e-3)], DT, "rk4")
+    arm = ij.with_parameters(ij.presets.ur5(), {"plant.effort": np.inf})
+    with pytest.raises(ValueError, match=r"plant.effort.*finite numbers that tuning can start"):
+        ends(arm, "plant.effort")
 
 
 def smooth(scenario):
@@ -208,9 +173,8 @@ def test_all_kinds_together_have_the_derivatives_of_simulate(lab):
     goal += ij.objectives.peak_torque_below([30.0, 15.0])
     problem = TuningProblem.build(scenario, TOGETHER, goal, **SHORT)
     z = problem.box.z
-    found = np.asarray(
-        evaluation.forward_derivatives(problem, problem.candidates(z[None])).gradient[0]
-    )
+    forward = evaluation.forward_derivatives(problem, problem.candidates(z[None]))
+    found = np.asarray(forward.gradient[0])
 
     def loss_of(changed):
         metrics = ij.simulate(changed, **SHORT).metrics
@@ -247,5 +211,4 @@ def test_periods_are_compared_by_values(lab):
         scenario = ij.with_parameters(best.scenario, {"sampling.period": period})
         return float(np.sum(ij.simulate(scenario, **options).metrics.ise))
 
-    shortest = min(DT * np.arange(2, 9), key=loss)
-    np.testing.assert_allclose(best.values["sampling.period"], shortest)
+    np.testing.assert_allclose(best.values["sampling.period"], min(DT * np.arange(2, 9), key=loss))

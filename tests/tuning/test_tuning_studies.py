@@ -2,11 +2,11 @@
 
 import dataclasses
 import json
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from conftest import ROOT
 from matplotlib.figure import Figure
 
 import iblf_jax as ij
@@ -27,20 +27,23 @@ SETS = {
 }
 
 
-def test_an_attack_whose_loop_is_unstable_says_so_although_its_bounds_are_kept(paper):
+def test_non_dominated_points_and_the_text_of_an_attack_whose_loop_is_unstable(paper):
+    points = np.array([[1.0, 5.0], [2.0, 4.0], [2.0, 3.0], [3.0, 3.5], [4.0, 1.0]])
+    assert non_dominated(points).tolist() == [0, 2, 4]
     timing = {"duration": 0.01, "dt": 1e-3, "method": "rk4"}
     attack = ij.WorstCase(paper, {}, 0.1, 0.1, 0, np.ones((2, 2)), 4, timing)
     assert repr(attack).startswith("WorstCase(not falsified: smallest margin 0.1 rad")
     unstable = dataclasses.replace(attack, status=int(ij.Status.SAMPLING_TOO_SLOW))
-    assert repr(unstable).startswith(
-        "WorstCase(bounds kept, but the sampled loop is unstable at this draw: smallest margin 0.1"
-    )
+    words = "bounds kept, but the sampled loop is unstable at this draw: smallest margin 0.1"
+    assert repr(unstable).startswith(f"WorstCase({words}")
     flags = ij.Status.SAMPLING_TOO_SLOW | ij.Status.BOUND_VIOLATED
     assert repr(dataclasses.replace(attack, status=int(flags))).startswith("WorstCase(FALSIFIED")
 
 
 @pytest.mark.slow
-def test_falsify_finds_worse_than_random_runs_of_the_same_cost(paper):
+@pytest.mark.filterwarnings("ignore::iblf_jax.SimulationWarning")
+def test_falsify_finds_worse_than_random_runs_and_returns_what_can_be_run(paper):
+    """As the second, of starts and references beyond the bounds."""
     attack = ij.falsify(paper, SETS, starts=4, iterations=8, **SHORT)
     budget = 6 * attack.runs  # a value with its derivatives costs less than six values
     study = ij.monte_carlo(paper, SETS, runs=budget, seed=1, progress=False, **SHORT)
@@ -51,19 +54,12 @@ def test_falsify_finds_worse_than_random_runs_of_the_same_cost(paper):
         low, high = perturbation.range(np.asarray(get(paper, path)))
         assert np.all(attack.values[path] >= low - 1e-9)
         assert np.all(attack.values[path] <= high + 1e-9)
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::iblf_jax.SimulationWarning")
-def test_falsify_returns_what_can_be_run(paper):
-    """Of starts and references beyond the bounds."""
     ends = {"initial.q": (0.2, 1.2), "reference.amplitude": (0.0, 0.8)}
     sets = {path: ij.value(ij.uniform(*pair)) for path, pair in ends.items()}
     attack = ij.falsify(paper, sets, starts=3, iterations=4, **SHORT)
     again = attack.replay()
     assert attack.margin == pytest.approx(float(np.min(again.metrics.margin)), abs=1e-9)
-    assert attack.margin <= np.nanmin(attack.history)
-    assert attack.margin < attack.first_margin
+    assert attack.margin <= np.nanmin(attack.history) and attack.margin < attack.first_margin
     assert np.all((again.q[0] > again.lower[0]) & (again.q[0] < again.upper[0]))
 
 
@@ -80,8 +76,7 @@ def test_pareto_is_a_front(paper, front):
     assert np.all(np.diff(a) > 0)
     assert np.all(np.diff(b) < 0)
     assert not np.any(np.all(front.tried[:, None] < front.objectives[None] - 1e-12, axis=-1))
-    assert a[0] < front.first[0]
-    assert b[-1] < front.first[1]
+    assert a[0] < front.first[0] and b[-1] < front.first[1]
     ise = [ij.simulate(x, **SHORT).metrics.ise.sum() for x in (front.scenario(0), paper)]
     assert float(ise[0] / ise[1]) == pytest.approx(a[0], rel=1e-9)
     with pytest.raises(ValueError, match="one term each"):
@@ -91,14 +86,12 @@ def test_pareto_is_a_front(paper, front):
 def area(points, corner):
     """What a front beats, of the logarithms below a corner: the hypervolume."""
     a, b = np.log(points[non_dominated(points)]).T
-    widths = np.diff(np.append(a, np.log(corner[0])))
-    return float(np.sum(widths * (np.log(corner[1]) - b)))
+    return float(np.sum(np.diff(np.append(a, np.log(corner[0]))) * (np.log(corner[1]) - b)))
 
 
 @pytest.mark.slow
 def test_a_front_has_its_ends_and_no_gaps(paper):
-    """Beside a dense grid over both gains; a limit on the margin cuts the grid's front and this one
-    alike."""
+    """Beside a dense grid over both gains; a limit on the margin cuts both fronts alike."""
     ends = {"controller.k1": 0.3, "controller.K2": 0.6}
     gains = [ij.tunable(path, low, 60.0, tied=True) for path, low in ends.items()]
     margin = float(np.min(ij.simulate(paper, **SHORT).metrics.margin))
@@ -120,11 +113,6 @@ def test_a_front_has_its_ends_and_no_gaps(paper):
     assert front.evaluations <= 8 * 12
     metrics = ij.simulate(front.scenario(len(front) - 1), **SHORT).metrics
     assert float(np.min(metrics.margin)) > -float(limit.limit) - 1e-12
-
-
-def test_non_dominated():
-    points = np.array([[1.0, 5.0], [2.0, 4.0], [2.0, 3.0], [3.0, 3.5], [4.0, 1.0]])
-    assert non_dominated(points).tolist() == [0, 2, 4]
 
 
 TUNING = """
@@ -162,20 +150,14 @@ def test_the_command_line_tunes_and_a_saved_result_reproduces_its_report(tmp_pat
     file.write_text(TUNING)
     assert main(["tune", str(file), "--out", str(tmp_path / "out"), "--quiet"]) in (0, 1)
     text = capsys.readouterr().out
-    assert "requirement margin > 0.02 rad" in text
-    assert "fresh runs" in text
-    assert {p.name for p in (tmp_path / "out").iterdir()} == {
-        "scenario.toml",
-        "tuning.npz",
-        "report.txt",
-        "tuning.png",
-    }
+    assert "requirement margin > 0.02 rad" in text and "fresh runs" in text
+    names = {p.name for p in (tmp_path / "out").iterdir()}
+    assert names == {"scenario.toml", "tuning.npz", "report.txt", "tuning.png"}
     loaded = ij.load(tmp_path / "out" / "tuning.npz")
     assert str(loaded.report) in text
     tuned = ij.load_scenario(tmp_path / "out" / "scenario.toml")
     np.testing.assert_array_equal(tuned.controller.K2, loaded.scenario.controller.K2)
-    assert loaded.values["controller.K2"].shape == (2,)
-    assert loaded.names[-1] == "controller.K2"
+    assert loaded.values["controller.K2"].shape == (2,) and loaded.names[-1] == "controller.K2"
     assert loaded.setup.limits[-1] == pytest.approx((0.6, 30.0))
     assert "peak torque of all runs, joint by joint" in text
     file.write_text(TUNING.replace("margin_above", "margin_abve"))
@@ -183,9 +165,25 @@ def test_the_command_line_tunes_and_a_saved_result_reproduces_its_report(tmp_pat
     assert "requirement[0].kind" in capsys.readouterr().err
 
 
-def _check_torque_and_ends(paper, best, figure):
-    """Report, repr and figure show both, although the objective contains neither; the legend
-    covers no curve."""
+def test_ends_of_ranges_are_found_at_zero_and_where_there_is_none():
+    """1 % of the limit, or of the range where it is 0; an infinite limit is never reached."""
+    limits = ((0.0, 100.0), (1.01, np.inf), (-np.inf, 50.0), (1.0, 9.0))
+    values = {"a": np.array(0.5), "b": np.array(1.011), "c": np.array(49.8), "d": np.array(5.0)}
+    search = ("newton", "forward", 0.0, SimpleNamespace(limits=limits, reasons=()))
+    result = TuneResult(None, None, values, tuple(values), {}, 0, "", *search)
+    sides = {name: end.side for name, end in result.at_limits.items()}
+    assert sides == {"a": "lower", "b": "lower", "c": "upper"}
+    assert dataclasses.replace(result, setup=SimpleNamespace(limits=(), reasons=())).at_limits == {}
+
+
+@pytest.mark.slow
+def test_figures(paper, front):
+    narrow = ij.tunable("controller.k1", low=1.0, high=2.5)
+    gains, goal = [narrow, "controller.K2"], ij.objectives.tracking()
+    best = ij.tune(paper, gains, goal, effort=ij.tuning.Effort(iterations=3), **SHORT)
+    figure = best.plot(points=3)
+    assert len(figure.axes) == 8
+    # All show torque and ends, although the objective contains neither.
     runs = [ij.simulate(scenario, **SHORT) for scenario in (paper, best.scenario)]
     peaks = [np.asarray(run.metrics.peak_torque) for run in runs]
     assert best.at_limits["controller.k1[0]"] == (best.tuned[0], "upper", 2.5, "as given")
@@ -206,33 +204,6 @@ def _check_torque_and_ends(paper, best, figure):
     assert not legend.get_window_extent().overlaps(gains.get_window_extent())
     labels = [text.get_text() for text in legend.get_texts()]
     assert "controller.k1[0] (at its upper limit 2.5)" in labels
-
-
-def test_ends_of_ranges_are_found_at_zero_and_where_there_is_none():
-    """1 % of the limit, or of the range where the limit is 0; an infinite limit is never
-    reached."""
-    limits = ((0.0, 100.0), (1.01, np.inf), (-np.inf, 50.0), (1.0, 9.0))
-    values = {"a": np.array(0.5), "b": np.array(1.011), "c": np.array(49.8), "d": np.array(5.0)}
-    setup = SimpleNamespace(limits=limits, reasons=())
-    result = TuneResult(
-        None, None, values, ("a", "b", "c", "d"), {}, 0, "", "newton", "forward", 0.0, setup
-    )
-    assert {name: end.side for name, end in result.at_limits.items()} == {
-        "a": "lower",
-        "b": "lower",
-        "c": "upper",
-    }
-    assert dataclasses.replace(result, setup=SimpleNamespace(limits=(), reasons=())).at_limits == {}
-
-
-@pytest.mark.slow
-def test_figures(paper, front):
-    narrow = ij.tunable("controller.k1", low=1.0, high=2.5)
-    gains, goal = [narrow, "controller.K2"], ij.objectives.tracking()
-    best = ij.tune(paper, gains, goal, effort=ij.tuning.Effort(iterations=3), **SHORT)
-    figure = best.plot(points=3)
-    assert len(figure.axes) == 8
-    _check_torque_and_ends(paper, best, figure)
     a, b, loss = best.landscape("controller.k1[0]", "controller.K2[1]", points=3, span=0.2)
     assert loss[1, 1] == pytest.approx(best.report.changes[0].after, rel=1e-9)
     assert (a[1], b[1]) == (best.tuned[0], best.tuned[3])
@@ -243,8 +214,7 @@ def test_figures(paper, front):
 
 @pytest.mark.slow
 def test_the_path_of_a_tuning_across_what_is_allowed(paper):
-    """Two gains that are one number for all joints; what the limit forbids is where runs break
-    it."""
+    """Two gains, each one number for all joints; what the limit forbids is where runs break it."""
     gains = [ij.tunable(path, tied=True) for path in GAINS]
     goal = ij.objectives.tracking() + ij.objectives.peak_torque_below(12.0)
     options = SHORT | {"effort": ij.tuning.Effort(iterations=3), "progress": False}
@@ -255,8 +225,7 @@ def test_the_path_of_a_tuning_across_what_is_allowed(paper):
     for i, j in ((0, 0), (1, 2)):
         values = {"controller.k1": np.full(2, k1[i]), "controller.K2": np.full(2, K2[j])}
         metrics = ij.simulate(ij.with_parameters(paper, values), **SHORT).metrics
-        expected = float(np.max(metrics.peak_torque)) / 12 - 1
-        assert excess[i, j] == pytest.approx(expected, rel=1e-9)
+        assert excess[i, j] == pytest.approx(float(np.max(metrics.peak_torque)) / 12 - 1, rel=1e-9)
         assert loss[i, j] == pytest.approx(float(np.sum(metrics.ise) / start), rel=1e-9)
     figure = Figure()
     others = {"grid": [[1.0, 3.0], [4.0, 40.0]]}
@@ -277,7 +246,7 @@ def short_tuning(paper, checkpoint, weight=1.0):
     return ij.tune(paper, ["controller.k1"], goal, checkpoint=checkpoint, **options)
 
 
-EARLIER = Path(__file__).parents[1] / "data" / "tuning_before_weights.json"
+EARLIER = ROOT / "tests" / "data" / "tuning_before_weights.json"
 
 
 @pytest.mark.slow

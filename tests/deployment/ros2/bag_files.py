@@ -3,8 +3,6 @@
 python tests/deployment/ros2/bag_files.py examples/run_bag     writes the one of the examples
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 
@@ -52,19 +50,16 @@ def write_bag(folder, messages, storage="sqlite3", compressed=False):
         for topic, received, (kind, message) in sorted(messages, key=lambda x: x[1]):
             if topic not in connections:
                 connections[topic] = writer.add_connection(topic, kind, typestore=STORE)
-            raw = STORE.serialize_cdr(message, kind)
-            writer.write(connections[topic], int(received), raw)
+            writer.write(connections[topic], int(received), STORE.serialize_cdr(message, kind))
     return folder
 
 
 def messages_of(t, names, q, tau, dq=None, *, origin=0, latency=300_000, delay=50_000):
-    """The messages of a loop: each joint state, received `delay` ns after its stamp, is answered
-    `latency` ns later."""
+    """Joint states, received `delay` ns after their stamps, and answers `latency` ns later."""
     found = []
     for k, time in enumerate(t):
         stamp = origin + round(time * 1e9)
-        velocity = () if dq is None else dq[k]
-        state = state_message(stamp, names, q[k], velocity)
+        state = state_message(stamp, names, q[k], () if dq is None else dq[k])
         found.append(("/joint_states", stamp + delay, state))
         if tau[k] is not None:
             found.append(("/efforts", stamp + delay + latency, effort_message(tau[k])))

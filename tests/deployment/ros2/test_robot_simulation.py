@@ -1,7 +1,4 @@
-"""A simulated robot without ROS: equal to `cosimulate` where the law answers at once, and what it
-does without efforts."""
-
-from __future__ import annotations
+"""A simulated robot without ROS: equal to `cosimulate` where the law answers at once."""
 
 import dataclasses
 
@@ -17,6 +14,7 @@ from iblf_jax.simulation.scenario import canonical
 
 mujoco = pytest.importorskip("mujoco", reason='needs the extra "robots"')
 from iblf_jax.deployment.mujoco_plant import MujocoPlant
+from iblf_jax.deployment.ros2.robot_model import plant_of
 from iblf_jax.deployment.ros2.robot_motion import RobotMotion, recorded
 from iblf_jax.deployment.ros2.robot_simulation import RobotSimulation
 
@@ -104,8 +102,7 @@ def test_a_motion_survives_its_file(tmp_path):
     assert len(last.rows) == len(last.samples) == 1
     motion.save(tmp_path / "motion.npz")
     loaded = ij.load(tmp_path / "motion.npz")
-    assert loaded.joints == JOINTS
-    assert loaded.counts == motion.counts
+    assert loaded.joints == JOINTS and loaded.counts == motion.counts
     assert loaded.timing() == pytest.approx(motion.timing(), nan_ok=True)
     np.testing.assert_array_equal(loaded.rollout(PAPER).V, motion.rollout(PAPER).V)
 
@@ -140,7 +137,7 @@ def test_without_efforts_the_brake_holds_and_without_brake_the_torque_is_zero():
     np.testing.assert_array_equal(motion_of(held).ddq, 0.0)
 
 
-def test_an_effort_acts_for_the_effort_timeout_and_then_the_torque_is_zero():
+def test_an_effort_acts_from_its_arrival_for_the_effort_timeout_and_then_no_torque_or_the_brake():
     simulation = robot(effort_timeout=0.0137)
     simulation.measure()
     simulation.receive(0.0, np.array([20.0, 5.0]))
@@ -151,9 +148,15 @@ def test_an_effort_acts_for_the_effort_timeout_and_then_the_torque_is_zero():
     assert motion.t[acts][-1] == pytest.approx(0.0137, abs=1e-9)
     np.testing.assert_array_equal(motion.tau[motion.t > 0.0137 + 1e-9], 0.0)
     assert motion.counts["expired efforts"] == 1
-
-
-def test_a_brake_stops_the_robot_after_the_effort_timeout_until_the_next_effort():
+    simulation = robot()
+    simulation.measure()
+    simulation.receive(0.0, np.array([20.0, 5.0]))
+    simulation.receive(1.3e-3, np.array([-3.0, 1.0]))
+    simulation.advance()
+    motion = motion_of(simulation)
+    before, after = motion.t < 1.3e-3 - 1e-9, motion.t > 1.3e-3 + 1e-9
+    np.testing.assert_array_equal(motion.tau[before], [[20.0, 5.0]] * before.sum())
+    np.testing.assert_array_equal(motion.tau[after], [[-3.0, 1.0]] * after.sum())
     simulation = robot(effort_timeout=0.01, brake="always")
     simulation.measure()
     simulation.receive(0.0, np.array([20.0, 5.0]))
@@ -170,31 +173,19 @@ def test_a_brake_stops_the_robot_after_the_effort_timeout_until_the_next_effort(
     assert np.max(np.abs(motion.dq[motion.t > 0.031])) > 1e-3
 
 
-def test_an_effort_within_a_period_acts_from_its_arrival_on():
-    simulation = robot()
-    simulation.measure()
-    simulation.receive(0.0, np.array([20.0, 5.0]))
-    simulation.receive(1.3e-3, np.array([-3.0, 1.0]))
-    simulation.advance()
-    motion = motion_of(simulation)
-    before, after = motion.t < 1.3e-3 - 1e-9, motion.t > 1.3e-3 + 1e-9
-    np.testing.assert_array_equal(motion.tau[before], [[20.0, 5.0]] * before.sum())
-    np.testing.assert_array_equal(motion.tau[after], [[-3.0, 1.0]] * after.sum())
-
-
 @pytest.mark.slow
-def test_a_payload_changes_the_motion_as_that_of_the_plant_does():
+def test_a_payload_changes_the_motion_as_that_of_the_plant_does_and_a_file_may_be_needed():
     length = float(PAPER.plant.length[1])
     loaded = robot(payload=ij.robots.Payload(mass=0.3, centre=[length, 0.0, 0.0]))
     motion = closed_with_law(loaded, PAPER, periods=100)
-    heavy = ij.with_parameters(PAPER, {"plant.payload": 0.3})
-    run = ij.simulate(heavy, duration=0.2, dt=DT)
+    run = ij.simulate(ij.with_parameters(PAPER, {"plant.payload": 0.3}), duration=0.2, dt=DT)
     np.testing.assert_allclose(motion.q[motion.instant], run.q, atol=1e-7)
-    light = ij.simulate(PAPER, duration=0.2, dt=DT)
-    assert np.max(np.abs(np.asarray(light.q - run.q))) > 1e-3
+    assert np.max(np.abs(np.asarray(ij.simulate(PAPER, duration=0.2, dt=DT).q - run.q))) > 1e-3
+    with pytest.raises(ValueError, match=r"plant: got 'Arm'.*--plant"):
+        plant_of(ij.presets.ur5(), None, None)
 
 
-def test_a_payload_that_mujoco_does_not_have_is_refused():
+def test_a_payload_that_mujoco_does_not_have_is_refused_and_joints_have_the_names_of_a_file():
     compiled = mujoco.MjModel.from_xml_path(str(ARM))
     for model, payload, words in (
         (ARM, 0.3, "payload: got 0.3, expected an iblf_jax.robots.Payload"),
@@ -203,3 +194,27 @@ def test_a_payload_that_mujoco_does_not_have_is_refused():
     ):
         with pytest.raises(ValueError, match=words):
             MujocoPlant(model, JOINTS, 2, {}, "RK4", payload)
+    assert plant_of(PLAIN, ARM, None) == (ARM, ("shoulder", "elbow"))
+    assert plant_of(PLAIN, ARM, ["elbow", "shoulder"]) == (ARM, ("elbow", "shoulder"))
+    with pytest.raises(ValueError, match=r"joints: got .*--joints"):
+        plant_of(PLAIN, ARM, ["elbow"])
+
+
+PLAIN = ij.with_parts(ij.presets.zhang_yan_2024(), sampling=ij.Sampling(1e-3))
+NUMBERS = {"mass": [2.0, 0.8], "length": [0.4, 0.3], "centre": [0.2, 0.1], "inertia": [0.05, 0.01]}
+CHAIN = ij.with_parts(PLAIN, robot=ij.robots.PlanarChain(**NUMBERS))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("scenario", "payload"), [(PLAIN, 0.4), (CHAIN, 0.0)])
+def test_a_planar_arm_moves_in_mujoco_as_in_simulate(scenario, payload):
+    scenario = ij.with_parameters(scenario, {"plant.payload": payload})
+    plant, joints = plant_of(scenario, None, None)
+    assert joints == ("joint_1", "joint_2")
+    run = ij.simulate(scenario, duration=0.2, dt=1e-3)
+    other = ij.cosimulate(scenario, plant, duration=0.2, dt=1e-3)
+    np.testing.assert_allclose(other.q, run.q, atol=1e-8)
+    np.testing.assert_allclose(other.disturbance, run.disturbance, atol=1e-7)
+    if payload:  # of which the law does not know
+        light = ij.simulate(PLAIN, duration=0.2, dt=1e-3)
+        assert np.max(np.abs(np.asarray(light.q - run.q))) > 1e-3

@@ -1,8 +1,6 @@
 """The generated controller of ros2_control, compiled against stubs of its headers and driven by a
 harness: torques of the package, limits, faults, parameters, and no allocation in `update`."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import xml.etree.ElementTree as ElementTree
@@ -25,14 +23,14 @@ SANE = ("-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover")
 PERIOD = 2e-3
 NANOSECONDS = 2_000_000
 JOINTS = ("joint_1", "joint_2")
+JUMP = 3 * NANOSECONDS
 UNTOUCHED = 123.5
 """What an effort of the harness is before the first command."""
 
+HAS_COMPILERS = shutil.which("c++") and shutil.which("cc")
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.skipif(
-        not (shutil.which("c++") and shutil.which("cc")), reason="there is no compiler of C and C++"
-    ),
+    pytest.mark.skipif(not HAS_COMPILERS, reason="there is no compiler of C and C++"),
 ]
 
 
@@ -85,23 +83,19 @@ class Built:
             subprocess.run(command, check=True)
 
     def states(self, q, dq):
-        """The values of the state interfaces as `activated` claims them."""
         pairs = zip(q, dq, strict=True) if self.description["reads_velocity"] else ((x,) for x in q)
         return " ".join(f"{float(x)!r}" for pair in pairs for x in pair)
 
     def activated(self, *parameters):
-        """The commands until the controller is active."""
         kinds = ("position", "velocity") if self.description["reads_velocity"] else ("position",)
         names = " ".join(f"{x}/{kind}" for x in JOINTS for kind in kinds)
         names += "".join(f" {x}/effort" for x in JOINTS)
         return ["rate 500", *parameters, "init", "configure", f"activate {names}"]
 
     def update_commands(self, updates):
-        """The commands of updates (time [ns], q, dq)."""
         return [f"update {t} {self.states(q, dq)}" for t, q, dq in updates]
 
     def answers(self, commands):
-        """What the harness prints."""
         given = "\n".join(commands) + "\n"
         done = subprocess.run([self.program], input=given, capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
@@ -138,11 +132,8 @@ def logged(lines):
 
 @pytest.fixture(scope="module")
 def scenario():
-    return ij.with_parts(
-        ij.presets.zhang_yan_2024(),
-        controller=ij.controllers.Backstepping(k1=2.0, K2=10.0, o=0.1),
-        sampling=ij.Sampling(PERIOD),
-    )
+    parts = {"controller": ij.controllers.Backstepping(k1=2.0, K2=10.0, o=0.1)}
+    return ij.with_parts(ij.presets.zhang_yan_2024(), sampling=ij.Sampling(PERIOD), **parts)
 
 
 @pytest.fixture(scope="module")
@@ -152,43 +143,35 @@ def built(scenario, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def updates(built):
-    """The samples of the run of the self-test, at a time that does not begin at 0."""
     v = built.vectors
     return [(10**15 + NANOSECONDS * k, v.q[k], v.dq[k]) for k in range(3000)]
 
 
-def test_the_efforts_are_the_torques_of_the_package(built, updates):
-    """Those of the self-test vectors, which begin at a start that is not rounded, and those of the
-    same samples by JAX."""
+def test_the_efforts_are_the_torques_of_the_package(scenario, built, updates, tmp_path):
+    """Those of the self-test, whose start is not rounded, and those of the samples by JAX."""
     found = built.efforts(updates)
     expected = built.vectors.tau[: len(updates) // CHECK_INTERVAL]
     largest = np.abs(expected).max()
     np.testing.assert_allclose(found[::CHECK_INTERVAL], expected, atol=1e-5 * largest)
-    again = built.law_torques(updates[:500])
-    np.testing.assert_allclose(found[:500], again, atol=1e-11 * largest)
-
-
-def test_a_controller_for_the_functions_of_humble(scenario, built, updates, tmp_path):
+    np.testing.assert_allclose(found[:500], built.law_torques(updates[:500]), atol=1e-11 * largest)
     humble = Built(tmp_path, scenario, flags=["-DSTUB_OF_HUMBLE"], like=built)
     np.testing.assert_array_equal(humble.efforts(updates[:50]), built.efforts(updates[:50]))
 
 
 def test_a_law_that_does_not_read_velocities_does_not_claim_them(scenario, tmp_path):
-    velocity = ij.sensors.FilteredDifference(cutoff=200.0)
-    encoder = ij.sensors.Encoder(counts=65536, velocity=velocity)
+    encoder = ij.sensors.Encoder(counts=65536, velocity=ij.sensors.FilteredDifference(cutoff=200.0))
     built = Built(tmp_path, ij.with_parts(scenario, sensor=encoder))
     assert not built.description["reads_velocity"]
     lines = built.answers(["rate 500", "init", "configure", "names"])
     claimed = [line.removeprefix("names ").split() for line in lines if line.startswith("names")]
     assert claimed == [[f"{x}/effort" for x in JOINTS], [f"{x}/position" for x in JOINTS]]
-    q = built.vectors.q[:200]
-    updates = [(NANOSECONDS * k, x, np.zeros(2)) for k, x in enumerate(q)]
+    updates = [(NANOSECONDS * k, x, np.zeros(2)) for k, x in enumerate(built.vectors.q[:200])]
     found, expected = built.efforts(updates), built.law_torques(updates)
     np.testing.assert_allclose(found, expected, atol=1e-11 * np.abs(expected).max())
     assert "velocity`" not in built.files["README.md"]
 
 
-def test_interfaces_are_claimed_in_any_order(built, updates):
+def test_interfaces_in_any_order_give_complete_states_at_new_times(built, updates):
     lines = built.answers(["rate 500", "init", "configure", "names"])
     assert lines[2:] == [
         "names joint_1/effort joint_2/effort",
@@ -201,19 +184,19 @@ def test_interfaces_are_claimed_in_any_order(built, updates):
     efforts = "joint_2/effort joint_1/effort"
     commands = ["rate 500", "init", "configure", f"activate {names} {efforts}"]
     for t, q, dq in updates[:20]:
-        values = (dq[1], q[0], q[1], dq[0])
-        commands.append(f"update {t} {' '.join(repr(float(x)) for x in values)}")
+        values = " ".join(repr(float(x)) for x in (dq[1], q[0], q[1], dq[0]))
+        commands.append(f"update {t} {values}")
     found = efforts_of(built.answers(commands))
     np.testing.assert_array_equal(found[:, ::-1], built.efforts(updates[:20]))
-
-
-def test_there_is_no_command_before_the_first_complete_state(built, updates):
     nan = float("nan")
     _, q, dq = updates[0]
     before = [(0, [nan, q[1]], dq), (1, q, [dq[0], nan]), (2, [q[0], np.inf], dq)]
     found = built.efforts([*before, *updates[:10]])
     np.testing.assert_array_equal(found[:3], UNTOUCHED)
     np.testing.assert_array_equal(found[3:], built.efforts(updates[:10]))
+    found = built.efforts([x for x in updates[:10] for _ in range(2)])
+    np.testing.assert_array_equal(found[::2], built.efforts(updates[:10]))
+    np.testing.assert_array_equal(found[1::2], found[::2])
 
 
 def hold_torque(built, q, q_hold, dq, is_fresh):
@@ -229,16 +212,10 @@ def faulty(updates):
     nan, velocity = ([[t, q.copy(), dq.copy()] for t, q, dq in updates[:20]] for _ in range(2))
     nan[16][1][0] = np.nan
     velocity[16][2][1] = -np.inf
-    late, back = (
-        [[t + jump * (k >= 16), q, dq] for k, (t, q, dq) in enumerate(updates[:20])]
-        for jump in (3 * NANOSECONDS, -3 * NANOSECONDS)
-    )
-    return [
-        ("a state is not finite", nan),
-        ("a state is not finite", velocity),
-        ("more than two periods passed", late),
-        ("the time jumped back", back),
-    ]
+    before, after = updates[:16], updates[16:20]
+    late, back = ([*before, *((t + jump, q, dq) for t, q, dq in after)] for jump in (JUMP, -JUMP))
+    not_finite = [("a state is not finite", x) for x in (nan, velocity)]
+    return [*not_finite, ("more than two periods passed", late), ("the time jumped back", back)]
 
 
 @pytest.mark.parametrize("case", range(4))
@@ -269,8 +246,7 @@ def test_a_torque_that_is_not_finite_is_a_fault(built, updates):
     samples[3][2] = np.array([1e300, 1e300])
     steps = built.update_commands(samples)
     lines = built.answers([*built.activated("text on_fault zero"), *steps, "timer"])
-    found = efforts_of(lines)
-    np.testing.assert_array_equal(found[3:], 0.0)
+    np.testing.assert_array_equal(efforts_of(lines)[3:], 0.0)
     assert logged(lines)[0].startswith("fault: the law has no finite torque")
     held = efforts_of(built.answers([*built.activated(), *steps]))
     assert np.all(np.isfinite(held)) and np.all(np.abs(held) <= [500.0, 400.0])
@@ -290,14 +266,23 @@ def test_a_start_outside_of_the_bounds_is_a_fault(policy, built, updates):
         held = samples[0][1]
         expected = [hold_torque(built, q, held, dq, True) for _, q, dq in samples]
     np.testing.assert_allclose(efforts_of(lines), expected, atol=1e-12)
-    commands = built.activated("flag start_outside_bounds")
-    lines = built.answers([*commands, *steps, "timer"])
+    lines = built.answers([*built.activated("flag start_outside_bounds"), *steps, "timer"])
     assert not logged(lines)
     torques = np.clip(built.law_torques(samples), [-500.0, -400.0], [500.0, 400.0])
     np.testing.assert_allclose(efforts_of(lines), torques, rtol=1e-9, atol=1e-9)
 
 
-def test_only_a_new_activation_leaves_a_fault(built, updates):
+def test_torques_are_clipped_last_and_only_a_new_activation_leaves_a_fault(built, updates):
+    free = built.efforts(updates[:400])
+    limits = 0.5 * np.abs(free).max(axis=0)
+    text = " ".join(f"{x!r}" for x in limits.tolist())
+    found = built.efforts(updates[:400], f"numbers torque_limits {text}")
+    np.testing.assert_array_equal(found, np.clip(free, -limits, limits))
+    assert np.any(np.abs(free) > limits)
+    # The torques of a fault too.
+    _, samples = faulty(updates)[2]
+    found = built.efforts(samples, "numbers torque_limits 0.1 0.01")
+    np.testing.assert_array_equal(np.abs(found[16:]), [[0.1, 0.01]] * 4)
     samples = [list(x) for x in updates[:6]]
     samples[3][1] = np.array([np.nan, 0.5])
     steps = built.update_commands(samples)
@@ -310,35 +295,11 @@ def test_only_a_new_activation_leaves_a_fault(built, updates):
     np.testing.assert_array_equal(found[6:], built.efforts(updates[:10]))
 
 
-def test_a_time_that_stands_still_is_not_a_sample(built, updates):
-    twice = [x for x in updates[:10] for _ in range(2)]
-    found = built.efforts(twice)
-    np.testing.assert_array_equal(found[::2], built.efforts(updates[:10]))
-    np.testing.assert_array_equal(found[1::2], found[::2])
-
-
-def test_torques_are_clipped_last(built, updates):
-    free = built.efforts(updates[:400])
-    limits = 0.5 * np.abs(free).max(axis=0)
-    text = " ".join(f"{x!r}" for x in limits.tolist())
-    found = built.efforts(updates[:400], f"numbers torque_limits {text}")
-    np.testing.assert_array_equal(found, np.clip(free, -limits, limits))
-    assert np.any(np.abs(free) > limits)
-    # The torques of a fault too.
-    _, samples = faulty(updates)[2]
-    found = built.efforts(samples, "numbers torque_limits 0.1 0.01")
-    np.testing.assert_array_equal(np.abs(found[16:]), [[0.1, 0.01]] * 4)
-
-
-def test_gains_are_read_when_the_controller_is_configured(built, updates):
+def test_parameters_are_read_when_the_controller_is_configured_only(built, updates):
     changed = built.efforts(updates[:50], "numbers controller.K2 6.0 15.0")
     assert not np.allclose(changed, built.efforts(updates[:50]))
     expected = built.law_torques(updates[:50], **{"controller.K2": np.array([6.0, 15.0])})
     np.testing.assert_allclose(changed, expected, atol=1e-11 * np.abs(expected).max())
-
-
-def test_a_parameter_of_a_configured_controller_cannot_be_changed(built, updates):
-    """It would have no effect: parameters are read in `on_configure`."""
     commands = built.activated()
     change = "change controller.K2 6.0 15.0"
     limits, other = "change torque_limits 1.0 1.0", "change use_sim_time 1.0"
@@ -351,10 +312,7 @@ def test_a_parameter_of_a_configured_controller_cannot_be_changed(built, updates
     again = ["deactivate", "cleanup", change, "configure", commands[-1]]
     lines = built.answers([*commands, *again, *steps])
     assert "change SUCCESS" in lines
-    found = efforts_of(lines)
-    np.testing.assert_array_equal(
-        found, built.efforts(updates[:10], "numbers controller.K2 6.0 15.0")
-    )
+    np.testing.assert_array_equal(efforts_of(lines), changed[:10])
 
 
 REFUSED = [
@@ -371,14 +329,10 @@ REFUSED = [
 ]
 
 
-def test_parameters_that_do_not_fit_are_refused(built):
+def test_parameters_and_names_that_do_not_fit_are_refused(scenario, built, tmp_path):
     for command, words in REFUSED:
         lines = built.answers(["rate 500", command, "init", "configure"])
-        assert "configure ERROR" in lines
-        assert logged(lines)[0].startswith(words)
-
-
-def test_names_of_the_robots_file_cannot_be_replaced(scenario, built, tmp_path):
+        assert "configure ERROR" in lines and logged(lines)[0].startswith(words)
     names = ['a "b" \\', "\u00e9??/"]
     built = Built(tmp_path, scenario, like=built, joints=names, has_joint_names=True)
     lines = built.answers(["rate 500", "texts joints a b", "init", "configure"])
@@ -388,7 +342,7 @@ def test_names_of_the_robots_file_cannot_be_replaced(scenario, built, tmp_path):
     assert cpp_string('"?\n') == '"\\042\\077\\012"'
 
 
-def test_the_files_of_the_package_fit_together(built):
+def test_the_files_fit_together_and_a_period_without_a_whole_rate_has_none(scenario, built):
     package = "iblf_law_controller"
     assert ElementTree.fromstring(built.files["package.xml"]).findtext("name") == package
     plugin = ElementTree.fromstring(built.files["law_controller.xml"])
@@ -396,9 +350,6 @@ def test_the_files_of_the_package_fit_together(built):
     assert plugin[0].attrib["type"] == f"{package}::LawController"
     cmake = built.files["CMakeLists.txt"]
     assert "${PROJECT_NAME}" in cmake and "src/law_controller.cpp src/iblf_law.c" in cmake
-
-
-def test_a_period_without_a_whole_rate_has_no_controller(scenario, built):
     scenario = canonical(ij.with_parts(scenario, sampling=ij.Sampling(3e-3)))
     law = Law(scenario, control_law(scenario, False), "iblf_law", False, built.vectors, (), None)
     with pytest.warns(UserWarning, match=r"period = 0.003 s is not the period of a whole number"):
