@@ -46,10 +46,12 @@ from iblf_jax.tuning.robust import Risk
 from iblf_jax.tuning.runs import NUMBERS_A_RUN
 from iblf_jax.tuning.samples import SampleRequest
 from iblf_jax.tuning.search import (
+    MANY_GAINS,
     REPAIR,
     REPAIR_STARTS,
     SAME_OBJECTIVE,
     SECOND_SEARCH,
+    STARTS_AROUND,
     STARTS_AT_ENDS,
     Search,
     Strategy,
@@ -225,11 +227,19 @@ def search_of(
         second_starts = min(effort.second_starts, starts)
         second_points = count // 3 if second_starts else 0
         at_ends = 0
+        starts_around = 0
         # Other solvers are for many numbers, of which there are too many pairs.
         if isinstance(solver, SQP) and count and len(z) > FEW_STARTS:
             at_ends = STARTS_AT_ENDS
+            starts_around = STARTS_AROUND if problem.size >= MANY_GAINS else 0
         strategy = Strategy(
-            screening, effort.selection, len(z), second_points, second_starts, at_ends
+            screening,
+            effort.selection,
+            len(z),
+            second_points,
+            second_starts,
+            at_ends,
+            starts_around,
         )
     else:
         z = starting_points(problem.box, starts, seed)
@@ -395,9 +405,9 @@ def _tried(search: Search) -> tuple[str, ...]:
             f"no gains that keep the requirements were found; the largest excess was minimised from"
             f" up to {REPAIR_STARTS} points, {how}: {least:.3g}"
         )
-    elif phase == SECOND_SEARCH:
+    elif phase >= SECOND_SEARCH:
         places = []
-        if search.strategy.second_points or search.reached_by_one_start:
+        if search.state.phases_around:
             places.append("the best points near them")
         if search.strategy.starts_at_ends:
             places.append("points with one or two of them at an end of their range")

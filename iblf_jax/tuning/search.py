@@ -34,7 +34,7 @@ A stage but the last one ends when all starts have converged to COARSE_TOLERANCE
 steps without a better result, or, in problems without requirements, after COARSE_STEPS steps of
 several starts or STEPS_PER_UPDATE steps of one.
 
-Phases.  A search with a `Strategy` has up to three phases:
+Phases.  A search with a `Strategy` has up to four phases:
 
 1. OPTIMISE.  All starts take steps as one batch.
 2. REPAIR, if phase 1 ends without a feasible point.  As many further points as before are
@@ -53,6 +53,14 @@ Phases.  A search with a `Strategy` has up to three phases:
    scenario's gains: the best optimum is often near a good one.  Where only one of many starts came
    within SAME_OBJECTIVE of the best objective (`reached_by_one_start`), such a search follows too,
    from STARTS_IF_SINGLE of a third as many points as before.
+4. SEARCH_AROUND, with `Strategy.starts_around`, where few starts came within SAME_OBJECTIVE of the
+   best objective (`reached_by_few_starts`) and phase 3 began at no points that are spread around
+   the incumbent.  It begins at the best of a third as many points of this kind as before.  It
+   follows again where such a phase improved the objective by more than SAME_OBJECTIVE, until
+   MOST_AROUND phases began at such points.  In problems of many gains the best optimum may differ
+   in most of them from the second best.  On a problem of 14 gains two of three searches ended 1 %
+   above the best known objective at an optimum to which all of 16 starts within 0.3 returned, and
+   each of four sets of eight starts of this phase, taken to their ends, led to within 0.1 % of it.
 
 Every phase also ends after `patience` steps without a better result.  A search without a strategy
 has phase 1 only.
@@ -69,6 +77,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -132,7 +141,7 @@ KEPT = 3
 """One of so many starts continues after a selection."""
 SELECTIONS_BY_DISTANCE = 2
 """Number of selections in which only starts end that have come near a better one."""
-OPTIMISE, REPAIR, SECOND_SEARCH = range(3)
+OPTIMISE, REPAIR, SECOND_SEARCH, SEARCH_AROUND = range(4)
 """The phases of a search, in order."""
 REPAIR_STEPS = 30
 """Largest number of steps of the phase REPAIR."""
@@ -157,6 +166,11 @@ STARTS_AT_ENDS = 4
 """Number of starts of the second search that have one or two gains at an end of their range."""
 STARTS_IF_SINGLE = 12
 """Number of starts of the second search where no other start confirms the best objective."""
+STARTS_AROUND = 8
+"""Number of starts of the phase SEARCH_AROUND, in problems of at least MANY_GAINS numbers."""
+MANY_GAINS = 10
+MOST_AROUND = 3
+"""Largest number of phases that begin at points around the incumbent."""
 STEP_FACTOR = 4.0
 """Change of the objective at a quarter of the time step, relative to the median of the starts,
 above which a point does not count."""
@@ -183,6 +197,8 @@ class Strategy(NamedTuple):
     starts_at_ends: int = 0
     """Number of starts of this phase with one or two gains at an end of their range and all others
     as the best ones.  If it is not 0, the phase always follows."""
+    starts_around: int = 0
+    """Number of starts of the phase SEARCH_AROUND."""
     at_quarter_step: Callable[[np.ndarray], np.ndarray] | None = None
     """The objective at a quarter of the time step at points z, (N, p), as
     `objective_at_quarter_step`.
@@ -222,7 +238,7 @@ class SearchState:
     iteration: int = 0
     """Steps in all."""
     phase: int = OPTIMISE
-    """OPTIMISE, REPAIR or SECOND_SEARCH."""
+    """OPTIMISE, REPAIR, SECOND_SEARCH or SEARCH_AROUND."""
     phase_steps: int = 0
     """Steps in this phase."""
     stage: int = 0
@@ -235,8 +251,10 @@ class SearchState:
     """Points that were evaluated with derivatives."""
     plain_values: int = 0
     """Points that were evaluated without derivatives."""
-    first_objective: np.ndarray = dataclasses.field(default_factory=lambda: np.asarray(np.inf))
-    """The objective of the incumbent at the end of the first phase, ()."""
+    counted_objective: np.ndarray = dataclasses.field(default_factory=lambda: np.asarray(np.inf))
+    """The objective of the incumbent when the starts near it were counted, ()."""
+    phases_around: int = 0
+    """Number of phases that began at points spread around the incumbent."""
     unresolved: int = 0
     """Starts that were retired because their objective depends on the time step."""
     largest_change: np.ndarray = dataclasses.field(default_factory=lambda: np.asarray(np.nan))
@@ -460,18 +478,20 @@ class Search:
         state = self.state
         if self.strategy is None:
             return False
-        if state.phase == SECOND_SEARCH:
-            if not self._are_near_best(state.first_objective):
-                # No start of the first phase came near the better gains of this one.
+        if state.phase >= SECOND_SEARCH:
+            has_improved = not self._are_near_best(state.counted_objective)
+            if has_improved:
+                # No start of the phases before came near the better gains of this one.
                 state.valleys[2] = self._starts_near_best()
-            return False
+                state.counted_objective = np.asarray(state.incumbent_key[1])
+            return (has_improved or not state.phases_around) and self._begin_around()
         if state.phase == REPAIR and self.is_violated:
             state.repair_ended = bool(self.conditions().hold)
             return False
         if state.phase == OPTIMISE:
             self._consider_points(self.strategy.screening.points, self.strategy.screening.found)
             state.valleys = self._valleys()
-            state.first_objective = np.asarray(state.incumbent_key[1])
+            state.counted_objective = np.asarray(state.incumbent_key[1])
             # A sampling period is a whole number of steps and has no derivative, so that the values
             # with other periods than that of the incumbent are compared.
             problem = self.evaluate.problem
@@ -486,7 +506,8 @@ class Search:
             is_explored = bool(np.any((distance <= SAME_VALLEY) & ~state.retired))
             is_last = self.strategy.second_starts == 0 and not self.reached_by_one_start
             if is_last and stopped == "converged" and is_explored and self.conditions().hold:
-                return self._begin_at_ends()
+                has_begun = self._begin_beside_best(SECOND_SEARCH, self._starts_at_ends)
+                return has_begun or self._begin_around()
         points, starts = self.strategy.second_points, self.strategy.second_starts
         has_ended = state.phase == OPTIMISE and stopped != "iterations used up"
         if not points and has_ended and self.reached_by_one_start:
@@ -498,22 +519,38 @@ class Search:
         self._begin_phase(SECOND_SEARCH, z)
         return True
 
-    def _begin_at_ends(self) -> bool:
-        """Begins a second search around an optimum from points at the ends of the ranges; returns
-        whether there are such points.  The start that converged there only takes part in the
-        selections, so that starts that come near it end.
+    def _begin_beside_best(self, phase: int, starts: Callable[[], np.ndarray]) -> bool:
+        """Begins a phase from points that are chosen around an optimum; returns whether there are
+        such points.  The start that converged there only takes part in the selections, so that
+        starts that come near it end.
+
+        Args:
+          phase: SECOND_SEARCH or SEARCH_AROUND.
+          starts: function that returns the points, (k, p).
         """
         state = self.state
         s = self._converged_near_incumbent()[0]
         optimum = state.incumbent_z  # one of the points may become the incumbent
         key = state.incumbent_key
-        z = self._starts_at_ends()
+        z = starts()
         if not len(z):
             return False
-        self._begin_phase(SECOND_SEARCH, z[: len(state.finished) - 1], converged=s)
+        self._begin_phase(phase, z[: len(state.finished) - 1], converged=s)
         state.best_z[s] = optimum
         state.best_key[s] = key
         return True
+
+    def _begin_around(self) -> bool:
+        """Begins the phase SEARCH_AROUND where few starts came near the best objective; returns
+        whether it has.
+        """
+        strategy = self.strategy
+        assert strategy is not None
+        starts = strategy.starts_around
+        if not starts or self.state.phases_around == MOST_AROUND or not self.reached_by_few_starts:
+            return False
+        points = len(strategy.screening.points) // 3
+        return self._begin_beside_best(SEARCH_AROUND, partial(self._second_starts, points, starts))
 
     def _starts_at_ends(self) -> np.ndarray:
         """The best points that differ from the incumbent in one gain or two, which are at an end of
@@ -537,7 +574,8 @@ class Search:
         best = self.state.incumbent_z[None]
         if count_of_points:
             box = dataclasses.replace(problem.box, z=best[0])
-            seed = int(problem.options.seed) + SECOND_SEED_OFFSET
+            seed = int(problem.options.seed) + SECOND_SEED_OFFSET + self.state.phases_around
+            self.state.phases_around += 1
             return self._best_of(spread_points(box, count_of_points, seed), count)
         screening = self.strategy.screening
         count = min(2, len(self.state.finished)) - 1

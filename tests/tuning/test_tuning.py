@@ -33,8 +33,10 @@ from iblf_jax.tuning.ranges import BY_STEP, BY_THEOREM, STABILITY_FRACTION, TIME
 from iblf_jax.tuning.result import FEW_STARTS_NEAR, STUCK
 from iblf_jax.tuning.robust import Risk, combine
 from iblf_jax.tuning.search import (
+    OPTIMISE,
     REPAIR,
     SAME_OBJECTIVE,
+    SEARCH_AROUND,
     SECOND_SEARCH,
     Search,
     SearchState,
@@ -842,3 +844,23 @@ def test_a_search_that_converged_goes_on_from_the_ends_of_the_ranges():
     assert np.any(np.all(z == 1.5, axis=1)) and np.min(keys) == pytest.approx(LOW)
     assert search.state.incumbent_key[1] == pytest.approx(DEEP)
     assert search.conditions().hold and search.state.valleys[2] == 1
+
+
+@pytest.mark.parametrize("deep", [[1.9, 0.5], [1.9, 0.5, 0.8, 1.2]])
+def test_a_search_around_the_best_gains_follows_where_few_starts_came_near_them(deep):
+    """It begins after the phases that the search has without it, and adds to what they found."""
+    starts = rows(*deep, *np.linspace(-3.9, -1.6, 7))
+    search = search_from(valleys, starts, selection=3, z=-0.6, starts_around=2)
+    phases = []
+    search.run(60, lambda x: phases.append(x.state.phase))
+    few = len(deep) == 2
+    assert search.state.phases_around == few and (SEARCH_AROUND in phases) == few
+    assert search.state.incumbent_key[1] == pytest.approx(DEEP)
+    assert search.conditions().hold and search.state.valleys[2] == len(deep)
+    spread = few * (len(starts) // 3)
+    assert search.state.plain_values == len(starts) + spread
+    without = search_from(valleys, starts, selection=3, z=-0.6)
+    without.run(60)
+    steps = phases.count(OPTIMISE)
+    assert len(without.history["z"]) == steps and len(search.history["z"]) == len(phases)
+    np.testing.assert_array_equal(without.history["z"], search.history["z"][:steps])
