@@ -421,8 +421,8 @@ def _law_has_limits(scenario: Scenario, limits: np.ndarray) -> bool:
     law = scenario.controller
     if type(law) is not controllers.Saturated or law.has_auxiliary or scenario.sampling is not None:
         return False
-    alone = dataclasses.replace(scenario, actuator=Ideal())
-    return bool(np.array_equal(np.asarray(without_limits(alone)[1]), limits))
+    without_motor = dataclasses.replace(scenario, actuator=Ideal())
+    return bool(np.array_equal(np.asarray(without_limits(without_motor)[1]), limits))
 
 
 # --- what is supported -------------------------------------------------------------------------
