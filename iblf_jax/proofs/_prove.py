@@ -9,7 +9,9 @@ V_w = V with the weight w of the estimation error.  Four steps answer:
    faster, branch and bound with outward rounding decides whether V_w' < 0 everywhere.  For a
    sampled loop, a search before it proves bounds of the rates of a held torque.
 3. At this weight, bounds of the torque on the whole set are proved. Limits of the torque are part
-   of the statement: weights with a torque beyond them do not count.
+   of the statement: weights with a torque beyond them do not count. Where all of them have one, or
+   where no proof is found that the torque is within the limits, steps 1 and 2 are repeated for the
+   loop whose limits are active.
 4. Without a proof, runs start at the points with the largest V_w': one that violates the bounds
    refutes the statement, and of a sampled loop one with V_w > level at a sample.
 """
@@ -103,7 +105,8 @@ def prove(
 
     Args:
       scenario: the loop of a robot with the corrected backstepping law and the momentum observer,
-        whose torque may have limits (`Saturated`, `Motor`), or of a plant in strict-feedback form
+        whose torque may have limits (`Saturated`, `Motor`; those of `Saturated` without an
+        auxiliary state may be active in a continuous loop), or of a plant in strict-feedback form
         of order 2 or 3 with one number per level and the law `BarrierBackstepping`.  The loop of a
         robot may be sampled, without delay, with exact measurements or positions rounded to counts
         of an `Encoder`; the statement then is about all times, also between samples.
@@ -155,6 +158,10 @@ def prove(
         if start is not None:
             choice = LevelChoice(start.level(findings["weight"]), largest)
             findings["level_choice"] = choice
+        fields = {
+            "rates": {each.weight: each.largest for each in sampled},
+            "assumptions": problem.assumptions,
+        } | findings
         return Proof(
             scenario=scenario,
             parameters=dict(parameters),
@@ -163,10 +170,8 @@ def prove(
             duration=problem.duration,
             is_period=problem.is_period,
             seconds=time.monotonic() - begin,
-            rates={each.weight: each.largest for each in sampled},
-            assumptions=problem.assumptions,
             disturbance_rate=disturbance_rate,
-            **findings,
+            **fields,
         )
 
 
@@ -203,10 +208,13 @@ def _chosen_level(
         except ValueError:  # the level reaches the guard of the barrier
             return False
         sampled = sample_weights(problem, level, some, options.seed)
-        return any(
-            each.largest <= 0.0 and _excess(problem, level, each, options) <= 0.0
-            for each in sampled
-        )
+        decreasing = [each for each in sampled if each.largest <= 0.0]
+        if any(_excess(problem, level, each, options) <= 0.0 for each in decreasing):
+            return True
+        limited = problem.with_active_limits
+        if limited is None:
+            return False
+        return any(x.largest <= 0.0 for x in sample_weights(limited, level, some, options.seed))
 
     start = start_of(problem)
     return start, proposed_level(start, weights, decreases)
@@ -300,8 +308,20 @@ def _decided(
     decreasing = [each for each in sampled if each.largest <= 0.0]
     excesses = [_excess(problem, level, each, options) for each in decreasing]
     admitted = [each for each, excess in zip(decreasing, excesses, strict=True) if excess <= 0.0]
+    limited = problem.with_active_limits
     if admitted:
-        return _searched_at_best(problem, level, admitted, options)
+        found = _searched_at_best(problem, level, admitted, options)
+        needs_limits = found["verdict"] == Verdict.UNDECIDED and found.get("done") == 1.0
+        if limited is None or not needs_limits:
+            return found
+    if limited is not None:
+        weights = [each.weight for each in sampled]
+        again = sample_weights(limited, level, weights, options.seed)
+        return {
+            "has_active_limits": True,
+            "rates": {each.weight: each.largest for each in again},
+            "assumptions": limited.assumptions,
+        } | _decided(limited, level, again, options)
     best = min(sampled, key=lambda each: each.largest)
     fields: dict[str, Any] = {}
     if decreasing:
@@ -335,7 +355,9 @@ def _searched_at_best(
     is_proved = result.proved and not found.is_of_held_rates
     is_within = True
     if problem.torque is not None:
-        torque = _torque(problem, level, best, options, to_prove=is_proved)
+        # What the law commands beyond its limits needs no bound.
+        to_prove = is_proved and not problem.limits_may_be_active
+        torque = _torque(problem, level, best, options, to_prove=to_prove)
         fields["torque"] = torque
         is_within = problem.torque.limits is None or torque.is_proved
     violation, verdict = None, Verdict.PROVED

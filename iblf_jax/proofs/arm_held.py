@@ -55,7 +55,6 @@ section above are h R_u + E_u and h R_L + E_L.
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
 from typing import Any, NamedTuple, cast
 
 import jax
@@ -259,15 +258,12 @@ class FirstRates(NamedTuple):
     """u_h + n, (n,) [N m]."""
 
 
-def first_rates(constants: Constants, places: Places, at: Errors, z: jax.Array) -> FirstRates:
-    """The rates of u_h and n, and F, at errors."""
+def mismatch_slope(constants: Constants, places: Places, at: Errors, z: jax.Array) -> jax.Array:
+    """F, the derivative of f along e2 at a given f_tilde, (n, n) [N m s/rad]."""
     parts, n = constants.parts, at.xi.shape[-1]
     inside, directions, sizes = differences(constants, places, z)
     of_model = (parts.model, parts.disturbance)
     zero = jnp.zeros(n)
-
-    def functions(at: Errors) -> tuple[jax.Array, jax.Array]:
-        return free_torque(parts, at), momentum_term(parts, at)
 
     def terms(at: Errors) -> tuple[jax.Array, list[jax.Array]]:
         now = kinematics(parts, at, zero)
@@ -278,25 +274,35 @@ def first_rates(constants: Constants, places: Places, at: Errors, z: jax.Array) 
         external = arm_motion.external_torque(with_plant(parts, of_model), now)
         return external, [along(required, (inside,), (direction,)) for direction in directions]
 
-    torque, momentum = along(functions, (at,), (path_rates(parts, at, zero, 0.0),))
-    torque_columns, momentum_columns, mismatch_columns = [], [], []
-    for unit in jnp.eye(n):
-        step = Errors(jnp.zeros_like(at.t), jnp.zeros_like(at.xi), unit)
-        along_torque, along_momentum = along(functions, (at,), (step,))
+    columns = []
+    for step in steps_of_e2(at):
         column, of_parameters = along(terms, (at,), (step,))
         for size, term in zip(sizes, of_parameters, strict=True):
             column = column - size * term
-        torque_columns.append(along_torque)
-        momentum_columns.append(along_momentum)
-        mismatch_columns.append(column)
+        columns.append(column)
+    return jnp.stack(columns, axis=-1)
 
-    def matrix(columns: Sequence[jax.Array]) -> jax.Array:
-        return jnp.stack(columns, axis=-1)
 
+def steps_of_e2(at: Errors) -> list[Errors]:
+    """The directions of the entries of e2."""
+    zero = jax.tree.map(jnp.zeros_like, at)
+    return [zero._replace(e2=unit) for unit in jnp.eye(len(at.e2))]
+
+
+def first_rates(constants: Constants, places: Places, at: Errors, z: jax.Array) -> FirstRates:
+    """The rates of u_h and n, and F, at errors."""
+    parts, n = constants.parts, at.xi.shape[-1]
+
+    def functions(at: Errors) -> tuple[jax.Array, jax.Array]:
+        return free_torque(parts, at), momentum_term(parts, at)
+
+    torque, momentum = along(functions, (at,), (path_rates(parts, at, jnp.zeros(n), 0.0),))
+    columns = [along(functions, (at,), (step,)) for step in steps_of_e2(at)]
+    of_torque, of_momentum = (jnp.stack(rows, axis=-1) for rows in zip(*columns, strict=True))
     return FirstRates(
-        Affine(torque, matrix(torque_columns)),
-        Affine(momentum, matrix(momentum_columns)),
-        matrix(mismatch_columns),
+        Affine(torque, of_torque),
+        Affine(momentum, of_momentum),
+        mismatch_slope(constants, places, at, z),
         momentum_rate(parts, at),
     )
 

@@ -73,6 +73,9 @@ class ArmParts(NamedTuple):
     in a period, (n,) [1/s]; None where it is kf."""
     measurement_error: jax.Array | None = None
     """Bound of the errors of the positions that samples read, (n,) [rad]; None for exact ones."""
+    torque_limits: jax.Array | None = None
+    """Least and greatest torque, (2, n) [N m], where a torque of the law may be beyond them; None
+    where none is."""
 
 
 class Errors(NamedTuple):

@@ -10,6 +10,15 @@ where Z_k and M_k are derivatives along coordinate k at f_tilde = 0, and d0 is f
 disturbance at the model's parameters.  The best direction of f_tilde adds b times the length of a
 row of the matrix.
 
+**Limits.**  A torque tau = sat(u) of the law's torque u adds c . D to V_w' (`arm_limits`), with D =
+sat(u) - u and a vector c.  Where u_i is above its limit, D_i < 0 adds to it for c_i < 0 alone, and
+the reverse below the limit, so that
+
+    c_i D_i <= max(0, P_i),
+    P_i = max(-c_i, 0) (u_i - highest_i) + max(c_i, 0) (lowest_i - u_i)                       (T.2)
+
+is an equality where it is positive.  P_i is affine in f_tilde.
+
 **Coordinates.**  Those of `arm_bound` on V_w = c share^2, with a further one, share in [0, 1],
 behind the parameters: they cover the whole set, not its boundary alone.
 """
@@ -20,7 +29,9 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.core.linalg import matmul, matvec
+from iblf_jax.kernels import hull, lower, upper
 from iblf_jax.proofs.arm_bound import (
+    Affine,
     ArmErrors,
     Constants,
     arm_errors,
@@ -66,7 +77,8 @@ def torque_excess(
     share = x[2 * n + 1 + m]
     at = coordinates(jnp.concatenate([x[: 2 * n + 1 + m], x[2 * n + 2 + m :]]), n, m)
     point = arm_errors(constants._replace(level=constants.level * share**2), at)
-    middle, reach = _torque(constants, places, point, at.z)
+    torque = law_torque(constants, places, point, at.z)
+    middle, reach = torque.value, point.b * row_lengths(torque.slope)
     above = middle + reach - highest
     below = lowest - (middle - reach)
     excess = jnp.max(jnp.maximum(above, below) / (highest - lowest))
@@ -74,10 +86,8 @@ def torque_excess(
     return jnp.where(inside, excess, jnp.inf)[None]
 
 
-def _torque(
-    constants: Constants, places: Places, point: ArmErrors, z: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """The torque at f_tilde = 0, and how far f_tilde moves it, (n,) each [N m]."""
+def law_torque(constants: Constants, places: Places, point: ArmErrors, z: jax.Array) -> Affine:
+    """The torque (T.1) as a function of f_tilde [N m]."""
     parts, at = constants.parts, point.errors
     n = at.xi.shape[-1]
     now = motion(parts, at, jnp.zeros(n)).now
@@ -97,4 +107,42 @@ def _torque(
         )
         torque = torque + size * column
         factor = factor + size * matmul(mass_along(change.inside, direction, now.q), M0_inverse)
-    return torque, point.b * jnp.stack([norm(factor[i]) for i in range(n)])
+    return Affine(torque, factor)
+
+
+def row_lengths(matrix: jax.Array) -> jax.Array:
+    """The length of each row of an (n, n) matrix, (n,)."""
+    return jnp.stack([norm(matrix[i]) for i in range(len(matrix))])
+
+
+def values_of(torque: Affine, b: jax.Array) -> jax.Array:
+    """The torque for all f_tilde of the length b, (n,) [N m]."""
+    reach = b * row_lengths(torque.slope)
+    return torque.value + hull(reach, -reach)
+
+
+def cut(torque: jax.Array, limits: jax.Array) -> jax.Array:
+    """D = sat(u) - u, (n,) [N m].
+
+    Args:
+      torque: u, (n,) [N m].
+      limits: least and greatest torque, (2, n) [N m].
+    """
+    lowest, highest = limits
+    return jnp.minimum(highest - torque, 0.0) + jnp.maximum(lowest - torque, 0.0)
+
+
+def power_of_cut(c: jax.Array, torque: Affine, values: jax.Array, limits: jax.Array) -> Affine:
+    """P of (T.2) as a function of f_tilde, (n,) [N m rad/s].
+
+    Args:
+      c: (n,) [rad/s].
+      torque: u as a function of f_tilde.
+      values: the torques that are cut, (n,) [N m]; where none is beyond a limit, P is 0.
+      limits: least and greatest torque, (2, n) [N m].
+    """
+    lowest, highest = limits
+    above = jnp.where(upper(values) <= highest, 0.0, jnp.maximum(-c, 0.0))
+    below = jnp.where(lower(values) >= lowest, 0.0, jnp.maximum(c, 0.0))
+    value = above * (torque.value - highest) + below * (lowest - torque.value)
+    return Affine(value, (above - below)[:, None] * torque.slope)

@@ -11,7 +11,7 @@ import functools
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from typing import ClassVar, NamedTuple, cast
+from typing import Any, ClassVar, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -19,13 +19,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from iblf_jax.control import controllers, observers, sensors
+from iblf_jax.control.actuators import Ideal
 from iblf_jax.core import checks
 from iblf_jax.core.linalg import matvec
 from iblf_jax.core.pytree import astype
 from iblf_jax.proofs import arm_held, arm_motion, uncertainty
 from iblf_jax.proofs.arm_bound import Constants, arm_bound
+from iblf_jax.proofs.arm_limits import limited_bound
 from iblf_jax.proofs.arm_motion import ArmParts, Errors, position
-from iblf_jax.proofs.arm_torque import torque_excess
+from iblf_jax.proofs.arm_torque import cut, torque_excess
 from iblf_jax.proofs.matrices import solve_transposed, upper_factor
 from iblf_jax.proofs.parameters import Uncertain, uncertain_coordinates
 from iblf_jax.proofs.problem import (
@@ -76,6 +78,11 @@ HELD_TORQUE = (
     " V_w of a state between samples is that of the torque that the law would command there, and of"
     " the estimate interpolated by (G.6).",
 )
+ACTIVE_LIMITS = (
+    "The limits cut the torque of the law, and the observer receives what is left. V_w is that of"
+    " the torque before the limits."
+)
+"""What is added where limits of the torque may be active."""
 ENCODERS = (
     "V_w is that of the true state, and of the estimate that the observer would give with the true"
     " momentum; a torque on the set differs from the law's one at the true state by what the errors"
@@ -105,6 +112,16 @@ class ArmBound(OfStructure):
         return arm_bound(self.places, n, x, numbers), jnp.zeros((0,))
 
 
+class LimitedArmBound(OfStructure):
+    """The bound of arms of one structure whose limits of the torque may be active."""
+
+    def __call__(self, x: jax.Array, constants: list[jax.Array]) -> tuple[jax.Array, jax.Array]:
+        """The upper bound of V_w' over a box, and no region."""
+        numbers: Constants = jax.tree.unflatten(self.structure, constants)
+        n = numbers.parts.kf.shape[0]
+        return limited_bound(self.places, n, x, numbers), jnp.zeros((0,))
+
+
 class ArmRate(OfStructure):
     """V_w' at a point of arms of one structure."""
 
@@ -113,8 +130,15 @@ class ArmRate(OfStructure):
         numbers: Constants = jax.tree.unflatten(self.structure, constants)
         at = point_of(self.places, jnp.asarray(point), numbers)
         rate = arm_motion.lyapunov_rate(at.parts, numbers.weight, at.errors, at.f_tilde, at.rate)
-        now = arm_motion.motion(at.parts, at.errors, at.f_tilde).now
-        return infinite_unless_defined(rate, arm_motion.required_torque(at.parts, now))
+        torque = torque_of(at)
+        rate = infinite_unless_defined(rate, torque)
+        limits = at.parts.torque_limits
+        if limits is None:
+            return rate
+        D = cut(torque, limits)
+        return rate + arm_held.held_addition(
+            at.parts, numbers.weight, at.errors, at.f_tilde, D, jnp.zeros_like(D)
+        )
 
 
 class SampledArmBound(OfStructure):
@@ -191,11 +215,8 @@ class ArmTorque(OfStructure):
 
     def __call__(self, point: jax.Array, constants: list[jax.Array]) -> jax.Array:
         """The torque that the true plant needs, which is that of the law, (n,) [N m]."""
-        at = point_of(
-            self.places, jnp.asarray(point), jax.tree.unflatten(self.structure, constants)
-        )
-        now = arm_motion.motion(at.parts, at.errors, at.f_tilde).now
-        return arm_motion.required_torque(at.parts, now)
+        numbers: Constants = jax.tree.unflatten(self.structure, constants)
+        return torque_of(point_of(self.places, jnp.asarray(point), numbers))
 
 
 class ArmPoint(NamedTuple):
@@ -206,6 +227,12 @@ class ArmPoint(NamedTuple):
     f_tilde: jax.Array
     rate: jax.Array | float
     """Rate of the further disturbance, (n,) [N m/s]."""
+
+
+def torque_of(at: ArmPoint) -> jax.Array:
+    """The torque of the law at a point, which the true plant needs for the motion, (n,) [N m]."""
+    now = arm_motion.motion(at.parts, at.errors, at.f_tilde).now
+    return arm_motion.required_torque(at.parts, now)
 
 
 def point_of(places: Places, point: jax.Array, constants: Constants) -> ArmPoint:
@@ -235,10 +262,15 @@ def point_of(places: Places, point: jax.Array, constants: Constants) -> ArmPoint
 class ArmProblem(LevelSetProblem):
     """The proof problem of an arm."""
 
-    bound: ArmBound | SampledArmBound
+    bound: ArmBound | SampledArmBound | LimitedArmBound
     parts: ArmParts
     units: ClassVar[tuple[str, str]] = ("rad/(N m)", "N m rad")
     first_barrier: ClassVar[str] = "barrier"
+
+    @property
+    def limits_may_be_active(self) -> bool:
+        """Whether the statement is that of a loop whose limits of the torque may be active."""
+        return self.parts.torque_limits is not None
 
     @property
     def angles(self) -> list[tuple[str, float, float]]:
@@ -338,34 +370,59 @@ def arm_problem(
         examination = examined(scenario, digests, agreement_of_robot, barriers, homogeneous=True)
         _check_tube(scenario, length)
         _check_mass_matrices(parts, uncertain)
+        limited_parts = None
+        if limits is not None and _law_has_limits(scenario, limits):
+            limited_parts = parts._replace(torque_limits=jnp.asarray(limits))
+    claims = claim_sentences([parts.law.barrier])
+    has_torque = disturbance_rate is None and parts.measurement_error is None
+
+    def problem(parts: ArmParts, more: Sequence[str], **fields: Any) -> ArmProblem:
+        """The problem of a loop with these parts."""
         zero = jnp.zeros(())
         structure = jax.tree.structure(Constants(parts, uncertain.numbers, zero, zero))
-    of_structure = (structure, uncertain.places, tuple(examination.digests))
-    claims = claim_sentences([parts.law.barrier])
-    assumptions = (
-        *_timing(scenario, limits, parts.measurement_error),
-        EXACT,
-        *claims,
-        *examination.assumed,
-    )
-    torque = TorqueFunctions(ArmTorque(*of_structure), ArmTorqueExcess(*of_structure), limits)
-    bound: ArmBound | SampledArmBound = ArmBound(*of_structure)
-    rate, held_torque = ArmRate(*of_structure), None
-    if scenario.sampling is not None:
-        bound, rate = SampledArmBound(*of_structure), SampledArmRate(*of_structure)
-        held_torque = HeldFunctions(HeldRates(*of_structure), HeldRatesExcess(*of_structure))
-    return ArmProblem(
-        scenario,
-        uncertain,
-        bound,
-        rate,
-        torque if disturbance_rate is None and parts.measurement_error is None else None,
-        held_torque,
-        length,
-        is_period,
-        assumptions,
-        parts,
-    )
+        of_structure = (structure, uncertain.places, tuple(examination.digests))
+        within = limits if parts.torque_limits is None else None
+        torque = TorqueFunctions(ArmTorque(*of_structure), ArmTorqueExcess(*of_structure), within)
+        bound: ArmBound | SampledArmBound | LimitedArmBound = ArmBound(*of_structure)
+        rate, held_torque = ArmRate(*of_structure), None
+        if parts.torque_limits is not None:
+            bound = LimitedArmBound(*of_structure)
+        if scenario.sampling is not None:
+            bound, rate = SampledArmBound(*of_structure), SampledArmRate(*of_structure)
+            held_torque = HeldFunctions(HeldRates(*of_structure), HeldRatesExcess(*of_structure))
+        return ArmProblem(
+            scenario,
+            uncertain,
+            bound,
+            rate,
+            torque if has_torque else None,
+            held_torque,
+            length,
+            is_period,
+            (
+                *_timing(scenario, limits, parts.measurement_error),
+                *more,
+                EXACT,
+                *claims,
+                *examination.assumed,
+            ),
+            parts,
+            **fields,
+        )
+
+    active = None if limited_parts is None else problem(limited_parts, [ACTIVE_LIMITS])
+    return problem(parts, [], with_active_limits=active)
+
+
+def _law_has_limits(scenario: Scenario, limits: np.ndarray) -> bool:
+    """Whether the loop is continuous and its law itself cuts the torque at the limits, so that the
+    observer receives what is applied, and nothing else changes with it.
+    """
+    law = scenario.controller
+    if type(law) is not controllers.Saturated or law.has_auxiliary or scenario.sampling is not None:
+        return False
+    without_motor = dataclasses.replace(scenario, actuator=Ideal())
+    return bool(np.array_equal(np.asarray(without_limits(without_motor)[1]), limits))
 
 
 # --- what is supported -------------------------------------------------------------------------

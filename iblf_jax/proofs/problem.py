@@ -131,10 +131,18 @@ class LevelSetProblem(abc.ABC):
     """Whether the time interval is a period, so that the proof is for all times."""
     assumptions: tuple[str, ...]
     """What was assumed, as sentences."""
+    with_active_limits: LevelSetProblem | None = dataclasses.field(default=None, kw_only=True)
+    """The same statement of the loop whose limits of the torque may be active; None without limits,
+    and where its V_w' is not known."""
     units: ClassVar[tuple[str, str]]
     """Of a weight and of a level."""
     first_barrier: ClassVar[str]
     """The barrier of the positions in words."""
+
+    @property
+    def limits_may_be_active(self) -> bool:
+        """Whether the statement is that of a loop whose limits of the torque may be active."""
+        return False
 
     @property
     @abc.abstractmethod

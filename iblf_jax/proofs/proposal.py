@@ -24,6 +24,7 @@ import jax.numpy as jnp
 from iblf_jax.core import programs
 from iblf_jax.proofs.problem import LevelSetProblem
 from iblf_jax.proofs.sampled_values import before_sampling, terms
+from iblf_jax.proofs.torque import without_limits
 from iblf_jax.simulation import closed_loop, paths
 from iblf_jax.simulation.scenario import Scenario
 
@@ -59,8 +60,9 @@ class LevelChoice(NamedTuple):
     """V_w of the start at the weight of the proof, the largest one of the plants at the corners of
     the box."""
     largest: float
-    """The greatest level at which no point with V_w' > 0, and no torque beyond a limit, was found
-    for a weight whose set contains the start; 0 if there is none."""
+    """The greatest level at which no point with V_w' > 0, and no torque beyond limits that the
+    bound cannot take as active, was found for a weight whose set contains the start; 0 if there is
+    none."""
 
 
 class Proposal(NamedTuple):
@@ -78,7 +80,7 @@ def start_of(problem: LevelSetProblem) -> Start:
     energies, squares = [], []
     for corner in itertools.product(*zip(uncertain.low, uncertain.high, strict=True)):
         with_plant = paths.with_parameters(problem.scenario, uncertain.values(corner))
-        energy, square = _terms_of_start(before_sampling(with_plant))
+        energy, square = _terms_of_start(before_sampling(without_limits(with_plant)[0]))
         energies.append(float(energy))
         squares.append(float(square))
     return Start(max(energies), max(squares))
@@ -99,8 +101,8 @@ def proposed_level(
       start: of the scenario.
       weights: that may be chosen [rad/(N m)].
       decreases: level and weights -> whether a weight has no point of the level set with V_w' > 0
-        or with a torque beyond a limit, as far as one was found; False for a level that is not
-        admitted.
+        or with a torque beyond limits that may not be active, as far as one was found; False for a
+        level that is not admitted.
     """
     least = min(start.level(ROOM * w) for w in weights)
 

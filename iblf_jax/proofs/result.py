@@ -42,7 +42,8 @@ class Verdict(enum.StrEnum):
 
     PROVED = "proved"
     """V_w' < 0 at every point of V_w = level, for all times and parameters; with limits of the
-    torque, the law's torque is within them on the whole set."""
+    torque, either the law's torque is within them on the whole set, or V_w' is that of the loop
+    whose limits are active."""
     NOT_PROVED = "not proved"
     """Every weight that was tried has a point of the level set with V_w' > 0, or with a torque of
     the law beyond a limit."""
@@ -186,6 +187,9 @@ class Proof(Result):
     the observer, and of f of the law's torque, (3, n) [N m/s]; with errors of measurements two rows
     more, by how much they change torque and lag at a sample [N m]; None without a proof of them,
     and of a continuous loop."""
+    has_active_limits: bool = False
+    """Whether the statement is that of the loop whose limits of the torque are active where the law
+    commands more."""
     boxes: int = 0
     """Number of boxes that were evaluated for V_w'."""
     done: float = 0.0
@@ -232,7 +236,10 @@ class Proof(Result):
         from iblf_jax.proofs._prove import problem_of
 
         duration = None if self.is_period else self.duration
-        return problem_of(self.scenario, self.parameters, duration, self.disturbance_rate)
+        problem = problem_of(self.scenario, self.parameters, duration, self.disturbance_rate)
+        if not self.has_active_limits:
+            return problem
+        return checks.given(problem.with_active_limits)
 
     @property
     def torque_limits(self) -> np.ndarray | None:
@@ -322,6 +329,8 @@ class Proof(Result):
         within = ""
         if self.proved and self.torque_limits is not None:
             within = ", and the torque stays within its limits"
+            if self.has_active_limits:
+                within = " with its limits of the torque, which may be active"
         sampled = ""
         if self.scenario.sampling is not None:
             sampled = f" of the loop sampled every {float(self.scenario.sampling.period):.4g} s"
@@ -413,10 +422,18 @@ class Proof(Result):
             lines.append(f"Guaranteed on the whole set [N m]: |tau| <= {', '.join(texts)}.")
         if limits is None:
             return lines
-        if found.excess(limits) > 0.0:
+        if self.has_active_limits:
+            ends = zip(names, *limits, strict=True)
+            listed = ", ".join(f"{name} {low:.4g} to {high:.4g}" for name, low, high in ends)
+            lines.append(
+                f"That is the torque of the law before its limits, {listed} N m, cut it; V_w' is"
+                " that of the loop with these limits."
+            )
+        elif found.excess(limits) > 0.0:
             lines.append(
                 "That is beyond the limits at this weight, and at every other one with V_w' < 0."
-                " A smaller level, larger limits, or gains with less torque help."
+                " A smaller level, larger limits, or gains with less torque help. In a continuous"
+                " loop, those of Saturated without an auxiliary state may be active."
             )
         elif self.done == 1.0 and not found.is_proved:
             lines.append(
