@@ -141,7 +141,9 @@ CASES: dict[str, Callable[[], Any]] = {
     "actuator": lambda: under(backstepping(), actuator=ij.actuators.Motor(bandwidth=200.0)),
     "event trigger": event_triggered,
     # levels
-    "own claim, order 2, that fails": lambda: levels.double_integrator(levels.WithClaim(1.2)),
+    "own claim, order 2, that fails": lambda: levels.double_integrator(
+        levels.WithClaim(factor=1.2)
+    ),
     "order 2, vessel": ij.presets.vessel,
     "order 3, many runs": of_many_runs,
     "an observer of levels": lambda: observed(ij.observers.LevelObserver),

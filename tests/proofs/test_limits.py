@@ -7,14 +7,8 @@ import numpy as np
 import pytest
 from proof_cases import pendulum, within
 from test_arm_proofs import coordinates_of, paper_loop
-from test_sampled import (
-    KF,
-    MASSES,
-    WEIGHT,
-    SampledPendulum,
-    SampledTwoLinks,
-    added,
-)
+from test_sampled import KF, MASSES, WEIGHT, SampledPendulum, SampledTwoLinks, added
+from test_torque import limited
 
 import iblf_jax as ij
 from iblf_jax.kernels.enclosure import enclose
@@ -26,10 +20,6 @@ LEVEL = 0.5
 HIGHEST, LOWEST = 12.0, -9.0
 """Limits of the pendulum in tests of the bound [N m]: they cut every second torque on the set."""
 TWO_LIMITS = np.array([[-9.0, -5.0], [8.0, 4.5]])
-
-
-def limited(scenario, limit, **more):
-    return dataclasses.replace(scenario, controller=Saturated(scenario.controller, limit, **more))
 
 
 @functools.cache
@@ -80,7 +70,7 @@ def points_of(loop, state, factor):
 @pytest.mark.parametrize("name", CASES)
 def test_rate_of_a_torque_within_limits_is_that_of_other_equations(name):
     make, links, kf, width = CASES[name]
-    problem, loop = make(), links(kf, WEIGHT)
+    problem, loop = make(), links(kf)
     state, factor = states(loop, 400, LEVEL, width, 0)
     sample = cut_sample(loop, problem, state)
     assert 0.1 < np.mean(sample[0] != loop.sample(state)[0]) < 0.8
@@ -98,7 +88,7 @@ def bounds_at(problem, x):
 @pytest.mark.slow
 def test_bound_of_a_pendulum_is_near_the_rate_at_the_worse_estimation_error():
     """Of one joint the direction of f_tilde is a sign: a term that is too small is found."""
-    problem, loop = pendulum_problem(30.0), SampledPendulum(100.0, WEIGHT)
+    problem, loop = pendulum_problem(30.0), SampledPendulum(100.0)
     state, factor = states(loop, 1500, LEVEL, 0.3, 1)
     f_tilde = loop.f_tilde(*state, factor)
     rates, cuts = [], []
@@ -120,7 +110,7 @@ def test_bound_of_a_pendulum_is_near_the_rate_at_the_worse_estimation_error():
 
 @pytest.mark.slow
 def test_bound_of_two_links_is_above_the_rate_for_each_direction_of_the_estimation_error():
-    problem, loop = two_links_problem(), SampledTwoLinks(KF, WEIGHT)
+    problem, loop = two_links_problem(), SampledTwoLinks(KF)
     state, factor = states(loop, 600, LEVEL, 0.01, 5)
     size = np.linalg.norm(loop.f_tilde(*state, factor), axis=1, keepdims=True)
     rates, cuts = [], []
@@ -143,7 +133,7 @@ def test_bound_of_two_links_is_above_the_rate_for_each_direction_of_the_estimati
 @pytest.mark.parametrize("name", CASES)
 def test_bound_over_boxes_is_above_the_rate_of_their_points(name):
     make, links, kf, width = CASES[name]
-    problem, loop = make(), links(kf, WEIGHT)
+    problem, loop = make(), links(kf)
     state, factor = states(loop, 2000, LEVEL, width, 2)
     expected = loop.rate_of_lyapunov(state, cut_sample(loop, problem, state), factor)
     _, x = points_of(loop, state, factor)
@@ -208,7 +198,7 @@ def test_a_set_on_which_limits_are_active_is_proved_and_no_run_leaves_it():
     assert "with its limits of the torque, which may be active" in text
     assert "V_w is that of the torque before the limits" in text
     assert "stays within its limits" not in text
-    loop = SampledPendulum(100.0, WEIGHT)
+    loop = SampledPendulum(100.0)
     state, factor = most_limited(loop, found.problem, 1000, LEVEL, 0.01)
     np.testing.assert_allclose(loop.lyapunov(*state, factor), LEVEL, rtol=1e-9)
     step = 5e-4
