@@ -332,8 +332,8 @@ def check_function(
         # All in one program, because each program has a cost of its own.
         found = {"float32": function(low)}
         for name, transform, arguments in (
-            ("slopes", _slopes, (function, point, along)),
-            ("batch", _batch, (function, points)),
+            ("slopes", functools.partial(_slopes, function), (point, along)),
+            ("batch", jax.vmap(function), (points,)),
         ):
             try:
                 found[name] = transform(*arguments)
@@ -346,7 +346,7 @@ def check_function(
     if "slopes" in errors:
         problem = f"it cannot be differentiated ({first_line(errors['slopes'])})"
         findings.add(problem, "Use only jax.numpy")
-    elif found["slopes"] is not None:
+    else:
         _same_slopes(findings, function, values, point, along, found["slopes"], rtol)
     if "batch" in errors:
         problem = f"it does not work under vmap ({first_line(errors['batch'])})"
@@ -396,10 +396,6 @@ def _slopes(function: Callable, point: Any, along: Along) -> tuple[dict[str, jax
 
 def _dot(a: Any, b: Any) -> Any:
     return sum(jnp.vdot(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
-
-
-def _batch(function: Callable, points: Any) -> dict[str, jax.Array]:
-    return jax.vmap(function)(points)
 
 
 def _same_slopes(findings, function, values, point, along, slopes, rtol) -> None:

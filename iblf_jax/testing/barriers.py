@@ -21,6 +21,7 @@ from iblf_jax.testing._contract import (
     in_dtype,
     traced_methods,
 )
+from iblf_jax.testing.bounds import position_at
 from iblf_jax.testing.joints import examine_joints, scenario_of
 from iblf_jax.world.bounds import Tube
 
@@ -112,8 +113,8 @@ def check_barrier(barrier: object, *, n: int | None = None) -> None:
             )
         times = jnp.asarray(TIMES)
         numbers = _numbers(functions, fitted, context, times, k1, o)
-        for at_time in numbers:
-            _at_every_xi(findings, at_time, fitted.guard)
+        for i in range(len(times)):
+            _at_every_xi(findings, {name: x[i] for name, x in numbers.items()}, fitted.guard)
         _claims(findings, fitted, context, times, k1, numbers)
         _grows_without_bound(findings, fitted, context, times, k1, o)
 
@@ -139,14 +140,14 @@ def _numbers(
     times: jax.Array,
     k1: jax.Array,
     o: jax.Array | None,
-) -> list[dict[str, np.ndarray]]:
-    """The functions of a barrier at every xi, their derivatives with respect to q in both modes,
-    and the rate of V1 along q' = alpha; one record for each time.
+) -> dict[str, np.ndarray]:
+    """The functions of a barrier at every time and xi, their derivatives with respect to q in both
+    modes, and the rate of V1 along q' = alpha.
     """
 
     def at(t, xi):
         tube: Tube = context.tube(t)
-        q = tube.q_d + xi * jnp.where(xi > 0, tube.k_u, tube.k_l)
+        q = position_at(tube, xi)
         ones = jnp.ones_like(q)
         found = {"xi": tube.xi(q)}
         for name, function in functions.items():
@@ -164,8 +165,7 @@ def _numbers(
         return found
 
     of_times = jax.jit(jax.vmap(jax.vmap(at, (None, 0)), (0, None)))
-    found = {name: np.asarray(x) for name, x in of_times(times, jnp.asarray(XI)).items()}
-    return [{name: x[i] for name, x in found.items()} for i in range(len(times))]
+    return {name: np.asarray(x) for name, x in of_times(times, jnp.asarray(XI)).items()}
 
 
 def _at_every_xi(findings: Findings, got: dict[str, np.ndarray], guard: float) -> None:
@@ -235,7 +235,7 @@ def _grows_without_bound(
 
     def value(t, xi):
         tube = context.tube(t)
-        return sharp.value(tube, tube.q_d + xi * jnp.where(xi > 0, tube.k_u, tube.k_l))
+        return sharp.value(tube, position_at(tube, xi))
 
     of_times = jax.vmap(jax.vmap(value, (None, 0)), (0, None))
     found = np.asarray(jax.jit(of_times)(times, jnp.asarray([*inside, *-inside])))
@@ -261,7 +261,7 @@ def _claims(
     context: LawContext,
     times: jax.Array,
     k1: jax.Array,
-    numbers: list[dict[str, np.ndarray]],
+    numbers: dict[str, np.ndarray],
 ) -> None:
     """Tests the claims of the barrier about V1, if it states any."""
     rate = barrier.decay_rate(k1)
@@ -270,14 +270,11 @@ def _claims(
 
     def claimed(t, xi, V1):
         tube = context.tube(t)
-        q = tube.q_d + xi * jnp.where(xi > 0, tube.k_u, tube.k_l)
+        q = position_at(tube, xi)
         return q - tube.q_d, barrier.error_over_slope(tube, q), barrier.xi_bound(V1, tube)
 
     of_times = jax.jit(jax.vmap(jax.vmap(claimed, (None, 0, 0))))
-    xi, V1, slope, decay = (
-        np.stack([at_time[name] for at_time in numbers])
-        for name in ("xi", "value", "slope", "decay")
-    )
+    xi, V1, slope, decay = (numbers[name] for name in ("xi", "value", "slope", "decay"))
     inside = np.abs(xi) < min(1 - 2 * barrier.guard, 1.0)
     error, ratio, bound = of_times(times, xi, V1)
     for i in range(len(times)):

@@ -17,6 +17,7 @@ from iblf_jax.control.controllers._base import law_of_x
 from iblf_jax.simulation.levels import has_speed_limits, levels_on_reference, start_levels
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.testing._contract import Findings
+from iblf_jax.world.bounds import Tube
 
 XI = (-40.0, -1.0, -0.9995, -0.5, 0.0, 0.5, 0.9995, 1.0, 40.0)
 """Values of xi at which a law is evaluated; a run may reach any of them."""
@@ -39,6 +40,11 @@ class Points(NamedTuple):
     at_rest: np.ndarray
     """Whether e2 = 0 on some joint, bool."""
     V1: np.ndarray
+
+
+def position_at(tube: Tube, xi: jax.Array) -> jax.Array:
+    """The positions whose errors, normalised by the bound of their side, are xi, (n,)."""
+    return tube.q_d + xi * jnp.where(xi > 0, tube.k_u, tube.k_l)
 
 
 CommandOf = Callable[..., tuple[Command, Any]]
@@ -162,7 +168,7 @@ def _at_points(scenario: Scenario, command: AtPoint, axis: str) -> Points:
             q, dq = levels_on_reference(scenario, t)[:2]
             limits: Any = context.speed_limits(t) if has_speed_limits(scenario) else ()
             if axis == "xi":
-                q = tube.q_d + xi * jnp.where(xi > 0, tube.k_u, tube.k_l)
+                q = position_at(tube, xi)
             else:
                 alpha = command(scenario, law, q, dq)[1]
                 dq = alpha + xi * jnp.where(xi > 0, limits[1] - alpha, alpha - limits[0])
