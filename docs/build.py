@@ -25,12 +25,15 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "docs")]
 os.environ.setdefault("MPLBACKEND", "Agg")
 
 import nbformat
+from contents import ON_THIS_PAGE, with_contents
+from entry_tables import markdown_table
 from gallery import digest
 from packaging.version import InvalidVersion, Version
 from PIL import Image
@@ -122,18 +125,49 @@ def enable_x64() -> None:
 
 
 def tutorial(notebook: Path) -> nbformat.NotebookNode:
-    """A notebook as it was executed, whose pictures have the texts of its figures; one that was
-    not executed is without outputs.
+    """A notebook as it was executed, whose pictures have the texts of its figures, with the list of
+    its sections; one that was not executed is without outputs.
     """
-    if not is_executed(notebook):
-        return nbformat.read(notebook, as_version=4)
-    found = nbformat.read(EXECUTED / notebook.name, as_version=4)
+    made = EXECUTED / notebook.name if is_executed(notebook) else notebook
+    found = nbformat.read(made, as_version=4)
+    found.cells[0].source += f"\n\n{ON_THIS_PAGE}"
     for cell in found.cells:
         shown = [output.get("data", {}) for output in cell.get("outputs", ())]
         texts = [data["text/plain"] for data in shown if "image/png" in data]
         if texts:
             cell.metadata["mystnb"] = {"image": {"alt": " Next figure: ".join(texts)}}
     return found
+
+
+def page_of_tutorials() -> str:
+    """The page that lists the notebooks, with what their second cells say of them."""
+    rows = []
+    for notebook in NOTEBOOKS:
+        title, needs = (cell.source for cell in nbformat.read(notebook, as_version=4).cells[:2])
+        found: Any = re.search(r"Knowledge: (.*)\. Extras: .* Time: about (\d+) minutes", needs)
+        link = f"[{title.splitlines()[0].removeprefix('# ')}]({notebook.name})"
+        rows.append([link, found[1], f"{found[2]} min"])
+    return "\n".join(
+        [
+            "# Tutorials",
+            "",
+            "The notebooks of the repository with their output. To run them in a clone:",
+            "",
+            "```bash",
+            'pip install ".[notebooks,robots,sweep]" && jupyter lab notebooks',
+            "```",
+            "",
+            "In Colab or a similar service, the first cell of a notebook installs the package."
+            " Begin with the first notebook; each one states its goals and what it needs.",
+            "",
+            markdown_table(["notebook", "knowledge", "time with exercises"], rows),
+            "",
+            "```{toctree}\n:hidden:\n",
+            *(notebook.stem for notebook in NOTEBOOKS),
+            "```",
+            "",
+        ]
+    )
 
 
 def with_thumbnails(index: str, folder: Path) -> str:
@@ -183,11 +217,7 @@ def assemble() -> None:
     (SOURCE / "tutorials").mkdir()
     for notebook in NOTEBOOKS:
         nbformat.write(tutorial(notebook), SOURCE / "tutorials" / notebook.name)
-    listed = "\n".join(notebook.stem for notebook in NOTEBOOKS)
-    words = "The notebooks of the repository with their output."
-    (SOURCE / "tutorials" / "index.md").write_text(
-        f"# Tutorials\n\n{words}\n\n```{{toctree}}\n:maxdepth: 1\n\n{listed}\n```\n"
-    )
+    (SOURCE / "tutorials" / "index.md").write_text(page_of_tutorials(), encoding="utf-8")
 
     shutil.copytree(gallery.MADE, SOURCE / "gallery", ignore=shutil.ignore_patterns("*.md"))
     for script in gallery.PAGES:  # and no page of a script that is there no longer
@@ -217,6 +247,8 @@ def assemble() -> None:
         text = text.replace("(benchmarks/README.md)", "(lab_notes.md)")
         (SOURCE / f"{page}.md").write_text(text, encoding="utf-8")
     shutil.copy(ROOT / "CITATION.cff", SOURCE)
+    for path in SOURCE.rglob("*.md"):
+        path.write_text(with_contents(path.read_text(encoding="utf-8")), encoding="utf-8")
 
 
 def release_of(name: str) -> Version | None:

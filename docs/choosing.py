@@ -12,7 +12,6 @@ import json
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from contents import ON_THIS_PAGE
 from gallery import ROOT
 from measured import RESULTS, table
 
@@ -190,8 +189,6 @@ def page(result: dict[str, Any], tuned: dict[str, Any]) -> str:
             "",
             f"Four questions lead to a law, and {len(rows)} laws on one task show with numbers what"
             " the choice costs. `ij.compare` gives the numbers of a scenario of your own.",
-            "",
-            ON_THIS_PAGE,
             "",
             "## Four questions",
             "",

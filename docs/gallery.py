@@ -26,7 +26,6 @@ from typing import Any
 
 import alt_text
 import entry_tables
-from contents import ON_THIS_PAGE
 from matplotlib import pyplot
 from matplotlib.figure import Figure
 
@@ -181,7 +180,6 @@ def index() -> str:
     parts = [
         "# Gallery",
         words,
-        ON_THIS_PAGE,
         "## Figures of the package",
         _cards(SCRIPTS),
         "(reproductions)=\n## Published examples",

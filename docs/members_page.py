@@ -11,8 +11,6 @@ import re
 from pathlib import Path
 from types import SimpleNamespace
 
-from contents import ON_THIS_PAGE
-
 from iblf_jax import (
     actuators,
     barriers,
@@ -130,8 +128,6 @@ def text() -> str:
         "",
         "The page lists all members of all families; the [reference](reference/index.md) documents"
         " their arguments.",
-        "",
-        ON_THIS_PAGE,
         "",
         "## Systems of the paper",
         "",

@@ -54,11 +54,13 @@ from iblf_jax.deployment.write_c import (
 )
 from iblf_jax.deployment.write_loop import loop_files, wasm_files
 from iblf_jax.engine.simulate import simulate
+from iblf_jax.engine.step_size import comfortable_dt, limited
 from iblf_jax.files.scenario import scenario_to_toml
 from iblf_jax.kernels import UnsupportedError
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.noise import check_method, has_noise, noise_key, realised
+from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical, fitted_to_step
 from iblf_jax.world import plants
 
@@ -180,7 +182,7 @@ def export(
       name: prefix of all names in the code, a C identifier, and the name of a ROS 2 package;
         "iblf_law" or "iblf_loop" if not given.
       dt: the time step [s]: of a closed loop, as in `simulate`; of a law, the longest one of the
-        self-test's run, which is at most 1 ms.
+        self-test's run, which is at most 1 ms and smaller where the plant needs it.
       method, seed: of a closed loop, as in `simulate`.
       gains: of a ROS 2 package, the gains that can be changed while the node runs: paths, or
         `ij.tunable(path, low, high)` with a range that was simulated; without one, the range is the
@@ -372,13 +374,21 @@ def vectors(
 ) -> Vectors:
     """Inputs of the law in a simulated run and its outputs; warns where that run fails.
 
-    A plant may need steps that are shorter than a period, such as one with stiff friction.
+    A plant may need steps that are shorter than a period, such as one with stiff friction: a run
+    whose step is too large for it is repeated once, with the step that it needs.
     """
     period = float(scenario.sampling.period)  # type: ignore[union-attr]
-    steps = max(1, math.ceil(period / min(longest_step, LONGEST_STEP) - 1e-9))
     samples = max(2, round(VECTORS_DURATION / period))
+
+    def run_with(step: float) -> Rollout:
+        steps = max(1, math.ceil(period / step - 1e-9))
+        return simulate(scenario, duration=samples * period, dt=period / steps, record_every=steps)
+
     with notices.muted():
-        run = simulate(scenario, duration=samples * period, dt=period / steps, record_every=steps)
+        run = run_with(min(longest_step, LONGEST_STEP))
+        if has_flag(int(run.status), Status.STEP_TOO_LARGE):
+            needed = comfortable_dt(float(run.fastest_mode), run.method)
+            run = run_with(limited(needed, float(run.dt)))
     dtype = run.q.dtype
     t = jnp.asarray(np.arange(samples) * period, dtype)
     at_start = inputs_at_start(scenario)

@@ -409,7 +409,7 @@ def _scenario_row(law: Law) -> str:
     dtype = C_TYPES[law.is_float]["type"]
     reference = "given" if law.external_reference else "inside"
     command = (
-        f"python -m iblf_jax export scenario.toml --out . --name {law.name} --dtype {dtype}"
+        f"iblf-jax export scenario.toml --out . --name {law.name} --dtype {dtype}"
         f" --reference {reference}"
     )
     repeats = f"`{command}` repeats the export"

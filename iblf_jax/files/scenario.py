@@ -402,8 +402,8 @@ def _from_preset(data: dict[str, Any]) -> Scenario:
     for name in COMPONENTS:
         if name in data:
             remedy = (
-                "Change its numbers in [parameters], or take the full text: python -m iblf_jax"
-                f" presets {data['preset']} --toml."
+                "Change its numbers in [parameters], or take the full text: iblf-jax presets"
+                f" {data['preset']} --toml."
             )
             came = Words("this table besides preset")
             raise checks.fail(name, came, "a preset, or a complete scenario", remedy)

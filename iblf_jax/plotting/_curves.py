@@ -465,7 +465,8 @@ def check_joint(curves: Sequence[Curve], joint: object, field: str = "joint") ->
         return names.index(joint)
     if isinstance(joint, bool) or not isinstance(joint, int | np.integer) or not 0 <= joint < n:
         noun = checks.with_article(plants.component_noun(plant))
-        raise checks.fail(field, joint, f"{noun}, 0 to {n - 1}")
+        remedy = checks.did_you_mean(joint, names) if isinstance(joint, str) else ""
+        raise checks.fail(field, joint, f"{noun}, 0 to {n - 1}, or its name", remedy)
     return int(joint)
 
 

@@ -239,13 +239,13 @@ def tube(scenario: Scenario, *, duration: float = 20.0) -> Figure:
 
 
 @_style.figure_function
-def joint(runs: Runs, joint: int = 0, *, zoom: float | None = None) -> Figure:
+def joint(runs: Runs, joint: int | str = 0, *, zoom: float | None = None) -> Figure:
     """Position of one joint between its bounds, and its error e1 between -k_l and k_u: the paper's
     figures 1 and 2.
 
     Args:
       runs: one run, or a dict of runs by name.
-      joint: which joint, from 0.
+      joint: which joint, from 0, or its name.
       zoom: length of the magnified start [s]; the transient if not given.
 
     Returns:
@@ -570,7 +570,7 @@ def _portrait(
 
 
 @_style.figure_function
-def velocity_portrait(runs: Runs, joint: int = 0) -> Figure:
+def velocity_portrait(runs: Runs, joint: int | str = 0) -> Figure:
     """Velocity [rad/s] of one joint against its position [rad], with the reference and the box of
     its bounds.
 
@@ -579,7 +579,7 @@ def velocity_portrait(runs: Runs, joint: int = 0) -> Figure:
 
     Args:
       runs: one run, or a dict of runs by name.
-      joint: which joint, from 0.
+      joint: which joint, from 0, or its name.
 
     Returns:
       The figure.

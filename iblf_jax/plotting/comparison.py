@@ -37,7 +37,7 @@ differ most there."""
 
 
 @_style.figure_function
-def comparison(result: Comparison, joint: int = 0, *, zoom: float | None = None) -> Figure:
+def comparison(result: Comparison, joint: int | str = 0, *, zoom: float | None = None) -> Figure:
     """Error |e1| and torque of one joint during the transient, and the settling time of every law
     (worst joint).
 
@@ -46,7 +46,7 @@ def comparison(result: Comparison, joint: int = 0, *, zoom: float | None = None)
 
     Args:
       result: the result of `iblf_jax.compare`.
-      joint: which joint, from 0.
+      joint: which joint, from 0, or its name.
       zoom: length of the start that is shown [s]; 2.5 transients of the error if not given.
 
     Returns:

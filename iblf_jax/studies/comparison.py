@@ -313,7 +313,7 @@ class Comparison(Result):
         frame = pd.DataFrame(lines).set_index(["held", "law"])
         return frame.drop(columns=[name for name in OPTIONAL if frame[name].isna().all()])
 
-    def plot(self, joint: int = 0, **options):
+    def plot(self, joint: int | str = 0, **options):
         """Overlaid figure of all laws, at their gains and at equal effort.  Options as
         `plotting.comparison`.
         """

@@ -19,6 +19,7 @@ import numpy as np
 from iblf_jax.core import checks
 from iblf_jax.core.presentation import Content, Result, present
 from iblf_jax.core.status import Status, has_flag
+from iblf_jax.world import plants
 
 if TYPE_CHECKING:
     from iblf_jax.studies.study import Study
@@ -61,7 +62,9 @@ class FirstExit(Result):
         return present("first exit figure", self, **options)
 
 
-def first_exit_of(study: Study, joint: int | None, instants: int, confidence: float) -> FirstExit:
+def first_exit_of(
+    study: Study, joint: int | str | None, instants: int, confidence: float
+) -> FirstExit:
     """The distribution of the first exit; arguments as `Study.first_exit`."""
     instants = checks.positive_integer("instants", instants, least=2, most=checks.MAX_POINTS)
     recorded = _recorded_times(study, joint)
@@ -82,15 +85,18 @@ def first_exit_of(study: Study, joint: int | None, instants: int, confidence: fl
     )
 
 
-def _recorded_times(study: Study, joint: int | None) -> np.ndarray:
+def _recorded_times(study: Study, joint: int | str | None) -> np.ndarray:
     """The first exit of a joint, or of any joint if None, in each run, (N,) [s].
 
     Raises:
-      ValueError: a study without the metric, or a number that is not that of a joint.
+      ValueError: a study without the metric, or no such joint.
     """
     name = "first_violation_time"
     metric = "Margin"
     if joint is not None:
+        names = plants.component_names(study.scenario.plant)
+        if joint in names:
+            joint = names.index(str(joint))
         joint = checks.entry("joint", joint, study.scenario.n, "joints")
         name = "first_exit_time"
         metric = "FirstExit"

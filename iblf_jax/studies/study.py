@@ -200,7 +200,7 @@ class Study(Result):
         return self.probability(VIOLATED)
 
     def first_exit(
-        self, *, joint: int | None = None, instants: int = INSTANTS, confidence: float = 0.95
+        self, *, joint: int | str | None = None, instants: int = INSTANTS, confidence: float = 0.95
     ) -> FirstExit:
         """The distribution of the time at which a run first leaves its bounds.
 
@@ -208,8 +208,8 @@ class Study(Result):
         seen, unless process noise acts on the positions themselves (`metrics.Margin`).
 
         Args:
-          joint: of this joint, from `metrics.FirstExit`; of any joint if None, from
-            `metrics.Margin`.
+          joint: of this joint, by index or name, from `metrics.FirstExit`; of any joint if None,
+            from `metrics.Margin`.
           instants: number of instants from 0 to the end at which it is given.
           confidence: of the interval at each instant, in (0, 1).
 

@@ -201,7 +201,7 @@ def test_a_users_law_is_registered_before_an_export_is_repeated(tmp_path, monkey
     assert "left out" not in repr(named) and "controller.gain" in named.parameters
     readme = (named.folder / "README.md").read_text()
     assert "in a program that first registers Own" in readme
-    assert "python -m iblf_jax export scenario.toml" not in readme
+    assert "iblf-jax export scenario.toml" not in readme
     (call,) = re.findall(r"`(ij\.export\(.*?)` repeats", readme)
     first = (named.folder / "iblf_law.c").read_text()
     monkeypatch.chdir(named.folder)
@@ -209,7 +209,7 @@ def test_a_users_law_is_registered_before_an_export_is_repeated(tmp_path, monkey
     assert (named.folder / "iblf_law.c").read_text() == first
 
     own = ij.export(ij.presets.zhang_yan_2024(), tmp_path / "own", period=2e-3)
-    assert "`python -m iblf_jax export scenario.toml" in (own.folder / "README.md").read_text()
+    assert "`iblf-jax export scenario.toml" in (own.folder / "README.md").read_text()
     with pytest.warns(UserWarning, match="recommended_period"):
         ij.export(ij.presets.zhang_yan_2024(), tmp_path / "slow", period=0.05)
 

@@ -167,7 +167,7 @@ def test_bad_arguments_are_named(tmp_path):
     for words, function, *arguments in (
         (r"batch of 2 runs.*run\[0\]", plotting.overview, batch),
         (r"runs\['b'\].*run\[0\]", plotting.joint, {"a": run, "b": batch}),
-        ("joint: got 2, expected a joint, 0 to 1", plotting.joint, run, 2),
+        ("expected a joint, 0 to 1, or its name. There", plotting.joint, run, "elbow"),
         ("at least one run", plotting.torques, {}),
         ("a Rollout", plotting.torques, [1.0]),
         ("a Rollout", plotting.overview, {"a": run}),

@@ -31,7 +31,7 @@ def test_every_example_is_run_and_names_its_command():
     assert {path.name for path in EXAMPLES.glob("*.toml")} == set(COMMANDS)
     for name, ((command, *_), _) in COMMANDS.items():
         first, *_ = (EXAMPLES / name).read_text(encoding="utf-8").splitlines()
-        assert f"python -m iblf_jax {command} examples/{name}" in first
+        assert f"iblf-jax {command} examples/{name}" in first
 
 
 @pytest.mark.slow

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 sys.path.insert(0, str(ROOT / "docs"))  # before another package of the name `build`
 import alt_text
 import build
+import contents
 import equations
 import flags
 import gallery
@@ -149,6 +150,13 @@ def test_every_public_name_is_in_the_reference():
 )
 def test_an_equation_for_terminals_is_one_in_tex(text, expected):
     assert equations.tex(text) == expected
+
+
+def test_a_long_page_begins_with_a_list_of_its_sections():
+    page = "# A\n\nwords\n\n(one)=\n## One\n\n## Two\n"
+    assert contents.with_contents(page) == page
+    listed = contents.with_contents(page + "x" * contents.LONG)
+    assert listed.startswith(page.replace("(one)", f"{contents.ON_THIS_PAGE}\n\n(one)"))
 
 
 def test_dead_links_and_pages_out_of_reach_are_named(tmp_path):

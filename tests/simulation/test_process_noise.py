@@ -178,7 +178,7 @@ def test_runs_do_not_depend_on_chunks_or_the_number_of_runs(study):
 
 @pytest.mark.slow
 def test_first_exit(study):
-    found = study.first_exit(joint=0, instants=9)
+    found = study.first_exit(joint="joint 0", instants=9)
     times = np.asarray(study.metrics["first_exit_time"])[:, 0]
     expected = [np.mean(times <= t) for t in found.t]
     assert 0.05 < expected[-1] < 0.95
