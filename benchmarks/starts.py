@@ -10,9 +10,12 @@ scenario's own gains.  A tuning that breaks a requirement, or whose objective ch
 LARGEST_CHANGE at an eighth of the time step, counts as one that does not end at the best: such
 gains are good at one time step only.
 
-The best known objective is that of all tunings, and with `--reference` also of a long search from
-the scenario's own gains: so many points without derivatives, and REFERENCE_STARTS starts that are
-taken nearly to their ends.
+The best known objective is that of BEST_KNOWN and of all tunings, and with `--reference` also of a
+long search from the scenario's own gains: so many points without derivatives, and REFERENCE_STARTS
+starts that are taken nearly to their ends.
+
+FILE has all tunings besides the table, and is written after each of them.  If it is one of the same
+commit, the problems with as many tunings in it are not measured again.
 
 With `--peers` each problem is tuned once by `tune` from its own gains, and then by other methods
 for as many seconds of a processor, all with programs at hand and with the compiled batches of this
@@ -31,12 +34,13 @@ import argparse
 import contextlib
 import dataclasses
 import importlib
+import itertools
 import json
 import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -45,7 +49,7 @@ import jax
 jax.config.update("jax_enable_x64", True)
 
 import numpy as np
-from _timing import report
+from _timing import commit, report, write_results
 from losses import checked_out
 from tuning import PENALTY, chain, limited_problem, slsqp
 
@@ -53,6 +57,7 @@ import iblf_jax as ij
 from iblf_jax import actuators, barriers, controllers, references
 from iblf_jax.tuning import TuningProblem, _tune, evaluation, starts
 from iblf_jax.tuning.options import EFFORTS, Effort
+from iblf_jax.tuning.search import Search
 from iblf_jax.tuning.solvers._base import violations
 
 WITHIN = 1.005
@@ -257,6 +262,35 @@ PROBLEMS: dict[str, Callable[[], Problem]] = {
 """Name with the number of gains -> problem."""
 
 
+BEST_KNOWN = {
+    "two links, tan (6)": 1.2070,
+    "two links, low torque, late error (4)": 1.0608,
+    "chain of three, mapping, funnels (9)": 1.1136,
+    "computed torque, motor, sampled (6)": 1.4193,
+    "pendulum with drive, order 3 (4)": 1.0429,
+    "adaptive network (6)": 1.1158,
+    "far start (6)": 1.2791,
+    "velocity bounds (6)": 1.6570,
+    "ur5, logarithmic (14)": 0.82654,
+    "vessel on an ellipse (12)": 1.1434,
+    "two links with drives, order 3 (8)": 1.4855,
+    "chain of four, settling (12)": 1.5381,
+    "two links, smooth step, tan (6)": 0.8941,
+    "flexible joints, smooth step, order 4 (10)": 1.0615,
+    "dynamic surface, motor, sampled (6)": 1.0785,
+    "radial basis functions (6)": 1.1042,
+    "terminal sliding mode (6)": 1.4995,
+    "two links, worst tenth of 16 runs (4)": 1.1662,
+    "two links in a funnel (6)": 1.0433,
+    "motor with rate limit, sampled (5)": 1.0863,
+}
+"""The best objective of all tunings and long searches in the lab notes (README.md), of gains that
+the time step resolves."""
+Tuning = dict[str, Any]
+"""What `tuning` returns, with the problem, the commit and the seed; a long search has the seed
+None."""
+
+
 def built(name: str) -> TuningProblem:
     """A problem, with limits relative to its start."""
     if name not in PROBLEMS:
@@ -277,7 +311,7 @@ def built(name: str) -> TuningProblem:
     return TuningProblem.build(problem.scenario, problem.gains, goal, **options)
 
 
-def tunings(name: str, count: int, first: int, points: int) -> list[dict[str, float]]:
+def tunings(name: str, count: int, first: int, points: int) -> Iterator[Tuning]:
     """The tunings of one problem by the package that is imported, and last the long search of so
     many points, if it is not 0.
     """
@@ -285,28 +319,39 @@ def tunings(name: str, count: int, first: int, points: int) -> list[dict[str, fl
     box = problem.box
     normal = EFFORTS["normal"]
     # The first one compiles and does not count.
-    found = [tuning(problem, box.z, first, dataclasses.replace(normal, iterations=1))]
+    tuning(problem, box.z, first, dataclasses.replace(normal, iterations=1))
     for seed in range(first, first + count):
         z = box.z
         if seed > first:
             z = z + np.random.default_rng(100 + seed).uniform(-1, 1, problem.size)
-        found.append(tuning(problem, np.clip(z, box.low, box.high), seed, normal))
+        yield {"seed": seed, **tuning(problem, np.clip(z, box.low, box.high), seed, normal)}
     if points:
         long = Effort(values=points, starts=REFERENCE_STARTS, iterations=120, selection=20)
-        found.append(tuning(problem, box.z, first, long))
-    return found[1:]
+        yield {"seed": None, **tuning(problem, box.z, first, long)}
 
 
-def tuning(problem: TuningProblem, z: np.ndarray, seed: int, effort: Effort) -> dict[str, float]:
+def tuning(problem: TuningProblem, z: np.ndarray, seed: int, effort: Effort) -> Tuning:
     """A tuning of a problem from the coordinates z, (p,)."""
     moved = dataclasses.replace(
         problem,
         box=dataclasses.replace(problem.box, z=z),
         options=dataclasses.replace(problem.options, seed=seed),
     )
+    phases: dict[str, Tuning] = {}
     began = time.process_time()
     search = _tune.search_of(moved, ij.tuning.SQP(), "forward", effort)
-    stopped = search.run(effort.iterations)
+
+    def note(search: Search) -> None:
+        state = search.state
+        phases[f"{state.phase}.{state.phases_around}"] = {
+            "objective": float(state.incumbent_key[1]),
+            "near_best": int(state.valleys[2]),
+            "evaluations": state.evaluations,
+            "values": state.plain_values,
+            "seconds": time.process_time() - began,
+        }
+
+    stopped = search.run(effort.iterations, note)
     seconds = time.process_time() - began
     outcome = _tune._outcome(search, stopped)
     violation, objective = search.state.incumbent_key
@@ -319,22 +364,46 @@ def tuning(problem: TuningProblem, z: np.ndarray, seed: int, effort: Effort) -> 
         "evaluations": search.state.evaluations,
         "values": search.state.plain_values,
         "converged": outcome.stopped.startswith("converged"),
+        "stopped": outcome.stopped,
+        "unresolved": search.state.unresolved,
+        "starts_near_best": int(search.state.valleys[2]),
+        "z": outcome.z.tolist(),
+        "phases": phases,
     }
 
 
-def measured(tree: Path, name: str, *numbers: int) -> list[dict[str, float]]:
+def measured(tree: Path, name: str, *numbers: int) -> Iterator[Tuning]:
     """As `tunings`, in a process that imports the package of a tree."""
     environment = os.environ | {"PYTHONPATH": str(tree)}
     words = [sys.executable, __file__, "--problem", name, "--worker"]
     for option, number in zip(("--count", "--seed", "--reference"), numbers, strict=True):
         words += [option, str(number)]
-    run = subprocess.run(words, capture_output=True, text=True, env=environment)
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True, env=environment) as run:
+        for line in run.stdout:
+            yield json.loads(line)
     if run.returncode:
-        raise SystemExit(f"{name}: {run.stderr.strip().splitlines()[-1]}")
-    return json.loads(run.stdout.splitlines()[-1])
+        raise SystemExit(f"{name}: the process that tunes it ended with {run.returncode}")
 
 
-def row(name: str, commit: str, found: list[dict[str, float]], best: float) -> list[Any]:
+COLUMNS = [
+    *("problem", "commit", "best known", "within 0.5 %", "from its own start, gap %"),
+    *("largest gap %", "called converged above 2 %", "values", "with derivatives", "processor s"),
+]
+
+
+def table(found: list[Tuning]) -> list[list[Any]]:
+    """The rows of all tunings, one of each problem and commit."""
+    rows = []
+    for name, tree in dict.fromkeys((x["problem"], x["commit"]) for x in found):
+        of_problem = [x for x in found if x["problem"] == name]
+        best = min(BEST_KNOWN.get(name, np.inf), *(x["objective"] for x in of_problem))
+        own = [x for x in of_problem if x["commit"] == tree and x["seed"] is not None]
+        if own:
+            rows.append(row(name, tree, own, best))
+    return rows
+
+
+def row(name: str, commit: str, found: list[Tuning], best: float) -> list[Any]:
     """The row of one problem and one commit."""
     objectives = np.sort([x["objective"] for x in found])
     reached = f"{int(np.sum(objectives <= WITHIN * best))} of {len(found)}"
@@ -343,9 +412,20 @@ def row(name: str, commit: str, found: list[dict[str, float]], best: float) -> l
     own = 100 * (found[0]["objective"] / best - 1)
     false = sum(x["converged"] and x["objective"] > 1.02 * best for x in found)
     gap = 100 * (float(objectives[-1]) / best - 1)
-    seconds = float(np.median([x["seconds"] for x in found]))
-    evaluations = float(np.median([x["evaluations"] for x in found]))
-    return [name, commit, best, reached, own, gap, false, evaluations, seconds]
+    numbers = [
+        float(np.median([x[k] for x in found])) for k in ("values", "evaluations", "seconds")
+    ]
+    return [name, commit, best, reached, own, gap, false, *numbers]
+
+
+def tunings_in(file: str | None) -> list[Tuning]:
+    """The tunings in a file of results of the present commit; none if there is no such file."""
+    if file is None or not Path(file).exists():
+        return []
+    results = json.loads(Path(file).read_text())
+    here = commit()
+    is_same = results["machine"]["commit"] == here and "uncommitted" not in here
+    return results["tunings"] if is_same else []
 
 
 class TimeUpError(Exception):
@@ -498,7 +578,8 @@ def main() -> None:
     parser.add_argument("--worker", action="store_true", help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.worker:
-        print(json.dumps(tunings(args.problem, args.count, args.seed, args.reference)))
+        for found in tunings(args.problem, args.count, args.seed, args.reference):
+            print(json.dumps(found), flush=True)
         return
     names = [args.problem] if args.problem else list(PROBLEMS)[: 1 if args.quick else None]
     if args.peers:
@@ -506,19 +587,20 @@ def main() -> None:
         return
     count = 2 if args.quick else args.count
     commits = [args.after] if args.before is None else [args.before, args.after]
-    rows = []
-    for name in names:
-        found = {}
-        for commit in commits:
-            with checked_out(commit) as tree:
-                own = measured(tree, name, count, args.seed, args.reference)
-                found[commit or "working tree"] = own
-        best = min(x["objective"] for of_commit in found.values() for x in of_commit)
-        rows += [row(name, commit, x[:count], best) for commit, x in found.items()]
-        print(*rows[-len(found) :], sep="\n", file=sys.stderr, flush=True)
-    columns = ["problem", "commit", "best known", "within 0.5 %", "from its own start, gap %"]
-    columns += ["largest gap %", "called converged above 2 %", "evaluations", "processor s"]
-    report("Random starts", columns, rows, args.json)
+    title = "Random starts"
+    found = tunings_in(args.json)
+    for name, tree_of in itertools.product(names, commits):
+        label = {"problem": name, "commit": tree_of or "working tree"}
+        if sum(x | label == x for x in found) == count + (args.reference > 0):
+            continue
+        found = [x for x in found if x | label != x]
+        with checked_out(tree_of) as tree:
+            for x in measured(tree, name, count, args.seed, args.reference):
+                found.append(label | x)
+                if args.json:
+                    write_results(title, COLUMNS, table(found), args.json, {"tunings": found})
+        print(*table([x for x in found if x["problem"] == name]), sep="\n", file=sys.stderr)
+    report(title, COLUMNS, table(found), args.json, {"tunings": found})
 
 
 if __name__ == "__main__":

@@ -151,7 +151,7 @@ class Batch(NamedTuple):
         return jax.vmap(one, axis_size=self.runs)(self.leaves.per_run, *args)
 
 
-Stepper = Callable[[Any, Batch, Any, int, int | None], tuple[Any, Any]]
+Stepper = Callable[[Any, Batch, Any, Any, int | None], tuple[Any, Any]]
 """Makes all steps of a batch: a function (step, batch, carry, steps, every) -> (carry after the
 last step, records).
 

@@ -5,9 +5,9 @@ run is (`single_run`).
     _all_steps     the steps
     _finalize      the metrics and the status
 
-Only the second part, which calls a kernel, depends on the number of steps.  A search for gains, its
-checks at a half and a quarter of the step and its report thus share the two others, which take XLA
-most of its time.
+Only the second part, which calls a kernel, depends on the number of steps, and that only as an
+input where the executor accepts it.  A search for gains, its checks at a half and a quarter of the
+step and its report thus share the parts.
 """
 
 from __future__ import annotations
@@ -19,11 +19,13 @@ import jax
 import numpy as np
 
 from iblf_jax.core import programs
+from iblf_jax.engine import registry, thresholds
 from iblf_jax.engine.batch import finalize, initialize
 from iblf_jax.engine.carry import Carry, Inputs
-from iblf_jax.engine.compile import inputs_of
+from iblf_jax.engine.compile import inputs_of, structural_part
 from iblf_jax.engine.execute import CompiledBatch, compile_batch
 from iblf_jax.engine.linearization import Linearization
+from iblf_jax.engine.loops import kernel_stepper
 from iblf_jax.engine.outcome import Outcome
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.time_step import TimeStep
@@ -67,9 +69,11 @@ def run_batch_in_parts(
         # A part has what it does not depend on at one value, so that all requests share it.
         of_start = batch._replace(request=request._replace(steps=0, assessed=True))
         of_steps = batch._replace(request=request._replace(assessed=True))
+        if registry.EXECUTORS[batch.backend].accepts_first_step:
+            of_steps = batch._replace(request=structural_part(request))
         of_end = batch._replace(request=request._replace(steps=0))
         carry, at_start = _initialize(arguments, batch=of_start)
-        carry = _all_steps(arguments, carry, batch=of_steps)
+        carry = _all_steps(arguments, carry, np.int32(request.instants), batch=of_steps)
         return _finalize(arguments, carry, at_start, batch=of_end)
 
     return compiled.first_that_works(run)
@@ -89,10 +93,22 @@ def _initialize(arguments: Arguments, *, batch: CompiledBatch) -> tuple[Carry, L
 
 
 @programs.jit(static_argnames="batch", kept=True)
-def _all_steps(arguments: Arguments, carry: Carry, *, batch: CompiledBatch) -> Carry:
+def _all_steps(
+    arguments: Arguments, carry: Carry, instants: jax.Array, *, batch: CompiledBatch
+) -> Carry:
+    """The carry after all steps; the executor is told their number by `instants`, or by the request
+    if it must know it beforehand.
+    """
     request = batch.request
+    executor = registry.EXECUTORS[batch.backend]
     run_steps, runs = batch.stepper(*_inputs(arguments, batch))
-    return run_steps(TimeStep.of(request), runs, carry, request.instants, None)[0]
+    number: int | jax.Array = request.instants
+    if executor.accepts_first_step:
+        bytes_of_runs = (runs.runs or 1) * runs.dtype.itemsize
+        short = thresholds.uses_short_vector(bytes_of_runs, number)
+        run_steps = kernel_stepper(executor, short_vector=short)
+        number = instants
+    return run_steps(TimeStep.of(request), runs, carry, number, None)[0]
 
 
 @programs.jit(static_argnames="batch", options=programs.UNOPTIMISED, kept=True)

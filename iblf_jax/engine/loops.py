@@ -167,7 +167,7 @@ def kernel_stepper(executor: Executor, **options: Any) -> Stepper:
     """
 
     def run_steps(
-        step: Step, batch: Batch, carry: Any, steps: int, every: int | None
+        step: Step, batch: Batch, carry: Any, steps: int | jax.Array, every: int | None
     ) -> tuple[Any, Any]:
         compiled = program_of(step, batch, carry)
         runs = batch.runs or 1

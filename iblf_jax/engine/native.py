@@ -21,7 +21,7 @@ def unavailable() -> str | None:
 
 
 def _kernel_build(
-    program: Program, runs: int, steps: int, short_vector: bool | None = None
+    program: Program, runs: int, steps: int | jax.Array, short_vector: bool | None = None
 ) -> Build:
     """How the kernel of a program is compiled.
 
@@ -54,7 +54,7 @@ def run(
     shared: jax.Array,
     per_run: jax.Array,
     carry: Packed,
-    steps: int,
+    steps: int | jax.Array,
     every: int | None,
     first: jax.Array | int = 0,
     short_vector: bool | None = None,
@@ -64,7 +64,7 @@ def run(
 
     Args:
       program, shared, per_run, carry, steps, every, first, series: as `kernels.cpu.run`.
-      short_vector: as `_kernel_build`.
+      short_vector: as `_kernel_build`; required where `steps` is an array.
 
     Returns:
       The rows after the last step, and the recorded arrays, (samples, numbers, runs), of every

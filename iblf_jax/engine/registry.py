@@ -48,8 +48,9 @@ class Executor(NamedTuple):
     """Starts to compile in the background; arguments as `build`, and `series`, the count of numbers
     of each step of a run in the series that the program reads."""
     accepts_first_step: bool = False
-    """Whether `run` accepts `first`, the index of the first step, and `short_vector`.  Then a long
-    single run can be divided into several calls."""
+    """Whether `run` accepts `first`, the index of the first step, `short_vector`, and with it a
+    number of steps that is an array.  Then a long single run can be divided into several calls, and
+    batches of several numbers of steps have one program."""
     accepts_series: bool = False
     """Whether `run` accepts `series`, a table of which each step reads a row, and `first`.  Then
     the executor differentiates in reverse mode (`adjoint`)."""

@@ -139,7 +139,7 @@ def run(
     shared: jax.Array,
     per_run: jax.Array,
     carry: Packed,
-    steps: int,
+    steps: int | jax.Array,
     every: int | None = None,
     *,
     first: jax.Array | int = 0,
@@ -154,7 +154,8 @@ def run(
       shared: entries of the shared leaves, (S,).
       per_run: entries of the leaves that differ between the runs, (P, runs).
       carry: rows before the first step.
-      steps: number of steps.
+      steps: number of steps; an array, () int32, only without records and series, whose shapes
+        depend on it.
       every: interval of the recorded steps; None for no record.
       first: number of the first step, () int32, a multiple of `every`.
       series: what the steps read, if they read a series: (steps, numbers, runs).  The first step
@@ -176,9 +177,12 @@ def run(
     name = kernel(program, shared.size, per_run.shape[0], build, width)
     outputs = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in carry]
     outputs += record_shapes(program, runs, steps, every)
-    attributes = jnp.asarray(np.asarray([[0, steps, every or 0, threads]], np.int32))
-    if not isinstance(first, int) or first:
-        attributes = attributes.at[0, 0].set(first)
+    numbers = (first, steps, every or 0, threads)
+    known = [x if isinstance(x, int) else 0 for x in numbers]
+    attributes = jnp.asarray(np.asarray([known], np.int32))
+    for i, x in enumerate(numbers):
+        if not isinstance(x, int):
+            attributes = attributes.at[0, i].set(x)
     operands = [shared.reshape(1, -1), per_run, *carry, attributes]
     if series is not None:
         operands.append(series.reshape(steps, -1))

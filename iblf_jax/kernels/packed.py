@@ -82,7 +82,7 @@ def unpack(packed: Packed, shapes: Shapes, runs: int) -> list[jax.Array]:
 
 
 def record_shapes(
-    program: Program, runs: int, steps: int, every: int | None
+    program: Program, runs: int, steps: Any, every: int | None
 ) -> list[jax.ShapeDtypeStruct]:
     """The shape (rows, numbers * runs) of each recorded array: one row for every `every`-th step,
     from the first step on.

@@ -46,10 +46,8 @@ from iblf_jax.tuning.robust import Risk
 from iblf_jax.tuning.runs import NUMBERS_A_RUN
 from iblf_jax.tuning.samples import SampleRequest
 from iblf_jax.tuning.search import (
-    MANY_GAINS,
     REPAIR,
     REPAIR_STARTS,
-    SAME_OBJECTIVE,
     SECOND_SEARCH,
     STARTS_AROUND,
     STARTS_AT_ENDS,
@@ -61,8 +59,10 @@ from iblf_jax.tuning.solvers.sqp import SQP
 from iblf_jax.tuning.starts import (
     FEW_STARTS,
     MAX_SCREENED_RUNS,
+    SAME_OBJECTIVE,
     WEIGHTS,
     Screening,
+    StepComparison,
     distinct,
     number_of_starts,
     screen,
@@ -223,7 +223,10 @@ def search_of(
         with bar(show, count + 1, unit="points") as shown:
             shown.set_description(_cost_in_words(problem, count + 1, starts, effort))
             screening = screen(problem, count, seed, shown.update)
-        z = _chosen_starts(problem, screening, starts)
+        comparison = None
+        if effort.values and solver.handles_requirements and mode == "forward":
+            comparison = StepComparison(partial(objective_at_quarter_step, problem))
+        z = _chosen_starts(problem, screening, starts, comparison)
         second_starts = min(effort.second_starts, starts)
         second_points = count // 3 if second_starts else 0
         at_ends = 0
@@ -231,7 +234,7 @@ def search_of(
         # Other solvers are for many numbers, of which there are too many pairs.
         if isinstance(solver, SQP) and count and len(z) > FEW_STARTS:
             at_ends = STARTS_AT_ENDS
-            starts_around = STARTS_AROUND if problem.size >= MANY_GAINS else 0
+            starts_around = STARTS_AROUND
         strategy = Strategy(
             screening,
             effort.selection,
@@ -240,14 +243,12 @@ def search_of(
             second_starts,
             at_ends,
             starts_around,
+            comparison,
         )
     else:
         z = starting_points(problem.box, starts, seed)
         z = usable_starts(problem, seed, z, values(problem, problem.box.z[None]))
     problem = problem.for_solver(solver)
-    has_constraints = solver.handles_requirements and mode == "forward"
-    if strategy is not None and effort.values and has_constraints:
-        strategy = strategy._replace(at_quarter_step=partial(objective_at_quarter_step, problem))
     space = problem.search_space(effort.iterations)
     starts_used = len(z)
     rows = starts_used
@@ -270,9 +271,11 @@ def _cost_in_words(problem: TuningProblem, points: int, starts: int, effort: Eff
     )
 
 
-def _chosen_starts(problem: TuningProblem, screening: Screening, starts: int) -> np.ndarray:
+def _chosen_starts(
+    problem: TuningProblem, screening: Screening, starts: int, comparison: StepComparison | None
+) -> np.ndarray:
     """The points that the search begins from, (k, p): the best screened points of each ranking that
-    differ from one another.
+    differ from one another and count.
 
     If all of them are refused, or the scenario's gains are the only point and leave their bounds,
     the start is found by `usable_starts`.
@@ -280,7 +283,7 @@ def _chosen_starts(problem: TuningProblem, screening: Screening, starts: int) ->
     seed = int(problem.options.seed)
     orders = [screening.order(weight) for weight in WEIGHTS]
     is_refused = problem.sampled_too_slowly
-    z = distinct(screening, orders, starts, problem.box, is_refused)
+    z = distinct(screening, orders, starts, problem.box, is_refused, comparison)
     if len(z):
         best = jax.tree.map(lambda x: x[orders[0][:1]], screening.found)
         if len(screening.points) > 1 or best.margin[0] > 0:
@@ -383,10 +386,12 @@ def _tried(search: Search) -> tuple[str, ...]:
     starts = search.strategy.starts
     lines = []
     if search.state.unresolved:
+        assert search.strategy.comparison is not None
+        change = 100 * search.strategy.comparison.largest_change
         lines.append(
-            f"{search.state.unresolved} searches came to gains whose objective changes by more than"
-            f" {100 * float(search.state.largest_change):.2g} % at a quarter of the time step: they"
-            " do not count"
+            f"{search.state.unresolved} searches came to gains, or would have begun at gains, whose"
+            f" objective changes by more than {change:.2g} % at a quarter of the time step: they do"
+            " not count"
         )
     if starts > 1:
         noun = "valley"

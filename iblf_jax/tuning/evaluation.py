@@ -39,7 +39,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import programs
-from iblf_jax.core.status import UNTRUSTED, Status
+from iblf_jax.core.status import UNTRUSTED, Status, has_flag
 from iblf_jax.engine import run_batch_vjp, starts_per_batch
 from iblf_jax.simulation.noise import NOISE_NAME
 from iblf_jax.studies.draws import paths_overlap
@@ -186,7 +186,7 @@ def _derivatives_of_start(
 
 def value(problem: TuningProblem, candidates: Candidate) -> Value:
     """The problem at the coordinates of each start, (S, ...)."""
-    return _values(problem, candidates, problem.rollouts(candidates))
+    return _values(problem.at_any_step(), candidates, problem.rollouts(candidates))
 
 
 def values(
@@ -209,10 +209,13 @@ def objective_at_quarter_step(problem: TuningProblem, z: np.ndarray) -> np.ndarr
     """
     fine = problem.at_half_the_step().at_half_the_step()
 
-    def of_rows(rows: np.ndarray) -> jax.Array:
+    def of_rows(rows: np.ndarray) -> np.ndarray:
         candidates = fine.candidates(z[rows])
         found = fine.rollouts(candidates, assessed=True)
-        return _accurate_objective(fine, candidates, found)
+        each = _values(fine.at_any_step(), candidates, found)
+        is_inaccurate = _by_start(has_flag(np.asarray(found.status), Status.INACCURATE), candidates)
+        is_usable = np.asarray(each.valid) & ~np.any(is_inaccurate, axis=1)
+        return np.where(is_usable, each.objective, np.nan)
 
     # Many points follow one another, so that one program serves them all.
     return in_groups(of_rows, len(z), fine.points_together(2))
@@ -222,15 +225,6 @@ def objective_at_quarter_step(problem: TuningProblem, z: np.ndarray) -> np.ndarr
 def _values(problem: TuningProblem, candidates: Candidate, found: Rollouts) -> Value:
     by_start = _by_start((found.smooth, found.exact, found.status), candidates)
     return jax.vmap(partial(value_of_start, problem))(candidates, *by_start)
-
-
-@programs.jit(kept=True)
-def _accurate_objective(
-    problem: TuningProblem, candidates: Candidate, found: Rollouts
-) -> jax.Array:
-    value = _values(problem, candidates, found)
-    is_inaccurate = _by_start(found.status & int(Status.INACCURATE) > 0, candidates)
-    return jnp.where(value.valid & ~jnp.any(is_inaccurate, axis=1), value.objective, jnp.nan)
 
 
 @programs.jit(kept=True)

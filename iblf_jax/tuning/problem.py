@@ -182,6 +182,12 @@ class TuningProblem:
             request=self.request._replace(steps=2 * self.request.steps),
         )
 
+    def at_any_step(self) -> TuningProblem:
+        """The problem without its number of steps, for functions that do not read it: they are then
+        compiled once for all time steps.
+        """
+        return dataclasses.replace(self, request=self.request._replace(steps=0))
+
     # -------------------------------------------------------------------------------- properties
 
     @property
@@ -247,7 +253,7 @@ class TuningProblem:
         """All runs of all starts, without derivatives, (S * B, ...); with the error of each run if
         they are `RunRequest.assessed`.
         """
-        varied = _leaves_of_runs(self, candidates)
+        varied = _leaves_of_runs(self.at_any_step(), candidates)
         request = self.request._replace(assessed=assessed)
         return rollouts(self.scenario, varied, self.objective, self.dt, request=request)
 

@@ -15,16 +15,12 @@ and at equal violation by the objective without smoothing.  A feasible point has
 Every point that was evaluated, with derivatives or without, is a candidate for the incumbent,
 unless its objective depends on the time step.
 
-Time step.  Gains may be good at the time step of the runs only: it stabilises a motion that runs
-away at a shorter one, or it passes a bound between two instants.  A search with
-`Strategy.at_quarter_step` therefore evaluates the best points of the starts at a quarter of the
-step as well, after the first step of a phase, after every `selection` steps and at the end of the
-phase.  (At half of it many such gains are still good.)  A start is retired, and its points do not
-count, where the objective changes by more than `largest_change` or the run is inaccurate even
-there.  This limit is SAME_OBJECTIVE, as objectives are compared to that difference, or STEP_FACTOR
-times the median change of the starts where that is larger: an objective with noise or with the rate
-of a held torque depends on the step itself.  Points without derivatives are compared before one of
-them becomes the incumbent.
+Time step.  Gains may be good at the time step of the runs only.  A search with
+`Strategy.comparison` therefore evaluates points at a quarter of the step as well (`StepComparison`)
+before a phase begins at them, and the best points of the starts after every `selection` steps and
+at the end of the phase.  A start is retired, and its points do not count, where the objective
+changes too much or the run is inaccurate even there.  Points without derivatives are compared
+before one of them becomes the incumbent.
 
 Stages.  A peak over time in the objective is replaced by a smooth maximum, which lies above the
 maximum by the smoothing times a logarithm.  The smooth objective has its minimum at other gains,
@@ -105,8 +101,10 @@ from iblf_jax.tuning.solvers.sqp import STATIONARITY_TOLERANCE, Point
 from iblf_jax.tuning.starts import (
     FEW_POINTS,
     FEW_STARTS,
+    SAME_OBJECTIVE,
     WEIGHTS,
     Screening,
+    StepComparison,
     distinct,
     is_near,
     points_at_ends,
@@ -156,8 +154,6 @@ SAME_VALLEY = 0.5
 """Two points whose distance in every coordinate z is at most this are in the same valley, the
 region around one local minimum."""
 
-SAME_OBJECTIVE = 0.005
-"""Largest difference from the best objective, relative to it, of a start that confirms it."""
 CONFIRMING_SHARE = 1 / 3
 """Smallest share of the starts that come within SAME_OBJECTIVE of the best objective for which the
 search has converged.  Of one tuning of two links, eight of 32 starts ended in a valley 4.5 % above
@@ -167,13 +163,9 @@ STARTS_AT_ENDS = 4
 STARTS_IF_SINGLE = 12
 """Number of starts of the second search where no other start confirms the best objective."""
 STARTS_AROUND = 8
-"""Number of starts of the phase SEARCH_AROUND, in problems of at least MANY_GAINS numbers."""
-MANY_GAINS = 10
+"""Number of starts of the phase SEARCH_AROUND."""
 MOST_AROUND = 3
 """Largest number of phases that begin at points around the incumbent."""
-STEP_FACTOR = 4.0
-"""Change of the objective at a quarter of the time step, relative to the median of the starts,
-above which a point does not count."""
 MOST_COMPARED = 32
 """Largest number of points without derivatives that are evaluated again at a quarter of the time
 step."""
@@ -199,10 +191,8 @@ class Strategy(NamedTuple):
     as the best ones.  If it is not 0, the phase always follows."""
     starts_around: int = 0
     """Number of starts of the phase SEARCH_AROUND."""
-    at_quarter_step: Callable[[np.ndarray], np.ndarray] | None = None
-    """The objective at a quarter of the time step at points z, (N, p), as
-    `objective_at_quarter_step`.
-    Without it the time step is not examined."""
+    comparison: StepComparison | None = None
+    """Without it the time step is not examined."""
 
 
 @dataclasses.dataclass
@@ -256,10 +246,8 @@ class SearchState:
     phases_around: int = 0
     """Number of phases that began at points spread around the incumbent."""
     unresolved: int = 0
-    """Starts that were retired because their objective depends on the time step."""
-    largest_change: np.ndarray = dataclasses.field(default_factory=lambda: np.asarray(np.nan))
-    """Largest relative change of the objective at a quarter of the time step of points that count;
-    NaN before the first comparison, (); see the head of this module."""
+    """Points at which no search began, and starts that were retired, because their objective
+    depends on the time step."""
     repair_ended: bool = False
     """Whether REPAIR ended at a stationary point of the largest excess."""
     least_excess: np.ndarray = dataclasses.field(default_factory=lambda: np.full((1, 1), np.inf))
@@ -332,6 +320,9 @@ class Search:
         evaluate.on_values = self.consider_values
         if strategy is not None:
             self._count(strategy.screening.found)
+            if strategy.comparison is not None:
+                self.state.plain_values += strategy.comparison.points
+                self.state.unresolved = strategy.comparison.unresolved
 
     def retire(self, starts: slice | np.ndarray | list[int]) -> None:
         """Ends some starts for the rest of the phase."""
@@ -415,17 +406,16 @@ class Search:
         """Whether the objective, (N,), at points, (N, p), is about the same at a quarter of the
         time step, (N,).
         """
-        state = self.state
-        if self.strategy is None or self.strategy.at_quarter_step is None or not len(z):
+        if self.strategy is None or self.strategy.comparison is None:
             return np.ones(len(z), bool)
-        fine = self.strategy.at_quarter_step(z)
-        state.plain_values += len(z)
-        change = np.abs(fine - objective) / np.maximum(1e-3, np.abs(objective))
-        change[~np.isfinite(change)] = np.inf
-        if np.isnan(state.largest_change):
-            typical = STEP_FACTOR * float(np.median(change))
-            state.largest_change = np.asarray(max(SAME_OBJECTIVE, typical))
-        return change <= state.largest_change
+        self.state.plain_values += len(z)
+        return self.strategy.comparison(z, objective)
+
+    def _are_usable(self, z: np.ndarray, objective: np.ndarray) -> np.ndarray:
+        """As `_are_resolved`, at points where a search would begin."""
+        resolved = self._are_resolved(z, objective)
+        self.state.unresolved += int(np.sum(~resolved))
+        return resolved
 
     def _consider(self, z: np.ndarray, key: tuple[float, float]) -> None:
         """Replaces the incumbent by a point, (p,), where that is better."""
@@ -581,7 +571,10 @@ class Search:
         count = min(2, len(self.state.finished)) - 1
         explored = np.concatenate([best, self.history["z"][0], self.state.best_z])
         refused = problem.sampled_too_slowly
-        return distinct(screening, [screening.order()], count, problem.box, refused, explored)
+        usable = self._are_usable
+        return distinct(
+            screening, [screening.order()], count, problem.box, refused, usable, explored
+        )
 
     def _best_of(self, points: np.ndarray, count: int) -> np.ndarray:
         """The best of some points, (N, p), by each of the rankings in turn, that differ from one
@@ -592,7 +585,8 @@ class Search:
         screening = ranked(points, self.evaluate.values(points))
         orders = [screening.order(weight) for weight in WEIGHTS]
         refused = problem.sampled_too_slowly
-        return distinct(screening, orders, count, problem.box, refused, explored)
+        usable = self._are_usable
+        return distinct(screening, orders, count, problem.box, refused, usable, explored)
 
     def conditions(self) -> Conditions:
         """The optimality conditions at the incumbent, which is evaluated once more; determined once
@@ -767,7 +761,8 @@ class Search:
             return best
         starts = min(REPAIR_STARTS, len(self.state.finished)) - 1
         order = np.argsort(both.excess, kind="stable")
-        further = distinct(both, [order], starts, problem.box, problem.sampled_too_slowly, best)
+        refused = problem.sampled_too_slowly
+        further = distinct(both, [order], starts, problem.box, refused, others=best)
         return np.concatenate([best, further])
 
     def _valleys(self) -> np.ndarray:
@@ -884,10 +879,9 @@ class Search:
     @property
     def _is_due(self) -> bool:
         """Whether the best points of the starts are considered after this step."""
-        if self.strategy is None or self.strategy.at_quarter_step is None:
+        if self.strategy is None or self.strategy.comparison is None:
             return True
-        steps = self.state.phase_steps
-        is_selection = steps == 1 or steps % self.strategy.selection == 0
+        is_selection = self.state.phase_steps % self.strategy.selection == 0
         return self.state.phase == REPAIR or is_selection
 
     def _prepare_evaluation(self) -> None:

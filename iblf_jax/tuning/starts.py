@@ -12,7 +12,8 @@ with each w of WEIGHTS, where f0 is the objective at the first valid point.  Wit
 feasible points come before all that are not almost feasible.  With the smallest one points of a low
 objective come first that break a requirement: on some problems only they lead to the best minimum.
 `distinct` takes the best points that differ from one another, from each ranking in turn, and
-excludes those whose gains are too high for the sampling period.
+excludes those whose gains are too high for the sampling period and those that are good at one time
+step only (`StepComparison`).
 
 `usable_starts` serves searches without screening, whose starts are near the scenario's gains, and
 searches for which `distinct` finds no point.
@@ -51,6 +52,13 @@ MAX_RUNS_OF_STARTS = 128
 """Largest number of runs of all starts together, unless there are few starts."""
 FEW_STARTS = 6
 """Number of starts that are never too many."""
+SAME_OBJECTIVE = 0.005
+"""Largest difference of two objectives, relative to one of them, that counts as none."""
+STEP_FACTOR = 4.0
+"""Change of the objective at a quarter of the time step, relative to the median of the first points
+that are compared, above which a point does not count."""
+MOST_ROUNDS = 4
+"""Largest number of comparisons at a quarter of the time step in a choice of starts."""
 FEW_POINTS = 32
 """Number of points that are evaluated where a search without screening needs another start."""
 
@@ -144,12 +152,53 @@ def points_at_ends(box: Box, z: np.ndarray, most: int, seed: int) -> np.ndarray:
     return points
 
 
+class StepComparison:
+    """Compares the objective with that at a quarter of the time step.
+
+    Gains may be good at the time step of the runs only: it stabilises a motion that runs away at a
+    shorter one, or it passes a bound between two instants.  (At half of it many such gains are
+    still good.)  The objective of a point may change by SAME_OBJECTIVE, or by STEP_FACTOR times the
+    median change of the first points that are compared where that is larger: an objective with
+    noise or with the rate of a held torque depends on the step itself.
+
+    Args:
+      at_quarter_step: function of points z, (N, p), that returns their objective at a quarter of
+        the time step, (N,), as `objective_at_quarter_step`.
+    """
+
+    def __init__(self, at_quarter_step: Callable[[np.ndarray], np.ndarray]):
+        self.at_quarter_step = at_quarter_step
+        self.largest_change = np.nan
+        """Largest relative change of the objective of a point that counts; NaN before the first
+        comparison."""
+        self.points = 0
+        """Number of points that were compared."""
+        self.unresolved = 0
+        """Number of them that do not count."""
+
+    def __call__(self, z: np.ndarray, objective: np.ndarray) -> np.ndarray:
+        """Whether points, (N, p), with these objectives, (N,), count, (N,)."""
+        if not len(z):
+            return np.ones(0, bool)
+        change = np.abs(self.at_quarter_step(z) - objective)
+        change /= np.maximum(1e-3, np.abs(objective))
+        change[~np.isfinite(change)] = np.inf
+        if np.isnan(self.largest_change):
+            typical = STEP_FACTOR * float(np.median(change))
+            self.largest_change = max(SAME_OBJECTIVE, typical)
+        resolved = change <= self.largest_change
+        self.points += len(z)
+        self.unresolved += int(np.sum(~resolved))
+        return resolved
+
+
 def distinct(
     screening: Screening,
     orders: Sequence[np.ndarray],
     count: int,
     box: Box,
     is_refused: Callable[[np.ndarray], bool],
+    are_resolved: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
     others: np.ndarray | None = None,
 ) -> np.ndarray:
     """The first points of some orders that differ from one another and are not refused, (m, p)
@@ -162,22 +211,31 @@ def distinct(
       box: the ranges.
       is_refused: function of z, (p,), that returns whether no search can begin there.  It takes
         long, so that no more points are tested than are needed.
+      are_resolved: function of points, (k, p), and their objectives, (k,), that returns which of
+        them count, (k,).  Those that do not are replaced by the next best ones, in MOST_ROUNDS
+        rounds, as many points take as long as one.
       others: further points that the result must differ from, (k, p).
     """
     points = screening.points
     remaining = np.isfinite(screening.excess)
     for other in [] if others is None else others:
         remaining &= ~is_near(points, other, box)
-    chosen: list[np.ndarray] = []
+    chosen: list[int] = []
     turns = itertools.cycle(orders)
-    while len(chosen) < count and np.any(remaining):
-        order = next(turns)
-        i = order[np.argmax(remaining[order])]  # the first one that remains
-        remaining[i] = False
-        if not is_refused(points[i]):
-            chosen.append(points[i])
-            remaining &= ~is_near(points, points[i], box)
-    return np.array(chosen).reshape(-1, len(box.z))
+    for _ in range(MOST_ROUNDS):
+        new: list[int] = []
+        while len(chosen) + len(new) < count and np.any(remaining):
+            order = next(turns)
+            i = order[np.argmax(remaining[order])]  # the first one that remains
+            remaining[i] = False
+            if not is_refused(points[i]):
+                new.append(i)
+                remaining &= ~is_near(points, points[i], box)
+        resolved = np.ones(len(new), bool)
+        if are_resolved is not None:
+            resolved = are_resolved(points[new], screening.found.objective[new])
+        chosen += list(itertools.compress(new, resolved))
+    return points[chosen]
 
 
 def is_near(points: np.ndarray, z: np.ndarray, box: Box) -> np.ndarray:

@@ -35,7 +35,6 @@ from iblf_jax.tuning.robust import Risk, combine
 from iblf_jax.tuning.search import (
     OPTIMISE,
     REPAIR,
-    SAME_OBJECTIVE,
     SEARCH_AROUND,
     SECOND_SEARCH,
     Search,
@@ -44,7 +43,14 @@ from iblf_jax.tuning.search import (
 )
 from iblf_jax.tuning.solvers import Constraints, SearchSpace
 from iblf_jax.tuning.solvers.sqp import Subproblem, subproblems
-from iblf_jax.tuning.starts import UNLIMITED, points_at_ends, ranked
+from iblf_jax.tuning.starts import (
+    SAME_OBJECTIVE,
+    UNLIMITED,
+    StepComparison,
+    distinct,
+    points_at_ends,
+    ranked,
+)
 
 objectives = ij.objectives
 SHORT = {"duration": 0.3, "dt": 1e-3, "method": "euler"}
@@ -784,23 +790,30 @@ def test_gains_that_are_good_at_one_time_step_only_do_not_count():
     def at_quarter_step(z):
         return np.where(np.max(np.abs(z - 1.0), axis=1) < 0.3, 1e30, valleys(z).value.objective)
 
-    search = search_in_valleys(1.9, 0.5, at_quarter_step=at_quarter_step)
+    comparison = StepComparison(at_quarter_step)
+    search = search_in_valleys(1.9, 0.5, comparison=comparison)
     assert search.run(60) == "converged"
     search.consider_values(np.ones((1, 7)), valleys(np.ones((1, 7))).value)
-    assert search.state.unresolved == 2 and search.state.largest_change == SAME_OBJECTIVE
+    assert search.state.unresolved == 2 and comparison.largest_change == SAME_OBJECTIVE
     assert search.state.incumbent_key[1] == pytest.approx(LOW)
     np.testing.assert_allclose(search.state.incumbent_z, -np.ones(7), atol=1e-3)
     assert search.conditions().hold
     assert any(line.startswith("2 searches came to gains") for line in _tune._tried(search))
+    # No search begins there: the next best points take their place.
+    z = rows(1.1, 0.9, -1.5, -2.9, 3.1)
+    screening = ranked(z, valleys(z).value)
+    box = search.evaluate.space.box
+    chosen = distinct(screening, [screening.order()], 2, box, lambda z: False, comparison)
+    np.testing.assert_array_equal(chosen, z[2:4])
 
 
 @pytest.mark.parametrize("change", [2.0, np.nan])
 def test_an_objective_that_depends_on_the_step_everywhere_is_compared_as_it_is(change):
     """With the rate of a held torque, or a reading that is rounded: no start is better resolved."""
-    coarse = {"at_quarter_step": lambda z: change * valleys(z).value.objective}
-    search = search_in_valleys(1.9, 0.5, **coarse)
+    comparison = StepComparison(lambda z: change * valleys(z).value.objective)
+    search = search_in_valleys(1.9, 0.5, comparison=comparison)
     search.run(60)
-    assert search.state.unresolved == 0 and search.state.largest_change > 1.0
+    assert search.state.unresolved == 0 and comparison.largest_change > 1.0
     assert search.state.incumbent_key[1] == pytest.approx(DEEP)
 
 
