@@ -57,7 +57,8 @@ class Comparison(NamedTuple):
     mislead."""
 
 
-NOT_NOTED = "The versions of the other software were not noted with {}."
+ENVIRONMENT = ("commit", "iblf_jax", "jax", "python", "processor", "cores", "peers")
+"""What all shown results must have in common, of `machine` in a result."""
 ERROR = "largest error [rad]"
 OF_ERRORS = "largest error {:.1e} rad"
 LOOP = {"loop": "paper", "type": "float64", "runs": 4096}
@@ -73,7 +74,10 @@ COMPARISONS = (
         "steps/s per core",
         "more",
         LOOP | {"row": "native"},
-        {"the same loop in plain JAX": LOOP | {"row": "textbook"}},
+        {
+            "the same loop in plain JAX": LOOP | {"row": "textbook"},
+            "diffrax with the same method": LOOP | {"row": "diffrax"},
+        },
     ),
     Comparison(
         "one run of 20 s, called from Python; RK4 at 0.5 ms, and LSODA with steps of its own that"
@@ -194,24 +198,25 @@ def errors_of(benchmark: str, conditions: Conditions) -> list[float]:
     return [float(row[ERROR]) for row in rows if named.items() <= row.items()]
 
 
-def measured_by(benchmark: str) -> str:
-    """The program of a row, and when and with which versions it was measured."""
-    machine = result_of(benchmark)["machine"]
-    version, _, _ = machine["iblf_jax"].partition(",")
-    versions = f"iblf_jax {version}, JAX {machine['jax']}, Python {machine['python']}"
-    return f"`benchmarks/{benchmark}.py`, {machine['date']}: {versions}"
+def environment(benchmarks: Sequence[str]) -> str:
+    """Where these benchmarks were measured, in sentences.
 
-
-def versions_of_others(shown: Sequence[Comparison]) -> str:
-    """The versions of the other software of these rows, in sentences."""
-    noted: dict[str, list[str]] = {}
-    for name in dict.fromkeys(comparison.benchmark for comparison in shown):
-        noted.setdefault(result_of(name)["machine"].get("peers", ""), []).append(name)
-    sentences = []
-    for peers, names in noted.items():
-        rows = ", ".join(f"`{name}.json`" for name in names)
-        sentences.append(f"Installed with {rows}: {peers}." if peers else NOT_NOTED.format(rows))
-    return " ".join(sentences)
+    Raises:
+      LookupError: not all of them were measured at one commit, on one machine and with the same
+        versions, so that rows of one table would not be comparable.
+    """
+    machines = [result_of(name)["machine"] for name in benchmarks]
+    common = machines[0]
+    for name, machine in zip(benchmarks, machines, strict=True):
+        differing = [key for key in ENVIRONMENT if machine.get(key) != common.get(key)]
+        if differing:
+            raise LookupError(f"{name}.json and {benchmarks[0]}.json differ in {differing}")
+    dates = " and ".join(sorted({machine["date"] for machine in machines}))
+    return (
+        f"All of it was measured on {dates}, at commit {common['commit'][:8]}, on"
+        f" {common['cores']} cores of an {common['processor']}: iblf_jax {common['iblf_jax']}, JAX"
+        f" {common['jax']}, Python {common['python']}; other software: {common['peers']}."
+    )
 
 
 def ratio(comparison: Comparison, name: str) -> float:
@@ -232,7 +237,7 @@ def row(comparison: Comparison) -> str:
         comparison.task,
         f"{ours} {comparison.unit}{beside(comparison, comparison.ours)}",
         "; ".join(others),
-        measured_by(comparison.benchmark),
+        f"`benchmarks/{comparison.benchmark}.py`",
     ]
     return "| " + " | ".join(cells) + " |"
 
@@ -242,11 +247,9 @@ def left_out() -> str:
     rows = result_of("constraints")["rows"]
     effort = {row["law"]: row["effort [N m]"] for row in rows}
     return (
-        "diffrax is left out of the first row until it is measured with the four evaluations a step"
-        " of the others: the noted run has the method Tsit5, with six. Model predictive control is"
-        " left out, because the noted runs of `benchmarks/constraints.py` are no comparison of"
-        f" equals: it has a period of 20 ms and an RMS torque of {effort['MPC (CasADi)']:.2g} N m,"
-        " the safety filter beside it a period of 1 ms and"
+        "Model predictive control is left out, because the runs of `benchmarks/constraints.py` are"
+        " no comparison of equals: it has a period of 20 ms and an RMS torque of"
+        f" {effort['MPC (CasADi)']:.2g} N m, the safety filter beside it a period of 1 ms and"
         f" {effort['safety_filter']:.2g} N m; it is called from Python once a period, where the"
         " loop of the filter is one compiled program; and it solves to convergence by IPOPT,"
         " without real-time iterations."
@@ -264,8 +267,8 @@ def table() -> str:
     lines = [*head, *map(row, shown)]
     lines += [
         "",
-        f"The errors of the first and the third row are those of {measured_by('errors')}."
-        f" {versions_of_others(shown)}",
+        "The errors of the first and the third row are those of `benchmarks/errors.py`."
+        f" {environment([*(x.benchmark for x in shown), 'errors'])}",
     ]
     if removed:
         names = " and ".join(f'"{task}"' for task in removed)
@@ -282,7 +285,7 @@ def three_numbers() -> str:
     lines = []
     for benchmark, text in ON_LANDING.items():
         chosen = next(x for x in COMPARISONS if x.benchmark == benchmark)
-        (conditions,) = chosen.others.values()
+        conditions = next(iter(chosen.others.values()))
         number = f"{words(value_of(chosen, chosen.ours))} {chosen.unit}"
         other = in_short(chosen, conditions) + beside(chosen, conditions)
         described = text.format(ours=beside(chosen, chosen.ours), other=other)

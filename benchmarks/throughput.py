@@ -438,16 +438,16 @@ def calls(quick: bool) -> list[list]:
     result = []
     for runs, steps in ((2, 20),) if quick else CALLS:
         study = partial(ij.monte_carlo, scenario, unknown, runs=runs, duration=1e-3 * steps)
-        name_of_call = "monte_carlo, whole call"
+        name_of_call, name_of_limit = "monte_carlo, whole call", "limit, in turn with it"
         ways = {name_of_call: partial(study, method=method, progress=False)}
         if by_hand:
             values = draws(canonical(ij.astype(scenario, "float32")), runs, "float32")
-            ways["limit"] = partial(by_hand, values, steps)
+            ways[name_of_limit] = partial(by_hand, values, steps)
         first = time.perf_counter()
         ways[name_of_call]()
         seconds = time.perf_counter() - first
         found = in_turn(ways, 1 if quick else 5)
-        least = found.get("limit", (math.nan, math.nan))[1]
+        least = found.get(name_of_limit, (math.nan, math.nan))[1]
         for name, (wall, cpu) in found.items():
             speeds = runs * steps / wall, runs * steps / cpu
             first_call = seconds if name == name_of_call else 0.0

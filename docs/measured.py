@@ -37,8 +37,8 @@ PLOTS = {
     "throughput": Plot(
         ("row", "type"),
         "steps/s per core",
-        "Many runs of the paper's loop at once; more is better. The row of diffrax was measured"
-        " with the method Tsit5, whose steps have six evaluations; those of the others have four.",
+        "Many runs of the paper's loop at once, by the classical Runge-Kutta method; more is"
+        " better.",
         {"loop": "paper", "runs": 4096},
     ),
     "errors": Plot(
