@@ -1,6 +1,7 @@
 """Laws with the same budget of tuning on the task of an entry: error against effort.
 
     python benchmarks/field/equal_budget.py --task NAME [NAME ...] [--laws LAW ...] [--quick]
+        [--minutes M]
 
 Every law of a task, the published one among them, is tuned with the same budget (`BUDGET`): two or
 three of its gains (`GAINS`), the same objective, the same limits of the effort, the same ranges.
@@ -95,18 +96,18 @@ OF_CHAINS = tuple(
 """The laws beside the published one, chosen before any result; `--laws` takes any of `laws_of`."""
 LATER = {
     "zhang_yan_2024": (
-        "Backstepping(Tan)",
+        "TerminalSlidingMode",
         "Backstepping(TransformedError)",
-        "Backstepping(TransformedError), finite time",
-        "Backstepping(Integral), q measured",
-        "Saturated(auxiliary)",
-        "AdaptiveParameters(masses)",
-        "Backstepping, no bounds",
-        "BarrierBackstepping(Integral, Integral)",
         "DynamicSurface",
+        "Backstepping(Tan)",
+        "Backstepping, no bounds",
+        "Saturated(auxiliary)",
+        "BarrierBackstepping(Integral, Integral)",
+        "Backstepping(Integral), q measured",
+        "AdaptiveParameters(masses)",
         "SurfaceBarrier",
         "ReferenceGovernor",
-        "TerminalSlidingMode",
+        "Backstepping(TransformedError), finite time",
     )
 }
 """Task -> laws that were added after the results of the others: those of the page "Choosing a law"
@@ -360,13 +361,18 @@ def limited(scenario: ij.Scenario, contents: entry.Entry) -> ij.Scenario:
     return ij.with_parts(scenario, actuator=InputLimits(lower, upper))
 
 
-def compare(folder: Path, names: list[str] | None = None, quick: bool = False) -> dict[str, Any]:
-    """The result of a task.
+def compare(
+    folder: Path,
+    names: list[str] | None = None,
+    quick: bool = False,
+    minutes: float = math.inf,
+) -> dict[str, Any]:
+    """The result of a task, with the laws that begin within some minutes.
 
     Raises:
       EntryError: the published law has no two gains.
     """
-    began = time.process_time()
+    began, end = time.process_time(), time.monotonic() + 60.0 * minutes
     contents = entry.load(folder)
     dt = contents.run.dt
     duration = dt * round(QUICK_DURATION / dt) if quick else contents.run.duration
@@ -383,6 +389,9 @@ def compare(folder: Path, names: list[str] | None = None, quick: bool = False) -
         paths = gains_of(folder.name, scenario.controller, name == PUBLISHED)
         if len(paths) not in (2, 3):
             reasons[name] = "it has no two or three gains in GAINS or OF_ENTRIES"
+            continue
+        if time.monotonic() > end:
+            reasons[name] = f"not begun within {minutes:g} minutes"
             continue
         used = time.process_time()
         try:
@@ -451,6 +460,7 @@ def main() -> int:
     parser.add_argument("--task", nargs="+", metavar="NAME", default=TASKS, help="entries")
     parser.add_argument("--laws", nargs="+", metavar="LAW", help="in place of those of the page")
     parser.add_argument("--quick", action="store_true", help="0.2 s of motion, a small budget")
+    parser.add_argument("--minutes", type=float, default=math.inf, help="no law begins later")
     parser.add_argument("--out", type=Path, help="folder of the results")
     args = parser.parse_args()
     out = args.out or entry.RESULTS
@@ -462,10 +472,11 @@ def main() -> int:
     failed = 0
     for name in args.task:
         words = ["python", "benchmarks/field/equal_budget.py", "--task", name]
+        words += ["--minutes", f"{args.minutes:g}"] * (args.minutes < math.inf)
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # the result states what a run does not keep
-                result = compare(entry.ENTRIES / name, args.laws, args.quick)
+                result = compare(entry.ENTRIES / name, args.laws, args.quick, args.minutes)
         except entry.EntryError as error:
             failed += 1
             print(f"{name}: failed: {error}")
