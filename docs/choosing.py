@@ -106,7 +106,8 @@ ADVICE = {
     "BarrierBackstepping(Integral, Integral)": Advice(
         "positions and velocities",
         "positions and velocities have bounds",
-        "the masses are uncertain: with masses that are 30 % wrong its error is six times as large",
+        "the masses are uncertain: its error is more than five times as large with masses that are"
+        " 30 % wrong",
     ),
     "DynamicSurface": Advice(
         POSITIONS,

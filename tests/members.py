@@ -274,7 +274,12 @@ def velocities_squared(t: Any, x: Any) -> Any:
 LAWS = {
     "backstepping": controllers.Backstepping(k1=2.0, K2=20.0, o=0.1),
     "backstepping_corrected_log": controllers.Backstepping(
-        k1=[2.0, 3.0], K2=20.0, o=0.1, barrier=barriers.Log(p=2), variant="corrected"
+        k1=[2.0, 3.0],
+        K2=[20.0, 15.0],
+        o=0.1,
+        barrier=barriers.Log(p=2),
+        variant="corrected",
+        gain_matrix=[[1.0, 0.3], [-0.1, 0.9]],
     ),
     "barrier_backstepping": controllers.BarrierBackstepping(k=(2.0, [20.0, 15.0])),
     "barrier_backstepping_compensated": controllers.BarrierBackstepping(

@@ -19,7 +19,7 @@ class Work(NamedTuple):
     """What the search found."""
 
 
-SEARCHED = "2026-11-30"
+SEARCHED = "2026-12-01"
 """Date of the search in public pages and repositories."""
 NOT_READABLE = (
     Work("K. P. Tee, S. S. Ge, E. H. Tay, Automatica 45 (2009) 918-927", ("liu_2018",)),
@@ -37,6 +37,7 @@ NOT_READABLE = (
     Work(
         "C. P. Bechlioulis, G. A. Rovithakis, Automatica 50 (2014) 1217-1226",
         ("dimanidis_2018", "damodaran_2024"),
+        "the beginning of the text of a conference version, without the example",
     ),
     Work(
         "A. Ilchmann, E. P. Ryan, C. J. Sangwin, ESAIM COCV 7 (2002) 471-493 (funnel control)",

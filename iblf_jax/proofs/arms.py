@@ -582,6 +582,9 @@ def _check_law(law: controllers.TrackingLaw) -> None:
     if law.variant != "corrected":
         reason = "The printed law leaves 1/2 e2^T M0' e2 in V_w', and its proof fails."
         raise unsupported("controller.variant", law.variant, '"corrected"', reason)
+    if law.gain_matrix is not None:
+        reason = "The bound of V_w' is that of a diagonal gain."
+        raise unsupported("controller.gain_matrix", "a matrix", "None", reason)
     check_exponential(law, "V_w'")
     barrier, tube = law.barrier, unit_tube()
     zero, one = jnp.zeros(1), jnp.ones(1)

@@ -217,10 +217,13 @@ def _default_low(conditions: Conditions, path: str, start: np.ndarray) -> End:
 
 
 def has_weight_of_the_paper(scenario: Scenario) -> bool:
-    """Whether the weight of the law's barrier is 1 on every joint; with another one Theorem 2 has
-    no condition on K2 alone.
+    """Whether the weight of the law's barrier is 1 on every joint, and its gain is K2; otherwise
+    Theorem 2 has no condition on K2 alone.
     """
-    weight = vars(unwrapped(scenario.controller)).get("weight", 1.0)
+    fields = vars(unwrapped(scenario.controller))
+    if fields.get("gain_matrix") is not None:
+        return False
+    weight = fields.get("weight", 1.0)
     return weight is None or bool(np.all(np.asarray(weight) == 1.0))
 
 

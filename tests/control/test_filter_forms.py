@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.linalg
 from independent import Loop
 from refused import refused
 
@@ -66,14 +67,21 @@ def test_a_dynamic_surface_law_and_its_start_are_those_of_an_independent_program
         np.testing.assert_allclose(rates, expected, atol=1e-12 * np.max(np.abs(expected)))
 
 
+ARM_GAIN = np.array([[1.2, -0.3], [0.5, 0.8]])
+COMMON = {"k1": 2.0, "K2": 20.0, "barrier": barriers.TransformedError()}
+
+
 @pytest.mark.slow
-def test_the_energy_of_the_compensated_law_of_robots_decays_as_with_exact_derivatives(rng):
+@pytest.mark.parametrize(
+    ("found", "K"),
+    [
+        (controllers.DynamicSurface(filter=0.05, filter_form="compensated", **COMMON), np.eye(2)),
+        (controllers.Backstepping(variant="corrected", gain_matrix=ARM_GAIN, **COMMON), ARM_GAIN),
+    ],
+)
+def test_the_energy_of_a_law_of_robots_decays_as_with_exact_derivatives(found, K, rng):
     scenario = ij.presets.zhang_yan_2024(variant="corrected")
-    barrier = barriers.TransformedError()
-    found = controllers.DynamicSurface(
-        k1=2.0, K2=20.0, filter=0.05, barrier=barrier, filter_form="compensated"
-    )
-    arm = plants.as_plant(scenario.model)
+    arm, has_filter = plants.as_plant(scenario.model), found.filter is not None
 
     def commanded(t, x, state):
         return found.command(t, x[0], x[1], jnp.zeros(2), scenario.context, state)
@@ -85,13 +93,37 @@ def test_the_energy_of_the_compensated_law_of_robots_decays_as_with_exact_deriva
 
     for _ in range(3):
         t = jnp.asarray(rng.uniform(0.0, 3.0))
-        x = jnp.asarray(rng.normal(scale=0.1, size=(2, 2))) + 0.4
-        state = jnp.asarray(rng.normal(scale=0.1, size=(2, 2)))
+        x = jnp.asarray(rng.uniform(-0.05, 0.05, (2, 2)))
+        x = x.at[0].add(scenario.context.tube(t).q_d)
+        state = jnp.asarray(rng.uniform(-0.05, 0.05, (2, 2))) if has_filter else ()
         command, rates = commanded(t, x, state)
         dx = plants.flow(arm, t, x, command.tau)
         dV = jax.jvp(energy, (t, x, state), (jnp.ones_like(t), dx, rates))[1]
-        decay = 4.0 * jnp.sum(command.V1) + 20.0 * jnp.sum((x[1] - command.alpha) ** 2)
+        e2 = x[1] - command.alpha
+        decay = 4.0 * jnp.sum(command.V1) + 20.0 * e2 @ K @ e2
         np.testing.assert_allclose(dV, -decay, rtol=1e-9)
+        if not has_filter:
+            stated = found.energy_decay(t, x[0], x[1], scenario.context)
+            np.testing.assert_allclose(stated, decay, rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_the_claims_about_a_full_gain_are_those_of_its_symmetric_part():
+    scenario = ij.presets.zhang_yan_2024(variant="corrected")
+    law = controllers.Backstepping(
+        k1=2.0, K2=[20.0, 15.0], gain_matrix=ARM_GAIN, variant="corrected"
+    )
+    scenario = ij.with_parts(scenario, controller=law)
+    cert = ij.certify(scenario, duration=0.5, dt=1e-3)
+    full = ARM_GAIN * np.array([20.0, 15.0])
+    symmetric = 0.5 * (full + full.T)
+    np.testing.assert_allclose(cert["K2"].margin, np.linalg.eigvalsh(symmetric)[0] - 0.5)
+    assert (cert["K2"].joint, cert.headline) == (None, "holds")
+    for name in ("inequality, case 2", "weighted inequality, case 2"):
+        assert cert[name].verdict == "holds"
+    M0 = scenario.model.mass_matrix(scenario.initial.q)
+    mu = scipy.linalg.eigvalsh(symmetric, M0)[0]
+    assert 0.9 * mu < cert.numbers["lambda_min_K2_over_M0_run"] <= mu * (1.0 + 1e-9)
 
 
 @pytest.mark.slow
@@ -200,6 +232,13 @@ def of_levels(**fields):
     return controllers.BarrierBackstepping(**{"k": (1.0, 1.0), "barriers": both} | fields)
 
 
+def of_joints(matrix):
+    return controllers.Backstepping(k1=1.0, K2=3.0, gain_matrix=matrix)
+
+
+ARM_CONTEXT = ij.presets.zhang_yan_2024().context
+
+
 def with_a_wrong_regressor():
     wrong = controllers.BarrierBackstepping(k=K, damping=1.0, regressor=lambda t, x: x)
     reference = references.Sinusoid(offset=0.2, amplitude=0.4)
@@ -210,6 +249,9 @@ test_what_does_not_fit_is_refused = refused(
     (lambda: of_levels(gain_matrices=[K1, K2]), r"matrices\[0\].*unit matrix.*TransformedError"),
     (lambda: of_levels(weight_matrices=[np.eye(3), K2]), r"weight_matrices\[1\].*symmetric"),
     (lambda: of_levels(gain_matrices=[np.eye(3), -K2]), r"matrices\[1\].*eigenvalue -12.2"),
+    (lambda: of_joints(np.eye(3)[0]), r"Backstepping\.gain_matrix.*shape \(n, n\)"),
+    (lambda: of_joints(np.diag([1.0, -2.0])), r"Backstepping\.gain_matrix.*eigenvalue -6"),
+    (lambda: of_joints(np.eye(3)).check_start(ARM_CONTEXT), r"controller\.gain.*\(2, 2\)"),
     (lambda: of_levels(weight_matrices=np.eye(3)), r"weight_matrices.*shape \(2, n, n\)"),
     (lambda: of_levels(filter_form="derivative"), r"BarrierBackstepping\.filter.*filter=0\.01"),
     (

@@ -45,7 +45,11 @@ def base():
     return ij.with_parts(paper, sampling=ij.Sampling(1e-3), bounds=(paper.bounds[0], speeds))
 
 
-FURTHER_FORMS = ("barrier_backstepping_matrices", "dynamic_surface_compensated")
+FURTHER_FORMS = (
+    "backstepping_corrected_log",
+    "barrier_backstepping_matrices",
+    "dynamic_surface_compensated",
+)
 """Members whose parameters or state have another form than those of the first of their class."""
 LAWS = [x for x in members.LAWS if x not in members.further(members.LAWS)]
 OBSERVERS = [x for x in members.OBSERVERS if x not in members.further(members.OBSERVERS)]

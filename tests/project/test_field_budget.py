@@ -36,12 +36,16 @@ def a_task(name):
 def test_every_law_of_a_task_has_two_or_three_gains_in_the_same_range(name):
     task = a_task(name)
     published = task.scenario.controller
-    choices = equal_budget.laws_on(task, published, None, {})
-    laws = {law: one.law for law, one in choices.items() if not isinstance(one, str)}
-    laws[equal_budget.PUBLISHED] = published
-    assert len(laws) >= 5
-    for law, controller in laws.items():
-        scenario = ij.with_parts(task.scenario, controller=controller)
+    chosen, uncertain = equal_budget.chosen_laws(name, task), ("plant.mass",)
+    choices = equal_budget.laws_on(task, published, chosen, {}, uncertain)
+    scenarios = {equal_budget.PUBLISHED: task.scenario} | {
+        law: ij.with_parts(task.scenario, controller=one.law, **one.parts)
+        for law, one in choices.items()
+        if not isinstance(one, str)
+    }
+    assert len(scenarios) >= 5
+    for law, scenario in scenarios.items():
+        controller = scenario.controller
         paths = equal_budget.gains_of(name, controller, law == equal_budget.PUBLISHED)
         assert len(paths) in (2, 3), law
         assert len(set(paths)) == len(paths), law
@@ -52,13 +56,13 @@ def test_every_law_of_a_task_has_two_or_three_gains_in_the_same_range(name):
 
 
 def test_a_law_that_is_the_published_one_has_no_second_row():
-    task, names = a_task("zhang_yan_2024"), ["ComputedTorque", "PDGravity"]
+    task, names = a_task("zhang_yan_2024"), ("ComputedTorque", "PDGravity")
     law = task_laws.laws_of(task, ())["ComputedTorque"].law
     found = equal_budget.laws_on(task, law, names, {"PDGravity": "no gravity"})
     assert found["ComputedTorque"] == "it is the published law with other gains"
     assert found["PDGravity"] == "no gravity"
     with pytest.raises(entry.EntryError, match=r"--laws: \['no law'\] are unknown"):
-        equal_budget.laws_on(task, law, ["no law"], {})
+        equal_budget.laws_on(task, law, ("no law",), {})
 
 
 def test_the_rank_leaves_out_laws_outside_the_effort():

@@ -192,6 +192,7 @@ SPLINE = ij.references.WaypointSpline((0.0, 1.0), [[0.5, 0.5], [0.6, 0.6]])
 REFUSED_LOOPS = {
     "controller.variant": ij.presets.zhang_yan_2024,
     "controller": with_parts(controller=ij.controllers.PDGravity(Kp=1.0, Kd=1.0)),
+    "controller.gain_matrix": with_law(gain_matrix=[[1.0, 0.2], [0.2, 1.0]]),
     "controller.decays": with_law(decays=(ij.decays.FiniteTime(k_a=2.0),) * 2),
     "controller.barrier": with_law(barrier=ij.barriers.StateBarrier(), o=None),
     "observer": with_parts(observer=ij.observers.NoObserver()),

@@ -11,7 +11,8 @@
 
 Every barrier that states how fast its V1 decays along alpha (`decay_rate`) has the claim, because
 the law cancels the barrier's slope against e2: 2 k1 for the integral barrier, 2 p k1 for the
-logarithmic one, and so on.  K2 and kf are diagonal, so lambda_min is the smallest entry.
+logarithmic one, and so on.  kf is diagonal, so lambda_min is the smallest entry.  With a
+`gain_matrix` K, K K2 takes the place of K2, and lambda_min is that of its symmetric part.
 
 The printed proof drops two terms of V2', whose sizes are measured beside the margin that the proof
 leaves for them:
@@ -240,7 +241,8 @@ class Theorem(TwoCases, MainClaim):
         """`Terms.size` and `Terms.sqrt_V_size`."""
         law = point.law
         guard = -1.0 if law.barrier is None else law.barrier.guard
-        return SignalSizes(point, law.K2, guard).of_V2(terms, law.weight)
+        K2 = law.full_gain if isinstance(law, Backstepping) else law.K2
+        return SignalSizes(point, K2, guard).of_V2(terms, law.weight)
 
     # --- the constants ----------------------------------------------------------------------------
 
@@ -260,8 +262,10 @@ class Theorem(TwoCases, MainClaim):
         M0 = np.asarray(torque.M0)
         eigenvalues, mu = _eigenvalues(M0), np.nan
         if isinstance(law, Backstepping):
-            root = np.asarray(law.K2**0.5)
-            mu = (1.0 / _eigenvalues(M0 / (root[:, None] * root[None, :]))[:, -1]).min()
+            gain = np.asarray(law.full_gain)
+            values, vectors = np.linalg.eigh(0.5 * (gain + gain.T))
+            inverse_root = vectors / np.sqrt(np.where(values > 0.0, values, np.nan))
+            mu = (1.0 / _eigenvalues(inverse_root.T @ M0 @ inverse_root)[:, -1]).min()
         half_square = 0.5 * np.sum(terms.d_tilde[0] ** 2)
         return {
             "d_rate_largest": Reduction(np.maximum, largest_norm(terms.dd)),
@@ -379,10 +383,13 @@ class Theorem(TwoCases, MainClaim):
         lines = []
         for statement, above_lowest, enters in conditions:
             margins = np.asarray(above_lowest)
+            joint: int | None = int(margins.argmin())
+            if statement is K2 and summary.law.gain_matrix is not None:
+                joint = None  # an eigenvalue of a full matrix belongs to all joints
             line = check_positive(
                 statement,
                 float(margins.min()),
-                joint=int(margins.argmin()),
+                joint=joint,
                 enters_verdict=enters,
                 note="" if enters else CASE_1_DECIDES,
             )
@@ -680,7 +687,7 @@ def _dissipation_of_backstepping(point: TorquePoint, e2: jax.Array) -> Any:
     stated = law.barrier.decay_rate(gain_at(decay_of(law, 0), t, law.k1, law.barrier, tube, q))
     if stated is None:
         return ()
-    dissipation = jnp.sum(law.weight * stated * law.barrier.value(tube, q)) + e2 @ (law.K2 * e2)
+    dissipation = jnp.sum(law.weight * stated * law.barrier.value(tube, q)) + e2 @ law.feedback(e2)
     W = 0.5 * e2 @ (point.M0 @ e2)
     second = decay_of(law, 1)
     if second.constant:
@@ -693,14 +700,15 @@ class SignalSizes:
 
     Args:
       point: of the loop.
-      K2: gain of the velocity error, (n,), or None.
+      K2: gain of the velocity error, (n,) or (n, n), or None.
       guard: of the barrier on e1.
     """
 
     def __init__(self, point: TorquePoint, K2: jax.Array | None, guard: float) -> None:
         now, rates = point.now, point.rates
         self.point = point
-        self.K2 = jnp.zeros_like(point.state.q) if K2 is None else K2
+        K2 = jnp.zeros_like(point.state.q) if K2 is None else K2
+        self.K2 = jnp.diag(K2) if K2.ndim == 1 else jnp.abs(K2)
         self.gap = relative_gap(now["xi"], guard)
         self.e2 = jnp.abs(point.state.dq) + jnp.abs(now["alpha"]) + jnp.abs(now["dq_d"])
         self.acceleration = jnp.abs(now["ddq"]) + jnp.abs(rates["alpha"])
@@ -708,7 +716,7 @@ class SignalSizes:
             jnp.abs(point.M0) @ self.acceleration
             + jnp.abs(now["tau"])
             + jnp.abs(now["disturbance_estimate"])
-            + self.K2 * self.e2
+            + self.K2 @ self.e2
             + jnp.abs(now["s"]) / self.gap
         )
 
@@ -723,7 +731,7 @@ class SignalSizes:
             M0 @ jnp.abs(rates["ddq"])
             + jnp.abs(rates["tau"])
             + jnp.abs(rates["disturbance_estimate"])
-            + self.K2 * self.acceleration
+            + self.K2 @ self.acceleration
             + kf * torque
             + (jnp.abs(rates["s"]) + jnp.abs(now["s"]) * e2) / gap
         )

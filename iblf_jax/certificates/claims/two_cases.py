@@ -40,6 +40,7 @@ class Gains(NamedTuple):
     decay_rate: jax.Array
     """Of V1 of each joint along alpha [1/s]."""
     K2: jax.Array
+    """`Backstepping.least_gain` [N m s/rad]."""
     kf: jax.Array
 
 
@@ -226,7 +227,7 @@ def gains_of(scenario: Scenario) -> Gains:
     """The gains on which rho depends; only for a scenario for which `why_no_theorem` is empty."""
     law: Any = unwrapped(scenario.controller)
     kf = scenario.observer.kf
-    return Gains(law.barrier.decay_rate(law.k1), law.K2, kf)
+    return Gains(law.barrier.decay_rate(law.k1), law.least_gain, kf)
 
 
 def why_no_theorem(scenario: Scenario) -> str:

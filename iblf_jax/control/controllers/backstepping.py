@@ -26,6 +26,9 @@ in the corrected variant, because e2^T (k2 M0 e2) = 2 k2 W.  V = sum w V1 + W th
     V' <= -sum w rate(k1(t, V1)) V1 - 2 (mu + k2(t, W)) W + e2 . f_tilde,  mu = lambda_min(M0^-1 K2)
 
 With a decay of finite, fixed or prescribed time in both steps, so does V.
+
+**A full matrix as gain.**  With `gain_matrix` K the feedback is -K K2 e2 and W' contains
+-e2^T K K2 e2, which the symmetric part of K K2 determines.
 """
 
 from __future__ import annotations
@@ -45,7 +48,7 @@ from iblf_jax.control.decays._base import (
     gain_at,
 )
 from iblf_jax.core import checks
-from iblf_jax.core.linalg import inner
+from iblf_jax.core.linalg import inner, matvec
 from iblf_jax.core.pytree import Leaf, component, leaf, static
 from iblf_jax.world.bounds import Tube
 from iblf_jax.world.robots import inverse_dynamics, momentum
@@ -88,6 +91,9 @@ class Backstepping(RobotLaw):
         rad^2), > 0; 1, the paper's, if not given.
       decays: a `Decay` of V1 and one of the energy 1/2 e2^T M0 e2; one alone is that of both;
         exponential in k1 and K2 if not given.
+      gain_matrix: K of the feedback -K K2 e2, (n, n) [1], for which the symmetric part of K K2 is
+        positive definite; with K2 = 1 N m s/rad its entries are those of a full gain.  The unit
+        matrix if not given.
 
     Source: Zhang & Yan 2024, (3.5), (3.14); `corrected` as said at the head of this module.
     """
@@ -99,6 +105,7 @@ class Backstepping(RobotLaw):
     variant: str = static(default="printed")
     weight: Leaf = leaf("N m rad", sign="positive", default=None)
     decays: tuple[Decay, ...] = ()
+    gain_matrix: Leaf = leaf("1", shape="any", default=None)
     factors: ClassVar[tuple[str, ...]] = ("weight",)
     takes_shift: ClassVar[bool] = True
     leaf_units = weight_units
@@ -106,24 +113,41 @@ class Backstepping(RobotLaw):
     init = no_state
 
     def check(self) -> None:
-        """Raises ValueError for an unknown variant; completes `o` (0.1, the paper's, if the barrier
-        needs one) and `weight`.
+        """Raises ValueError for an unknown variant or a matrix that is no gain; completes `o` (0.1,
+        the paper's, if the barrier needs one) and `weight`.
         """
         checks.one_of("Backstepping.variant", self.variant, VARIANTS)
         check_barrier(self, "barrier", self.barrier)
         fit_o(self, self.barrier)
         fit_weight(self)
         fit_decays(self, 2)
+        if self.gain_matrix is None:
+            return
+        shape = jnp.shape(self.gain_matrix)
+        if len(shape) != 2 or shape[0] != shape[1]:
+            words = checks.Words(f"shape {shape}")
+            raise checks.fail("Backstepping.gain_matrix", words, "one matrix, shape (n, n)")
+        fits = jnp.shape(self.K2) in ((), shape[:1])
+        if fits and checks.is_concrete((self.K2, self.gain_matrix)):
+            check_definite("Backstepping.gain_matrix", np.asarray(self.gain_matrix * self.K2))
+
+    def check_start(self, context: LawContext) -> None:
+        """Raises ValueError for a matrix of another number of joints."""
+        n = context.model.n
+        if self.gain_matrix is not None and len(self.gain_matrix) != n:
+            words = checks.Words(f"shape {self.gain_matrix.shape}")
+            raise checks.fail("controller.gain_matrix", words, f"one matrix, shape ({n}, {n})")
 
     def advice(self) -> list[str]:
         """What is lost of Theorem 2 where the printed law, whose weight is 1, has a gain outside
         its conditions.  For the corrected law the claim with weights, which holds for every K2 > 0,
         takes its place.
         """
-        if self.variant == "corrected" or not checks.is_concrete((self.K2, self.weight)):
+        gains = (self.K2, self.weight, self.gain_matrix)
+        if self.variant == "corrected" or not checks.is_concrete(gains):
             return []
         is_papers = np.asarray(self.weight) == 1.0
-        if not np.any(is_papers & (np.asarray(self.K2) <= 0.5)):
+        if not np.any(is_papers & (np.asarray(self.least_gain) <= 0.5)):
             return []
         need = "Theorem 2 needs K2 > 1/2 on every joint, condition (3.17) of the paper"
         lost = "Below it the paper's bound on V2 is not proven"
@@ -131,7 +155,34 @@ class Backstepping(RobotLaw):
             'with variant="corrected" and observers.Momentum, ij.certify computes another bound,'
             ' its claim "weighted", which holds for every K2 > 0'
         )
-        return [f"controller.K2 = {self.K2}: {need}. {lost}; {rest}."]
+        gain = f"controller.K2 = {self.K2}"
+        if self.gain_matrix is not None:
+            gain = f"the least eigenvalue of K K2 is {self.least_gain[0]:.4g} N m s/rad"
+        return [f"{gain}: {need}. {lost}; {rest}."]
+
+    def feedback(self, e2: jax.Array) -> jax.Array:
+        """K K2 e2, (n,) [N m]."""
+        if self.gain_matrix is None:
+            return self.K2 * e2
+        return matvec(self.gain_matrix, self.K2 * e2)
+
+    @property
+    def full_gain(self) -> jax.Array:
+        """K K2, or the diagonal matrix of K2, (n, n) [N m s/rad]."""
+        if self.gain_matrix is None:
+            return jnp.diag(self.K2)
+        return self.gain_matrix * self.K2
+
+    @property
+    def least_gain(self) -> jax.Array:
+        """K2, or for each joint the least eigenvalue of the symmetric part of K K2, of which
+        e2^T K K2 e2 is at least |e2|^2 times; (n,) [N m s/rad].
+        """
+        if self.gain_matrix is None:
+            return self.K2
+        full = self.full_gain
+        least = jnp.linalg.eigvalsh(0.5 * (full + full.T))[0]
+        return jnp.full(len(full), least)
 
     def command(
         self,
@@ -147,7 +198,7 @@ class Backstepping(RobotLaw):
         tube = context.tube(t)
         v = alpha if self.variant == "corrected" else dq
         feedforward = inverse_dynamics(context.model, q, dq, v, dalpha)
-        tau = feedforward - f_hat - self.K2 * (dq - alpha)
+        tau = feedforward - f_hat - self.feedback(dq - alpha)
         tau = tau - self.weight * self.barrier.slope(tube, q)
         tau = with_energy_decay(self, t, q, dq - alpha, context, tau)
         command = barrier_command(self, tube, q, alpha, tau)
@@ -162,12 +213,12 @@ class Backstepping(RobotLaw):
     def energy_decay(
         self, t: jax.Array, q: jax.Array, dq: jax.Array, context: LawContext
     ) -> jax.Array:
-        """The decay of V1, which is 0 for a barrier that states none, + e2^T K2 e2, ()
+        """The decay of V1, which is 0 for a barrier that states none, + e2^T K K2 e2, ()
         [N m rad/s], of the corrected variant.
         """
         e2 = dq - virtual_velocity(self, t, q, context)
         V1 = self.weight * self.barrier.value(context.tube(t), q)
-        return jnp.sum(stated_decay(self.barrier, self.k1, V1)) + inner(e2, self.K2 * e2)
+        return jnp.sum(stated_decay(self.barrier, self.k1, V1)) + inner(e2, self.feedback(e2))
 
 
 def barrier_command(law, tube: Tube, q: jax.Array, alpha: jax.Array, tau: jax.Array) -> Command:
@@ -191,6 +242,14 @@ def check_barrier(law, field: str, barrier: object, example: str = "Integral") -
     """Raises ValueError unless a field of a law holds a barrier."""
     name = f"{type(law).__name__}.{field}"
     checks.conforms(name, barrier, Barrier, f"Such as iblf_jax.barriers.{example}().")
+
+
+def check_definite(field: str, matrix: np.ndarray) -> None:
+    """Raises ValueError unless the symmetric part of a matrix is positive definite."""
+    smallest = np.min(np.linalg.eigvalsh(0.5 * (matrix + matrix.T)))
+    if smallest <= 0.0:
+        got = f"a matrix whose symmetric part has the eigenvalue {smallest:.4g}"
+        raise checks.fail(field, checks.Words(got), "a positive definite symmetric part")
 
 
 def fit_o(law, *barriers: Barrier, like: jax.Array | None = None) -> None:

@@ -116,6 +116,7 @@ from iblf_jax.control.controllers._levels import (
 )
 from iblf_jax.control.controllers.backstepping import (
     check_barrier,
+    check_definite,
     fit_decays,
     fit_o,
     stated_decay,
@@ -624,10 +625,7 @@ def _check_matrix(field: str, matrix: np.ndarray, barrier: Barrier, name: str) -
         return
     if name == "weight_matrices" and not np.allclose(matrix, matrix.T, rtol=1e-9, atol=0.0):
         raise checks.fail(field, matrix, "a symmetric matrix")
-    smallest = np.min(np.linalg.eigvalsh(0.5 * (matrix + matrix.T)))
-    if smallest <= 0.0:
-        got = f"a matrix whose symmetric part has the eigenvalue {smallest:.4g}"
-        raise checks.fail(field, checks.Words(got), "a positive definite symmetric part")
+    check_definite(field, matrix)
 
 
 # One program: each of some fifty operations would be one.
