@@ -57,11 +57,6 @@ def test_heat_maps_show_shares_and_medians(table):
     assert maps[1].get_xlabel() == "controller.K2 [N m s/rad]"
 
 
-def test_parallel_has_a_line_a_point(table):
-    figure = drawn(plotting.parallel(table, "margin"))
-    assert len(figure.axes[0].get_lines()) == 6 and len(figure.axes[0].get_xticks()) == 3
-
-
 def test_bad_figures_are_refused(study, table):
     for message, draw, *arguments in (
         ("a Study", plotting.bands, table),

@@ -1,6 +1,6 @@
 """What users see of short flows through the package, from a scenario to texts, figures and files.
 
-`tests/data/flows.txt` has the printed results, and of every array and every curve of a figure what
+`tests/data/flows.txt` has the printed results, and of every array and all that a figure shows what
 its numbers add up to, with generic weights.  The flows have one joint and few steps, so that what
 they compile is small, but they go through studies, certificates, proofs, identification
 and figures, with the parts that other tests leave at their defaults.  Results of every class come
@@ -15,6 +15,7 @@ writes the file anew.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import os
 import re
@@ -35,18 +36,23 @@ import numpy as np
 import pytest
 from compared_texts import same_row, same_text
 from made_up_runs import chain, made_up
+from matplotlib.colors import to_rgba_array
 from proof_cases import pendulum, within
 from stored_results import FOLDER, stored
 
 import iblf_jax as ij
+from iblf_jax.core.status import Status
+from iblf_jax.engine import diagnosis
 from iblf_jax.files.scenario import scenario_to_toml
+from iblf_jax.simulation.error_growth import BOUND
+from iblf_jax.simulation.stability import RADIUS
 
 FILE = TESTS / "data" / "flows.txt"
 HEADING = "=== "
 RUN: dict[str, Any] = {"duration": 0.1, "dt": 5e-3, "method": "euler"}
 SECONDS = re.compile(r"(?<=(?:bes|xes|eps), )[\d.]+ s\b")
 """How long so many probes, boxes or steps took."""
-SLOW = ("comparisons", "proofs", "Proof_0", "Study_0", "TuneResult_0")
+SLOW = ("comparisons", "proofs", "Proof_0")
 """Flows that take several seconds of a processor."""
 
 # ------------------------------------------------------------ what is shown of a result
@@ -84,6 +90,26 @@ def drawn(figure: Any) -> Iterator[str]:
             for group in (curves, patches, areas)
         ]
         yield " | ".join([*filter(None, words), *counts]).replace("\n", " ")
+        yield f"looks: {total(np.concatenate([np.ravel(x) for x in looks(axes)]))}"
+    yield "figure of {:.6g} x {:.6g} inches".format(*figure.get_size_inches())
+
+
+LOOKS = (
+    *("color", "facecolor", "edgecolor", "alpha", "zorder", "linewidth", "markersize", "sizes"),
+    *("position", "fontsize", "rotation"),
+)
+"""What `get_` of lines, patches, areas or texts returns."""
+
+
+def looks(axes: Any) -> Iterator[Any]:
+    """Numbers of where a panel is, of its axes, and of how each artist in it looks."""
+    yield from (axes.get_position().bounds, axes.get_xlim(), axes.get_ylim(), axes.get_xticks())
+    yield from (np.asarray(x.get_array(), float) for x in axes.images)
+    for artist in (*axes.lines, *axes.patches, *axes.collections, *axes.texts):
+        for name in LOOKS:
+            value = getattr(artist, f"get_{name}", tuple)()
+            if value is not None:
+                yield to_rgba_array(value) if "color" in name else value
 
 
 def printed(result: Any) -> Iterator[str]:
@@ -115,6 +141,14 @@ def of_studies() -> Iterator[str]:
     yield from arrays("quantiles", study.quantiles((0.025, 0.5)))
     yield from arrays("bands", study.bands((0.125, 0.5)))
     yield from drawn(study.plot())
+
+
+def of_sweeps() -> Iterator[str]:
+    grid = {"controller.K2": [2.0, 4.0], "observer.kf": [20.0, 50.0, 60.0]}
+    table = ij.sweep(loop(), grid, perturbations=MASS, runs=8, seed=1, progress=False, **RUN)
+    yield from arrays("sweep", table)
+    yield from drawn(ij.plotting.heat_map(table, ["violated", "margin"]))
+    yield from drawn(ij.plotting.parallel(table))
 
 
 def of_comparisons() -> Iterator[str]:
@@ -162,6 +196,23 @@ def of_runs() -> Iterator[str]:
     yield from printed(run)
     yield from arrays("metrics", dict(run.metrics.items()))
     yield from drawn(run.plot())
+
+
+def of_messages() -> Iterator[str]:
+    """What is said of each flag of a run, whether the run has it or not."""
+    run = stored("Rollout_1")
+    values = run.metrics.values_by_name | {RADIUS: np.array(1.2), BOUND: np.array(0.1)}
+    values |= {"first_level_violation_level": 3, "first_level_violation_component": 0}
+    metrics = dataclasses.replace(run.metrics, values_by_name=values)
+    for flag in sorted(set(Status) - {Status.FILTER_INFEASIBLE, Status.MODES_EXHAUSTED}):
+        flagged = dataclasses.replace(run, metrics=metrics, status=np.int32(flag))
+        with warnings.catch_warnings(record=True) as shown:
+            warnings.simplefilter("always")
+            try:
+                diagnosis.report(flagged, 50, throw=False)
+            except ValueError as error:
+                yield str(error)
+        yield from (str(x.message) for x in shown)
 
 
 def of_derivatives() -> Iterator[str]:

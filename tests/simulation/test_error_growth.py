@@ -147,7 +147,6 @@ def linearised(scenario):
     return scenario, state, derivative, growth, ravel_pytree(integrated_part(state))[0].size
 
 
-@pytest.mark.slow
 def test_the_bounds_are_those_of_the_worst_and_of_random_rounding_errors():
     """The sums over periods, against some in NumPy, over a run of few periods and a long one."""
     scenario, state, derivative, growth, plant = linearised(sampled(ENCODER, QUANTISER))

@@ -1,10 +1,12 @@
 """The generated ROS 2 package without ROS: its files, its library, and what is refused."""
 
 import ast
+import collections
 import dataclasses
 import itertools
 import json
 import re
+import runpy
 import shlex
 import shutil
 import subprocess
@@ -12,6 +14,9 @@ import sys
 import types
 import warnings
 import xml.etree.ElementTree
+from types import SimpleNamespace as Record
+from typing import ClassVar
+from unittest import mock
 
 import jax
 import members
@@ -25,6 +30,7 @@ import iblf_jax as ij
 from iblf_jax import cli
 from iblf_jax.deployment.control_law import control_law
 from iblf_jax.deployment.export import vectors
+from iblf_jax.deployment.ros2 import simulated_robot
 from iblf_jax.deployment.ros2.node.c_law import FLAGS, NOT_FINITE, CLaw, load_law, read_description
 from iblf_jax.deployment.ros2.package import ros_options, write_package
 from iblf_jax.deployment.ros2.ros2_control import ros2_control_files
@@ -34,6 +40,7 @@ from iblf_jax.simulation.scenario import canonical
 setuptools = pytest.importorskip("setuptools", reason="setuptools builds a package")
 
 NAME = ros_package.NAME
+JOINTS = ["shoulder", "elbow"]
 
 
 @pytest.fixture(scope="module")
@@ -176,6 +183,85 @@ def test_the_launch_file_starts_the_node(package, monkeypatch):
     names = ["joint_states", "efforts", "diagnostics"]
     assert [(x[1][0], x[2]["default_value"]) for x in topics] == [(x, x) for x in names]
     assert node[2]["remappings"] == [(x, ("configuration", (x,), {})) for x in names]
+
+
+class FakeNode:
+    """A node of rclpy whose messages arrive at once."""
+
+    parameters: ClassVar = {"joints": JOINTS, "trigger": "state"}
+    topics: ClassVar = collections.defaultdict(mock.MagicMock)
+
+    def __init__(self, name, **options):
+        self.get_name, self.count_publishers, self.services = lambda: name, lambda topic: 1, {}
+
+    def __getattr__(self, name):
+        return mock.MagicMock()
+
+    def declare_parameter(self, name, default, descriptor):
+        return Record(value=self.parameters.get(name, default))
+
+    def create_publisher(self, kind, topic, depth):
+        return mock.MagicMock(publish=lambda message: self.topics[topic](message))
+
+    def create_subscription(self, kind, topic, callback, quality):
+        more = [{"publisher_gid": {"data": b"1"}}] if topic == "joint_states" else []
+        self.topics[topic] = lambda message: callback(message, *more)
+        return mock.MagicMock(topic_name=topic)
+
+    def create_service(self, kind, name, callback):
+        self.services[name] = callback
+
+
+def test_the_node_moves_a_simulated_robot_as_its_law_does_in_mujoco(law, package, monkeypatch):
+    """There are wheels of `rclpy` for one Python only: it is replaced."""
+    mujoco = pytest.importorskip("mujoco")
+    path = ROOT / "iblf_jax" / "deployment" / "ros2" / "node" / "law_node.py"
+    ros = mock.MagicMock(Node=FakeNode, create_node=FakeNode, KeyValue=Record)
+    ros.msg, ros.Float64MultiArray, ros.SetParametersResult = ros, Record, Record
+    ros.JointState = lambda name: Record(name=name, header=Record(stamp=Record()))
+    packages = r"rclpy|diagnostic_msgs|rcl_interfaces|sensor_msgs|std_msgs|std_srvs"
+    for name in re.findall(rf"^from ((?:{packages})\.\w+) import", path.read_text(), re.MULTILINE):
+        for module in (name, name.partition(".")[0], "rclpy.experimental"):
+            monkeypatch.setitem(sys.modules, module, ros)
+    monkeypatch.setattr(simulated_robot, "DISCOVERY_TIME", 0.0)
+    node = runpy.run_path(str(path))["LawNode"](law)
+    arm, start = ROOT / "examples" / "two_link.xml", [0.55, 0.45]
+    options = {"period": ros_package.PERIOD, "dt": 1e-3, "initial": ij.Initial(q=start)}
+    robot = ij.deployment.robot_node(arm, JOINTS, **options)
+    answer, states = node.topics["joint_states"], []
+
+    def start_after_two(state):
+        states.append(answer(state))
+        if len(states) == 2:
+            assert node.services["~/start"](None, Record()).success
+
+    node.topics["joint_states"] = start_after_two
+    motion = robot.run(0.1)
+    model, own = mujoco.MjModel.from_xml_path(str(arm)), load_law(package.modules / NAME)
+    model.opt.timestep, model.opt.integrator = 1e-3, mujoco.mjtIntegrator.mjINT_RK4
+    data = mujoco.MjData(model)
+    data.qpos[:] = start
+    own.init(start, [0.0, 0.0])
+    for k in range(100):
+        if k % 10 == 0:  # t = 0 is the last state before the start
+            state = data.qpos.tolist(), data.qvel.tolist()
+            data.qfrc_applied[:], _ = own.step(1e-3 * (k + 10), *state)
+        mujoco.mj_step(model, data)
+    np.testing.assert_allclose(motion.q[motion.instant][-1], data.qpos, rtol=1e-9)
+    node._publish_diagnostics()
+    shown = {value.key: value.value for value in node._values}
+    assert (shown["mode"], shown["samples"], shown["missed_periods"]) == ("running", "13", "0")
+    assert node._status.level is ros.DiagnosticStatus.OK
+    assert motion.origin == 2.0 * float(shown["time_origin [s]"]) == 2.0 * ros_package.PERIOD
+    changes = [Record(name="controller.K2", value=x) for x in ([3.0, 2.5], [9.0, 9.0])]
+    assert [node._refuse_parameters([x]).successful for x in changes] == [True, False]
+    node._apply_parameters(changes[:1])
+    assert law.gain("controller.K2") == [3.0, 2.5]
+    for name, mode in (("hold", "holding"), ("stop", "stopped")):
+        assert node.services[f"~/{name}"](None, Record()).success
+        assert node.supervisor.mode.value == mode
+    node.send_final_command()
+    np.testing.assert_array_equal(robot.arrivals[-1].effort, [0.0, 0.0])
 
 
 def plain() -> ij.Scenario:
