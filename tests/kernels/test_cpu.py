@@ -143,7 +143,7 @@ def test_rows_of_another_size_are_an_error_and_no_crash():
     for rows, integers, words in ((2, 0, "does not fit"), (5, 0, "without an array")):
         shapes = [((rows, 4), jnp.float64), ((integers, 4), jnp.int32)]
         call = jax.ffi.ffi_call(
-            cpu.rows_function("pack"), [jax.ShapeDtypeStruct(*x) for x in shapes]
+            cpu.array_function("pack"), [jax.ShapeDtypeStruct(*x) for x in shapes]
         )
         with pytest.raises(jax.errors.JaxRuntimeError, match=words):
             jax.block_until_ready(call(jnp.ones((4, 3))))
