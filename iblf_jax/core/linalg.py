@@ -25,23 +25,6 @@ def matmul(left: jax.Array, right: jax.Array) -> jax.Array:
     return jnp.sum(left[:, :, None] * right[None, :, :], axis=1)
 
 
-@jax.jit
-def matmul_in_order(left: jax.Array, right: jax.Array) -> jax.Array:
-    """The product of two matrices, summed in the order of the terms.
-
-    XLA chooses the order of a reduction by the number of runs in the batch, so its results depend
-    on that number. The sum is written out and not a loop, because XLA then passes over the runs
-    once and not once per term: the work before and after the steps of 4,096 runs of seven joints
-    takes 0.33 s instead of 0.67 s. JAX traces the terms once for all products of the same shapes.
-    """
-    # The first product is computed on its own. In a sum of two products a processor may round
-    # either one, and a batch would differ from a single run.
-    total = jax.lax.optimization_barrier(left[:, :1] * right[0])
-    for k in range(1, len(right)):
-        total = total + left[:, k, None] * right[k]
-    return total
-
-
 def inner(u: jax.Array, v: jax.Array) -> jax.Array:
     """u^T v, (), for two (n,) vectors."""
     return jnp.sum(u * v)

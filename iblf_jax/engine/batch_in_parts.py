@@ -111,7 +111,7 @@ def _all_steps(
     return run_steps(TimeStep.of(request), runs, carry, number, None)[0]
 
 
-@programs.jit(static_argnames="batch", options=programs.UNOPTIMISED, kept=True)
+@programs.jit(static_argnames="batch", options=programs.SHORTEST_TO_COMPILE, kept=True)
 def _finalize(
     arguments: Arguments, carry: Carry, at_start: Linearization, *, batch: CompiledBatch
 ) -> Outcome:

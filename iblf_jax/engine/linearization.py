@@ -15,6 +15,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from iblf_jax.engine.carry import Inputs, Step, StepOptions, tree_where
+from iblf_jax.kernels import MIN_TERMS_OF_CALL
 from iblf_jax.simulation import error_estimate, stability
 from iblf_jax.simulation.closed_loop import (
     LoopState,
@@ -149,6 +150,8 @@ def fastest_modes(scenario: Scenario, found: Linearization) -> jax.Array:
         jacobian = jacobian[..., :size, :size]
     is_complete = jacobian.shape[-1] == found.state.shape[-1]
     if is_complete or scenario.sampling is not None:
+        if jacobian.shape[-1] >= MIN_TERMS_OF_CALL:
+            return jnp.vectorize(stability.growth_rate_of_matrix, signature="(m,m)->()")(jacobian)
         # (..., m, m) -> (m, m, ...) with the axis of the runs last.
         runs_last = jnp.swapaxes(jacobian.T, 0, 1)
         return stability.growth_rate_of_matrix(runs_last).T

@@ -86,7 +86,7 @@ def _sampled_states(scenario: Scenario, instants: jax.Array) -> LoopState:
     return jax.vmap(sampled)(instants, start_and_along(scenario, instants[1:]))
 
 
-@programs.jit(options=programs.UNOPTIMISED, kept=True)
+@programs.jit(options=programs.SHORTEST_TO_COMPILE, kept=True)
 def _maps(
     scenario: Scenario, states: LoopState, derivatives: jax.Array
 ) -> tuple[jax.Array, jax.Array]:

@@ -2,7 +2,7 @@
 
     _initialize    the carry before the first step, and the linearization at the start
     _all_steps     the steps and the records
-    _finalize      the metrics and the status; of a sampled loop `_finalize_sampled`
+    _finalize      the metrics and the status
 
 Only the second part depends on the number of steps and on what is recorded.  XLA does not optimise
 the first and the last one, which run for less than a millisecond: that saves about 0.9 of 3.4 s of
@@ -117,10 +117,7 @@ def _run_by_executor(compiled: Compiled, nodes: int, request: RunRequest, leaves
         carry, records = _all_steps(compiled, request, leaves, carry)
     else:
         carry, records = _steps_in_calls(compiled, request, leaves, carry, length)
-    finalize_run = _finalize
-    if jax.tree.unflatten(compiled.structure, leaves).scenario.sampling is not None:
-        finalize_run = _finalize_sampled
-    outcome = finalize_run(compiled, without_steps, leaves, carry, at_start)
+    outcome = _finalize(compiled, without_steps, leaves, carry, at_start)
     return outcome._replace(records=records)
 
 
@@ -180,21 +177,13 @@ def _steps(
     return carry, jax.tree.map(lambda x: x[0], records)
 
 
-def _finalized(
+@programs.jit(static_argnums=(0, 1), options=programs.SHORTEST_TO_COMPILE, kept=True)
+def _finalize(
     compiled: Compiled, request: RunRequest, leaves: list, carry: Carry, at_start: Linearization
 ) -> Outcome:
     run_steps = kernel_stepper(compiled.executor)
     outcome = finalize(run_steps, compiled.batch(leaves, request), request, carry, at_start)
     return jax.tree.map(lambda x: x[0], outcome)
-
-
-_finalize = programs.jit(
-    _finalized, static_argnums=(0, 1), options=programs.SHORTEST_TO_COMPILE, kept=True
-)
-_finalize_sampled = programs.jit(
-    _finalized, static_argnums=(0, 1), options=programs.UNOPTIMISED, kept=True
-)
-"""Of a sampled loop, whose errors are summed over its periods in loops."""
 
 
 @programs.jit(static_argnums=(0, 1))

@@ -101,6 +101,8 @@ from iblf_jax.kernels.passes import written_out as written_out
 from iblf_jax.kernels.primitives import is_zero as is_zero
 from iblf_jax.kernels.primitives import new_primitive as new_primitive
 from iblf_jax.kernels.primitives import without_symbol as without_symbol
+from iblf_jax.kernels.products import MIN_TERMS_OF_CALL as MIN_TERMS_OF_CALL
+from iblf_jax.kernels.products import matmul_in_order as matmul_in_order
 from iblf_jax.kernels.program import INPUTS as INPUTS
 from iblf_jax.kernels.program import PER_RUN as PER_RUN
 from iblf_jax.kernels.program import SHARED as SHARED

@@ -17,6 +17,7 @@ import numpy as np
 from iblf_jax.kernels import jaxprs
 from iblf_jax.kernels.caches import CACHES
 from iblf_jax.kernels.from_jaxpr import closed
+from iblf_jax.kernels.functions import uses_in
 from iblf_jax.kernels.messages import announce_if_slow
 from iblf_jax.kernels.packed import EMPTY, Shapes
 from iblf_jax.kernels.passes import with_reciprocals
@@ -124,7 +125,7 @@ def _lowered(
     """The program of the jaxpr of a step, whose first `carried` outputs are the carry; other
     arguments as `compile_step`.
     """
-    b = Builder(dtype, sparse=is_derivative, limits=limits)
+    b = Builder(dtype, sparse=is_derivative, limits=limits, uses=uses_in(jaxpr))
     shared_ids = _inputs(b, shared, lambda i, kind: _shared(b, i, known))
     per_run_ids = _inputs(b, per_run, lambda i, kind: b.input("per_run", i, kind))
     series_ids = _inputs(b, series, lambda i, kind: b.input("series", i, kind))

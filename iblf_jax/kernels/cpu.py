@@ -77,15 +77,19 @@ def kernel(
     return register(f"iblf_jax_{key}", library, "iblf_jax_kernel", "cpu")
 
 
-@CACHES.function(maxsize=2)
-def rows_function(name: str) -> str:
-    """The name by which XLA knows `iblf_jax_pack` or `iblf_jax_unpack` of `c/leaves.h`.
+@CACHES.function(maxsize=3)
+def array_function(name: str) -> str:
+    """The name by which XLA knows a function of arrays that is no kernel of a program.
 
     Args:
-      name: "pack" or "unpack".
+      name: "pack" or "unpack" of `c/leaves.h`, or "multiply" of `c/products.h`.
+
+    Raises:
+      ToolchainError: no compiler, or an error from it.
     """
     definitions = ["#define RECORDED 0", "#define RECORDED_SIZES {0}"]
-    library, key = built("\n".join([*definitions, header("frame.h"), header("leaves.h")]))
+    headers = map(header, ("frame.h", "leaves.h", "products.h"))
+    library, key = built("\n".join([*definitions, *headers]))
     return register(f"iblf_jax_{name}_{key}", library, f"iblf_jax_{name}", "cpu")
 
 
@@ -125,13 +129,13 @@ def pack(leaves: Sequence[jax.Array], shapes: Shapes, dtype, runs: int) -> Packe
         jax.ShapeDtypeStruct((floats, runs), dtype),
         jax.ShapeDtypeStruct((len(kinds) - floats, runs), jnp.int32),
     ]
-    return Packed(*jax.ffi.ffi_call(rows_function("pack"), rows)(*leaves))
+    return Packed(*jax.ffi.ffi_call(array_function("pack"), rows)(*leaves))
 
 
 def unpack(packed: Packed, shapes: Shapes, runs: int) -> list[jax.Array]:
     """The same as `packed.unpack`, in one call of compiled code."""
     leaves = [jax.ShapeDtypeStruct((runs, *shape), dtype) for shape, dtype in shapes.items]
-    return list(jax.ffi.ffi_call(rows_function("unpack"), leaves)(*packed))
+    return list(jax.ffi.ffi_call(array_function("unpack"), leaves)(*packed))
 
 
 def run(

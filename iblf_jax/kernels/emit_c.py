@@ -126,7 +126,7 @@ class _Emitter:
     Args:
       program: the program.
       tables: text of a table -> its name in the C; the program's tables are added.
-      calls: places of the arguments and results of calls.
+      functions: places of the arguments and results of calls.
 
     `names`, an argument of many methods, has the C expressions of nodes that are computed already.
     """
@@ -135,7 +135,7 @@ class _Emitter:
         self,
         program: Program,
         tables: dict[str, str],
-        calls: FunctionCalls,
+        functions: FunctionCalls,
         target: Target = NATIVE,
     ) -> None:
         self.program = program
@@ -148,7 +148,8 @@ class _Emitter:
             for i, node in enumerate(program.nodes)
             if node.op == "lookup"
         }
-        self.calls = calls
+        self.functions = functions
+        self.calls = functions.of[id(program)]
         self.target = target
         self.in_place: dict[int, int] = {}
         """Selections that overwrite a carried number in its place -> the node of the number before
@@ -387,7 +388,7 @@ def _functions(
 ) -> list[str]:
     """The C of the functions that a program calls, divided as in `source`."""
     texts = []
-    for k, (function, arguments, _) in enumerate(calls.functions):
+    for k, (function, _, arguments, _) in enumerate(calls.functions):
         e = _Emitter(function, tables, calls, target)
         names = {
             i: arguments[node.value]
@@ -530,8 +531,8 @@ def _advance(e: _Emitter, layout: Layout, segment: int | None) -> str:
             names[before] = f"c{c}"
     e.in_place = _in_place(program)
     e.statements(names, frontier(program, e.classes, PER_RUN, lambda k: k == PER_RUN | TIME))
-    if e.calls.functions:
-        e.lines += [e.calls.declarations, *e.calls.once_statements(names)]
+    if e.functions.functions:
+        e.lines += [e.calls.declarations, *e.functions.once_statements(names)]
     e.lines += _loop(program)
     names |= _names_of_columns(e, layout) | _names_of_series(e)
     e.statements(names, [after for _, after in program.carry])
@@ -703,7 +704,7 @@ def _advance_in_segments(e: _Emitter, layout: Layout, segment: int) -> str:
     ]
     declarations += [segments.declarations, e.calls.declarations]
     e.lines += [*declarations, *signs]
-    e.lines += [*(f"  {call}" for call in before), *e.calls.once_statements(segments.names)]
+    e.lines += [*(f"  {call}" for call in before), *e.functions.once_statements(segments.names)]
     e.lines += [*_loop(program), *(f"  {call}" for call in within)]
     if program.outputs:
         _record(e, segments.names)

@@ -41,25 +41,20 @@ def interpret(b: Builder, jaxpr: Any, consts: Sequence[Ids], inputs: Sequence[Id
         return known[atom]
 
     live = jaxprs.needed(jaxpr)
-    uses = {id(eqn): tuple(v in live for v in eqn.outvars) for eqn in jaxpr.eqns}
-    calls: dict[int, list] = {}
     for eqn in jaxpr.eqns:
-        if eqn.primitive.name == "jit":
-            calls.setdefault(id(jaxprs.called(eqn)), []).append(uses[id(eqn)])
-
-    for eqn in jaxpr.eqns:
-        if not any(uses[id(eqn)]):
+        used = tuple([v in live for v in eqn.outvars])
+        if not any(used):
             continue
         name = eqn.primitive.name
         function = jaxprs.called(eqn)
         operands = [read(v) for v in eqn.invars]
         results: Sequence[Ids | None]
         if name == "jit" and len(function.eqns) > MAX_REINTERPRETED:
-            results = apply(b, function, operands, uses[id(eqn)], calls[id(function)], closed)
+            results = apply(b, function, operands, used, closed)
         elif function is not None:
             results = closed(b, function, operands)
         elif name in CONTROL:
-            results = CONTROL[name](b, eqn, operands, uses[id(eqn)])
+            results = CONTROL[name](b, eqn, operands, used)
         elif name in RULES:
             for v in eqn.outvars:
                 _check_float(b, v.aval.dtype, eqn)
@@ -148,7 +143,7 @@ def _cond(b: Builder, eqn, operands, used):
         taken = which
         if not is_truth:
             taken = b.emit("ge", which, b.constant(len(branches) - 1, "i"), kind="b")
-        results = apply(b, branches[-1], rest, used, [used], closed, taken)
+        results = apply(b, branches[-1], rest, used, closed, taken)
     else:
         results = list(closed(b, branches[-1], rest))
     for i in reversed(range(len(branches) - 1)):

@@ -5,11 +5,12 @@ The closed loop is such a function: a step evaluates it once per stage of the in
 that reads it once has a quarter of the text to read, and its time grows faster than the text.
 
 A branch that all runs take together, because only time decides it (the law of a sampled loop), is
-such a function, too. It is called in steps that take it; the result is selected afterwards.
+such a function, too. It is called in steps that take it; the result is selected afterwards. A
+function may call others: the closed loop in such a branch is the same function as in the stages.
 
 A call computes the numbers that depend on the state. The caller computes what depends on leaves and
-time only, as rarely as its class permits. It also computes results that only some calls use (the
-sample, which only the first stage returns), from numbers that the call returns.
+time only, as rarely as its class permits. It also computes what only some calls need (the sample,
+which only the first stage returns), from numbers that the call returns.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from iblf_jax.kernels import jaxprs
 from iblf_jax.kernels.caches import CACHES
 from iblf_jax.kernels.passes import with_reciprocals
 from iblf_jax.kernels.program import (
@@ -29,6 +31,7 @@ from iblf_jax.kernels.program import (
     Ids,
     LoweringLimits,
     Program,
+    Uses,
     finished,
     needed,
 )
@@ -37,14 +40,16 @@ if TYPE_CHECKING:
     from jax.extend import core
 
 
-Uses = tuple[bool, ...]
-"""Which results of a function are used."""
+@CACHES.function(maxsize=64)
+def uses_in(function: core.ClosedJaxpr) -> dict[core.ClosedJaxpr, tuple[Uses, ...]]:
+    """As `jaxprs.uses_of_calls`."""
+    return jaxprs.uses_of_calls(function)
 
 
 class Called(NamedTuple):
     """An inner function and the properties of its operands on which its program depends."""
 
-    jaxpr: core.Jaxpr
+    jaxpr: core.ClosedJaxpr
     pattern: tuple
     """The pattern of its operands, number by number (`_pattern`)."""
     shapes: tuple[tuple[int, ...], ...]
@@ -53,6 +58,8 @@ class Called(NamedTuple):
     sparse: bool
     limits: LoweringLimits
     exact: bool
+    uses: frozenset[tuple[core.ClosedJaxpr, tuple[Uses, ...]]]
+    """The functions inside it, and which of their results each call in the complete step uses."""
     read: Callable
     """Function (builder, jaxpr, operands) -> results."""
 
@@ -83,10 +90,9 @@ class Split(NamedTuple):
 
 def apply(
     b: Builder,
-    jaxpr: core.Jaxpr,
+    jaxpr: core.ClosedJaxpr,
     operands: Sequence[Ids],
     used: Uses,
-    all_uses: Sequence[Uses],
     read: Callable,
     condition: int | None = None,
 ) -> list[Ids | None]:
@@ -97,7 +103,6 @@ def apply(
       jaxpr: the function.
       operands: its operands.
       used: which results of this call are used.
-      all_uses: `used` of every call of the function by this caller.
       read: function (builder, jaxpr, operands) -> results.
       condition: node of a truth value, the same for all runs: results are used only where it holds.
         None for always.
@@ -109,24 +114,24 @@ def apply(
         tuple(x.shape for x in operands),
         b.dtype,
         b.sparse,
-        b.limits,
+        # A function is the same wherever it is called; branches in it are inlined.
+        b.limits._replace(under_condition=math.inf),
         b.exact,
+        frozenset([(inner, b.uses[inner]) for inner in uses_in(jaxpr) if inner in b.uses]),
         read,
     )
     template = _template(called)
+    all_uses = b.uses.get(jaxpr, (used,))
     limit = b.limits.written_out
     if condition is not None:
         limit = b.limits.under_condition
-    on_state = sum(
-        bool(c & PER_RUN) and node.op not in INPUTS
-        for c, node in zip(template.program.classes(), template.program.nodes, strict=True)
-    )
-    if on_state <= limit:
+    elif b.in_function and len(all_uses) == 1:
+        limit = math.inf
+    if _size_on_state(template.program) <= limit:
         program = template.program
         known = _known_inputs(program, flat)
     else:
-        uses = list(zip(*all_uses, strict=True))
-        split = _split(called, tuple(map(all, uses)), tuple(map(any, uses)))
+        split = _split(called, frozenset(all_uses))
         program = split.program
         known = _known_inputs(program, flat)
         _write(b, program, known, split.arguments)
@@ -137,6 +142,17 @@ def apply(
         _result(known, program, positions, is_used)
         for positions, is_used in zip(template.results, used, strict=True)
     ]
+
+
+def _size_on_state(program: Program) -> int:
+    """Number of operations on the state, those of functions that it calls included."""
+    size = 0
+    for c, node in zip(program.classes(), program.nodes, strict=True):
+        if node.op == "call":
+            size += node.value.size
+        elif c & PER_RUN and node.op not in INPUTS:
+            size += 1
+    return size
 
 
 def _known_inputs(program: Program, operands: list[int]) -> dict[int, int]:
@@ -170,8 +186,10 @@ def _template(called: Called) -> Template:
     b = Builder(
         called.dtype,
         sparse=called.sparse,
-        limits=called.limits._replace(written_out=math.inf, under_condition=math.inf),
+        limits=called.limits,
         exact=called.exact,
+        uses=dict(called.uses),
+        in_function=True,
     )
 
     def node_of(kind, value, *known):
@@ -221,14 +239,13 @@ def _samples(program: Program, results: list[Ids], used: Uses) -> list[int]:
 
 
 @CACHES.function(maxsize=16)
-def _split(called: Called, used_by_all: Uses, used_by_some: Uses) -> Split:
+def _split(called: Called, all_uses: frozenset[Uses]) -> Split:
     """Divides a function: a call computes the operations that depend on the state and that every
-    caller uses.
+    caller needs.
 
     Args:
       called: the function.
-      used_by_all: which results all calls use.
-      used_by_some: which results some call uses.
+      all_uses: which results each of its calls uses.
     """
     program = _with_reciprocals(called)
     positions = _template(called).results
@@ -240,10 +257,12 @@ def _split(called: Called, used_by_all: Uses, used_by_some: Uses) -> Split:
             i for i in needed(nodes, outputs) if classes[i] & PER_RUN and nodes[i].op not in INPUTS
         ]
 
-    results = _samples(program, positions, used_by_all)
-    inside = on_state(results)
-    within = set(inside)
-    read = _samples(program, positions, used_by_some)
+    by_result = list(zip(*all_uses, strict=True))
+    read = _samples(program, positions, tuple(map(any, by_result)))
+    results = _samples(program, positions, tuple(map(all, by_result)))
+    needed_by = [set(on_state(_samples(program, positions, used))) for used in all_uses]
+    within = set.intersection(*needed_by)
+    inside = sorted(within)
     # Numbers that the caller computes on the state read numbers of the call.
     read += [a for i in on_state(read) if i not in within for a in nodes[i].args]
     returned = list(dict.fromkeys(i for i in [*results, *read] if i in within))

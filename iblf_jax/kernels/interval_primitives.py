@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.kernels.primitives import new_primitive
+from iblf_jax.kernels.primitives import new_primitive, with_axis_first
 
 
 def _primitive(name: str) -> Any:
@@ -24,13 +24,7 @@ def _primitive(name: str) -> Any:
         return primitive.bind(*primals), tangents[0]
 
     def batch(arguments, axes):
-        size = next(x.shape[a] for x, a in zip(arguments, axes, strict=True) if a is not None)
-        return primitive.bind(
-            *(
-                jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
-                for x, axis in zip(arguments, axes, strict=True)
-            )
-        ), 0
+        return primitive.bind(*with_axis_first(arguments, axes)), 0
 
     primitive = new_primitive(name, first, shapes=first, jvp=jvp, batch=batch)
     return primitive

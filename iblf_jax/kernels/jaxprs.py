@@ -92,6 +92,21 @@ def needed(function: core.ClosedJaxpr | core.Jaxpr) -> set[Any]:
     return found
 
 
+def uses_of_calls(function: core.ClosedJaxpr) -> dict[Any, tuple[tuple[bool, ...], ...]]:
+    """Function of `jit` inside a function, at any depth -> which of its results each of its calls
+    uses.
+    """
+    found: dict[Any, tuple[tuple[bool, ...], ...]] = {}
+    for jaxpr, _ in nested(function):
+        live = needed(jaxpr)
+        for equation in jaxpr.eqns:
+            used = tuple([x in live for x in equation.outvars])
+            if equation.primitive.name == "jit" and any(used):
+                inner = called(equation)
+                found[inner] = (*found.get(inner, ()), used)
+    return found
+
+
 def depend_on_last(function: core.ClosedJaxpr, count: int) -> list[bool]:
     """Which outputs depend on the last `count` inputs."""
     jaxpr, _ = opened(function)

@@ -64,12 +64,13 @@ def written_out(program: Program) -> Program:
         if node.op == "call":
             arguments = args[len(args) - len(arguments_of(node)) :]
             new: list[int] = []
-            for inner in node.value.nodes:
+            function = written_out(node.value)
+            for inner in function.nodes:
                 if inner.op == "argument":
                     new.append(arguments[inner.value])
                 else:
                     new.append(b.copy(inner, [new[a] for a in inner.args]))
-            results[i] = [new[output] for output in node.value.outputs]
+            results[i] = [new[output] for output in function.outputs]
             return -1
         if node.op == "result":
             return results[node.args[0]][node.value]

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
@@ -19,6 +20,7 @@ def new_primitive(
     batch: Callable,
     transpose: Callable | None = None,
     called: Callable | None = None,
+    on_cpu: Callable | None = None,
     several_results: bool = False,
 ) -> Primitive:
     """A primitive with its rules, which receive its parameters by name.
@@ -32,6 +34,7 @@ def new_primitive(
       transpose: function (cotangents, operands) -> the cotangent of each operand; None for a
         primitive that is not linear.
       called: `evaluate` as it runs outside of a trace, if that is another function.
+      on_cpu: `evaluate` in programs for a CPU, if that is another function.
       several_results: whether results, tangents and axes are lists.
     """
     primitive = Primitive(name)
@@ -40,11 +43,25 @@ def new_primitive(
     primitive.def_abstract_eval(shapes)
     lowering = mlir.lower_fun(evaluate, multiple_results=several_results)
     mlir.register_lowering(primitive, lowering)
+    if on_cpu is not None:
+        lowering = mlir.lower_fun(on_cpu, multiple_results=several_results)
+        mlir.register_lowering(primitive, lowering, platform="cpu")
     ad.primitive_jvps[primitive] = jvp
     batching.primitive_batchers[primitive] = batch
     if transpose is not None:
         ad.primitive_transposes[primitive] = transpose
     return primitive
+
+
+def with_axis_first(operands: Sequence[jax.Array], axes: Sequence[int | None]) -> list[jax.Array]:
+    """Operands of a batch with its axis as the first one of each; `axes` are their own, None where
+    an operand has no such axis.
+    """
+    size = next(x.shape[a] for x, a in zip(operands, axes, strict=True) if a is not None)
+    return [
+        jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
+        for x, axis in zip(operands, axes, strict=True)
+    ]
 
 
 def is_zero(tangent: object) -> bool:

@@ -20,7 +20,8 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections import Counter
-from collections.abc import Callable, Container, Iterable, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -37,6 +38,10 @@ function that a program calls."""
 
 SPECIAL = frozenset((*INPUTS, "const", "lookup", "call", "result"))
 """Operations for which a `Builder` has a method of their own."""
+
+
+Uses = tuple[bool, ...]
+"""Which results of a function a call uses."""
 
 
 Ids = np.ndarray
@@ -106,7 +111,8 @@ class LoweringLimits(NamedTuple):
     scan: float = math.inf
     """Steps of an inner scan, which is unrolled."""
     written_out: float = math.inf
-    """Nodes of a function that is inlined at each call; a longer one is called."""
+    """Nodes of a function that is inlined at each call; a longer one is called, and inside another
+    function only if it has several calls."""
     under_condition: float = math.inf
     """Nodes of a branch that is inlined if all runs take it together; a longer one is called."""
     power: float = math.inf
@@ -154,6 +160,8 @@ class Builder:
         sparse: bool = False,
         limits: LoweringLimits = NO_LIMITS,
         exact: bool = False,
+        uses: Mapping[Any, tuple[Uses, ...]] = MappingProxyType({}),
+        in_function: bool = False,
     ) -> None:
         """Starts an empty list of nodes.
 
@@ -164,11 +172,15 @@ class Builder:
           limits: sizes above which a jaxpr is not compiled.
           exact: whether the program must be equal to the jaxpr in real arithmetic, as one on
             intervals must: constants are folded only where the result is not rounded.
+          uses: function of a jaxpr -> which of its results each of its calls uses.
+          in_function: whether the nodes are those of a function that is called.
         """
         self.dtype = np.dtype(dtype)
         self.exact = exact
         self.sparse = sparse
         self.limits = limits
+        self.uses = uses
+        self.in_function = in_function
         self.nodes: list[Node] = []
         self.constant_carry: set[int] = set()
         """Nodes of carried numbers that a step returns unchanged."""
@@ -367,8 +379,19 @@ class Program:
     @property
     def size(self) -> int:
         """Number of nodes that a compiler reads; those of a function count once."""
-        functions = {id(node.value): node.value for node in self.nodes if node.op == "call"}
-        return len(self.nodes) + sum(function.size for function in functions.values())
+        return len(self.nodes) + sum(len(function.nodes) for function in called_functions(self))
+
+
+def called_functions(program: Program) -> list[Program]:
+    """The functions that a program calls, and those that they call; each follows all that it calls
+    itself.
+    """
+    found: dict[int, Program] = {}
+    for node in program.nodes:
+        if node.op == "call" and id(node.value) not in found:
+            inner = called_functions(node.value)
+            found |= {id(function): function for function in (*inner, node.value)}
+    return list(found.values())
 
 
 def needed(nodes: Sequence[Node], outputs: Iterable[int], known: Container[int] = ()) -> list[int]:

@@ -81,8 +81,8 @@ from jax.flatten_util import ravel_pytree
 
 from iblf_jax.control.sensors._base import sensor_of_x
 from iblf_jax.core import checks
-from iblf_jax.core.linalg import matmul_in_order
 from iblf_jax.core.pytree import Absent, is_absent
+from iblf_jax.kernels import matmul_in_order
 from iblf_jax.simulation.closed_loop import (
     LoopState,
     evaluate,

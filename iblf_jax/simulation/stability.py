@@ -34,7 +34,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 from iblf_jax.core import checks, programs
-from iblf_jax.core.linalg import matmul_in_order
+from iblf_jax.kernels import matmul_in_order
 from iblf_jax.simulation.closed_loop import (
     LoopState,
     integrated_part,
@@ -117,8 +117,8 @@ def growth_rate_of_matrix(jacobian: jax.Array) -> jax.Array:
     powers of J.
 
     Args:
-      jacobian: (m, m, ...) [1/s]; the runs are the last axis, because a processor computes
-        neighbours in memory together.
+      jacobian: (m, m, ...) [1/s]; the runs of small ones are the last axis, because a processor
+        computes neighbours in memory together.
     """
     tiny = jnp.finfo(jacobian.dtype).tiny
     start = power_iteration_start(jacobian.ravel()[: len(jacobian)]).direction

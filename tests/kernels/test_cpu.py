@@ -15,6 +15,7 @@ from iblf_jax.engine.batch import Batch
 from iblf_jax.engine.carry import Inputs, initial_carry
 from iblf_jax.engine.time_step import TimeStep
 from iblf_jax.kernels import Shapes, compile_step, cpu, packed
+from iblf_jax.kernels.program import called_functions
 from iblf_jax.simulation.metrics import as_folds, standard
 from iblf_jax.simulation.scenario import canonical
 from iblf_jax.tuning.quantities import Peak, Quantities, TimeIntegral
@@ -142,7 +143,7 @@ def test_rows_of_another_size_are_an_error_and_no_crash():
     for rows, integers, words in ((2, 0, "does not fit"), (5, 0, "without an array")):
         shapes = [((rows, 4), jnp.float64), ((integers, 4), jnp.int32)]
         call = jax.ffi.ffi_call(
-            cpu.rows_function("pack"), [jax.ShapeDtypeStruct(*x) for x in shapes]
+            cpu.array_function("pack"), [jax.ShapeDtypeStruct(*x) for x in shapes]
         )
         with pytest.raises(jax.errors.JaxRuntimeError, match=words):
             jax.block_until_ready(call(jnp.ones((4, 3))))
@@ -258,3 +259,40 @@ def test_copies_at_the_end_of_a_batch_have_the_results_of_their_runs():
         found = ends(rows)
         np.testing.assert_array_equal(found.floats, each.floats[:, rows])
         np.testing.assert_array_equal(found.ints, each.ints[:, rows])
+
+
+@jax.jit
+def rate(k, x, u):
+    """A rate and a sample, long enough to be a function of its own."""
+    for _ in range(30):
+        x = jnp.sin(x) * k + u
+    return x, jnp.cos(x) * k
+
+
+@pytest.mark.parametrize("segment", [None, 20])
+def test_a_branch_calls_the_function_that_the_step_calls(segment):
+    def step(shared, per_run, carry, index):
+        (k,), (u,), (x,) = shared, per_run, carry
+
+        def further(x):
+            y = rate(k, x, u)[0]
+            return rate(k, x + y, u)[0], rate(k, 0.5 * x, u)[1]
+
+        x, sample = rate(k, x, u)
+        x, other = jax.lax.cond(index > 1, further, lambda x: (x, 2.0 * x), x)
+        return [x], [sample + other]
+
+    leaf = Shapes((((), np.dtype("float64")),))
+    limits = thresholds.LOWERING_LIMITS._replace(written_out=10, under_condition=10)
+    compiled = compile_step(step, np.dtype("float64"), leaf, leaf, leaf, limits).program
+    inner, branch = called_functions(compiled)
+    assert [sum(x.op == "call" for x in p.nodes) for p in (compiled, branch, inner)] == [2, 3, 0]
+    k, u, x = jnp.asarray([0.9]), jnp.linspace(0.1, 0.5, 7), jnp.linspace(-1.0, 1.0, 7)
+    carry = packed.pack([x], leaf, np.dtype("float64"), runs=7)
+    build = cpu.Build(segment=segment)
+    after, (samples,) = cpu.run(compiled, k, u[None], carry, 5, 1, build=build)
+    run = jax.jit(jax.vmap(lambda u, x, i: step([k[0]], [u], [x], i), in_axes=(0, 0, None)))
+    for i in range(5):
+        (x,), (sample,) = run(u, x, jnp.int32(i))
+        np.testing.assert_allclose(samples[i, 0], sample, rtol=1e-13)
+    np.testing.assert_allclose(after.floats[0], x, rtol=1e-13)
