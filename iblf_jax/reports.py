@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from iblf_jax.certificates import Certificate
     from iblf_jax.proofs import Proof
     from iblf_jax.simulation.results import Rollout
+    from iblf_jax.studies.comparison import Comparison
     from iblf_jax.studies.study import Study
     from iblf_jax.tuning import TuneResult
 
@@ -98,7 +99,8 @@ def _parts_of(scenario: Scenario) -> str:
         if part is None or part == () or (name == "model" and part is scenario.plant):
             continue
         if isinstance(part, tuple):
-            rows.append((name, ", ".join(type(each).__name__ for each in part), ""))
+            kinds = [type(each).__name__ for each in part if each is not None]
+            rows.append((name, ", ".join(kinds), ""))
             continue
         leaves = parameters(part, named=False)[:MAX_LEAVES]
         rows.append((name, _kind(part), _assignments(leaves, " = ")))
@@ -333,10 +335,40 @@ def _proof(found: Proof) -> Shown:
     return Shown(f"Proof: {found.verdict}", words, contents, {"Tube": found.plot}, found.scenario)
 
 
+FIGURES = {"Comparison": "Side by side", "Identification": "Numbers and residuals"}
+"""Name of a result's class -> heading of its figure."""
+
+
+def _other(result: Any) -> Shown:
+    """The content of a result of any class: its text, its tables and its figure."""
+    name = type(result).__name__
+    found = {part.title: part.html() for part in _contents(result) if isinstance(part, Table)}
+    figures = {}
+    if has_members(result, "plot"):
+        figures[FIGURES.get(name, "Figure")] = result.plot
+    scenario = getattr(result, "scenario", None)
+    return Shown(name, _described(result), found, figures, scenario, on_card=len(found))
+
+
+def _comparison(found: Comparison) -> Shown:
+    laws = len(found.rollouts)
+    title = f"Comparison: {laws - len(found.failed)} of {laws} laws without a failure"
+    rows = [
+        row
+        for row in found.table.get("effort", ())
+        if not has_flag(int(found.equal_effort[row.law].status), FAILED)
+    ]
+    if len(rows) > 1:
+        best = min(rows, key=lambda row: row.rmse)
+        title += f"; at equal effort {best.law} has the smallest rmse of {len(rows)}"
+    return _other(found)._replace(title=title)
+
+
 KINDS: dict[str, Callable[[Any], Shown]] = {
     "Scenario": _scenario,
     "Rollout": _rollout,
     "Study": _study,
+    "Comparison": _comparison,
     "Certificate": _certificate,
     "TuneResult": _tuning,
     "Proof": _proof,
@@ -345,22 +377,9 @@ KINDS: dict[str, Callable[[Any], Shown]] = {
 the import of modules that are not used."""
 
 
-FIGURES = {"Comparison": "Side by side", "Identification": "Numbers and residuals"}
-"""Name of a result's class -> heading of its figure."""
-
-
 def shown(result: Any) -> Shown:
     """The content of a result."""
-    maker = KINDS.get(type(result).__name__)
-    if maker is not None:
-        return maker(result)
-    name = type(result).__name__
-    found = {part.title: part.html() for part in _contents(result) if isinstance(part, Table)}
-    figures = {}
-    if has_members(result, "plot"):
-        figures[FIGURES.get(name, "Figure")] = result.plot
-    scenario = getattr(result, "scenario", None)
-    return Shown(name, _described(result), found, figures, scenario, on_card=len(found))
+    return KINDS.get(type(result).__name__, _other)(result)
 
 
 def _image(figure: Figure, dpi: int, words: str) -> str:
@@ -434,10 +453,15 @@ def _page(parts: Shown, title: str | None) -> str:
     if title:
         body.append(f"<p>{html.escape(parts.title)}</p>")
     body.append(_lines(parts.words))
+    figures = [
+        f"<h2>{html.escape(name)}</h2>{_image(draw(), PAGE_DPI, name)}"
+        for name, draw in parts.figures.items()
+    ]
+    # The main figure stands before the tables, which may have many lines.
+    body += figures[:1]
     for name, table in parts.tables.items():
         body.append(f'<h2>{html.escape(name)}</h2><div class="wide">{table}</div>')
-    for name, draw in parts.figures.items():
-        body.append(f"<h2>{html.escape(name)}</h2>{_image(draw(), PAGE_DPI, name)}")
+    body += figures[1:]
     if parts.scenario is not None:
         try:
             text = scenario_to_toml(parts.scenario)

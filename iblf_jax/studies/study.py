@@ -490,7 +490,7 @@ class Study(Result):
         )
         texts = status_words(self.scenario)
         flags = [
-            f"{count} {describe(flag, texts)}"
+            f"{describe(flag, texts)} ({count})"
             for flag in Status
             if (count := counts[flag.name or ""])
         ]
