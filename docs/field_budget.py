@@ -72,7 +72,7 @@ def in_words(found: dict[str, dict[str, Any]]) -> str:
     near = sum(rank == 1 for order in orders for rank in order.values())
     chosen = sum(name in found for name in TASKS)
     later = f" and on {len(found) - chosen} added later" if len(found) > chosen else ""
-    of_laws = f" ({added} of them with laws added after the other results)" if added else ""
+    of_laws = f" ({added} added after the results of the others)" if added else ""
     return (
         f"of {laws} pairs of a task and a tuned law{of_laws}, on {chosen} of the {len(TASKS)} tasks"
         f" chosen before the results{later}, {kept} keep the effort of the published law, the"
@@ -131,9 +131,9 @@ def method() -> list[str]:
         " starts at its published gains, the others at its rates (`task_laws.py`).",
         f"**Budget**: for each limit of the effort `ij.tune` has {BUDGET.values} points without"
         f" derivatives, and {BUDGET.starts} searches of at most {BUDGET.iterations} steps with"
-        " them. A search that has converged ends, and one without gains that keep the requirements"
-        " looks further at up to twice as many points. The runs that each law took therefore"
-        " differ, and are in its table.",
+        " them. A search that has converged ends, one whose best gains a single start came near"
+        " begins once more around them, and one without gains that keep the requirements looks at"
+        " further points. The runs that each law took therefore differ, and are in its table.",
         "**Objective**: the RMS error of the first level, over all components and the entire run."
         " Error and effort are those of the same time.",
         "**Effort**: the RMS input above the one that balances gravity, or above the steady input"
@@ -151,9 +151,9 @@ def method() -> list[str]:
         f" are {', '.join(f'{x:g}' for x in SHARES)} times those of the model, with periods of"
         f" {periods} ms, and with {SEEDS} seeds of noise at 2 ms, whose standard deviation is"
         f" {NOISE:g} times half the least distance of the bounds. They are not tuned for it.",
-        "**Chosen before results**: the tasks, and the laws but those that were added later:"
-        f" {'; '.join(f'on {escaped(x)} {len(LATER[x])} of *Choosing a law*' for x in LATER)},"
-        " which have the same budget, limits and ranges. Two tasks of the first choice,"
+        "**Chosen before results**: the tasks, and the laws but those of *Choosing a law* that were"
+        f" added later, on {' and '.join(map(escaped, LATER))}, with the same budget, limits and"
+        " ranges. Two tasks of the first choice,"
         " golestani\\_2022 and zhang\\_2022, were left out for their time: plants of three"
         " components take 100 s of a processor for each law. The limits of the effort, the range of"
         " the gains and the weights among them were chosen after a trial on liu\\_2018, in which no"
