@@ -29,6 +29,7 @@ from iblf_jax.core.pytree import wrapped_field
 from iblf_jax.core.status import FAILED, describe, has_flag
 from iblf_jax.core.tables import Table, number
 from iblf_jax.core.units import as_text
+from iblf_jax.kernels import without_garbage_collection
 from iblf_jax.simulation.paths import get, parameters, unit_at
 from iblf_jax.simulation.results import NUMBERED
 from iblf_jax.simulation.scenario import Scenario
@@ -382,6 +383,7 @@ def shown(result: Any) -> Shown:
     return KINDS.get(type(result).__name__, _other)(result)
 
 
+@without_garbage_collection()  # which takes a tenth of the time of a layout
 def _image(figure: Figure, dpi: int, words: str) -> str:
     """A figure as an HTML image."""
     picture = io.BytesIO()

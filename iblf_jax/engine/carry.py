@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import jax
@@ -85,6 +86,8 @@ def tree_where(condition, new, old):
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
 
 
+# inline, so that JAX traces it once for the shapes of a plan and for the program of the start
+@partial(jax.jit, static_argnames="method", inline=True)
 def initial_carry(inputs: Inputs, method: str, jacobian: jax.Array) -> Carry:
     """The carry before the first step; accumulators that begin with something of the first sample
     are blank until then.
