@@ -1,8 +1,6 @@
 """Settings of all tests: float64, no compilation cache on disk, no display, and the compiled runs
 that many tests share."""
 
-from __future__ import annotations
-
 import ctypes
 import gc
 import os

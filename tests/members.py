@@ -3,8 +3,6 @@
 Whoever adds a member adds it here; `test_contracts.test_every_member_is_listed` notices if not.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

@@ -1,16 +1,20 @@
 """Calls that must be refused."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 
 import pytest
 
 
-def assert_refused(words: str, call: Callable[..., Any], *arguments: Any, **options: Any) -> None:
-    """Fails unless a call raises a ValueError whose message matches the words."""
-    with pytest.raises(ValueError, match=words):
+def assert_refused(
+    words: str,
+    call: Callable[..., Any],
+    *arguments: Any,
+    error: type[BaseException] = ValueError,
+    **options: Any,
+) -> None:
+    """Fails unless a call raises this error with a message that matches the words."""
+    with pytest.raises(error, match=words):
         call(*arguments, **options)
 
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import jax.numpy as jnp
@@ -10,10 +10,12 @@ import members
 
 import iblf_jax as ij
 
-PAPER = ij.presets.zhang_yan_2024(variant="corrected")
-CHAIN = ij.presets.motor_driven_two_link()
-FLEXIBLE = ij.presets.flexible_joint_two_link()
-VESSEL = ij.presets.vessel()
+# Each is made where a test needs it: most default tests need one of them or none, and every worker
+# collects all tests.
+paper = cache(partial(ij.presets.zhang_yan_2024, variant="corrected"))
+chain = cache(ij.presets.motor_driven_two_link)
+flexible = cache(ij.presets.flexible_joint_two_link)
+vessel = cache(ij.presets.vessel)
 LAW = partial(ij.controllers.Backstepping, k1=2.0, K2=20.0)
 SAMPLING = ij.Sampling(period=2e-3)
 WIDE = ij.Bounds(lower=ij.bounds.Constant(-4.0), upper=ij.bounds.Constant(4.0))
@@ -21,7 +23,7 @@ FAR = ij.Bounds(lower=ij.bounds.Constant(-20.0), upper=ij.bounds.Constant(20.0))
 
 
 def with_velocity_bounds(law: Any) -> ij.Scenario:
-    return ij.with_parts(PAPER, controller=law, bounds=(PAPER.bounds[0], WIDE))
+    return ij.with_parts(paper(), controller=law, bounds=(paper().bounds[0], WIDE))
 
 
 def inside(plant: Any, controller: Any, initial: ij.Initial) -> ij.Scenario:
@@ -48,21 +50,21 @@ def of_plant(plant: Any) -> ij.Scenario:
 FITTING: dict[str, Callable[[Any], ij.Scenario]] = {
     "robot": of_robot,
     "plant": of_plant,
-    "reference": lambda part: ij.with_parts(PAPER, reference=part, bounds=WIDE),
+    "reference": lambda part: ij.with_parts(paper(), reference=part, bounds=WIDE),
     "side": lambda part: ij.with_parts(
         of_robot(members.TWO_LINK), bounds=ij.Bounds(lower=ij.bounds.Constant(0.0), upper=part)
     ),
-    "region": lambda part: ij.with_parts(PAPER, regions=(part,)),
-    "disturbance": lambda part: ij.with_parts(PAPER, disturbance=part),
-    "process_noise": lambda part: ij.with_parts(CHAIN, process_noise=part),
-    "barrier": lambda part: ij.with_parts(PAPER, controller=LAW(barrier=part)),
+    "region": lambda part: ij.with_parts(paper(), regions=(part,)),
+    "disturbance": lambda part: ij.with_parts(paper(), disturbance=part),
+    "process_noise": lambda part: ij.with_parts(chain(), process_noise=part),
+    "barrier": lambda part: ij.with_parts(paper(), controller=LAW(barrier=part)),
     "decay": lambda part: ij.with_parts(
-        PAPER, controller=LAW(barrier=ij.barriers.TransformedError(), decays=(part, part))
+        paper(), controller=LAW(barrier=ij.barriers.TransformedError(), decays=(part, part))
     ),
-    "observer": lambda part: ij.with_parts(PAPER, observer=part),
-    "sensor": lambda part: ij.with_parts(PAPER, sensor=part, sampling=SAMPLING),
-    "actuator": lambda part: ij.with_parts(PAPER, actuator=part),
-    "law": lambda part: ij.with_parts(PAPER, controller=part),
+    "observer": lambda part: ij.with_parts(paper(), observer=part),
+    "sensor": lambda part: ij.with_parts(paper(), sensor=part, sampling=SAMPLING),
+    "actuator": lambda part: ij.with_parts(paper(), actuator=part),
+    "law": lambda part: ij.with_parts(paper(), controller=part),
 }
 
 
@@ -74,7 +76,7 @@ def estimated(part: Any) -> ij.Scenario:
     """A robot whose velocity is not measured."""
     observer = ij.observers.StateObserver(bandwidth=40.0, measured=(1,))
     law = ij.controllers.BarrierBackstepping(k=(2.0, 20.0))
-    return sampled(PAPER, sensor=part, observer=observer, controller=law)
+    return sampled(paper(), sensor=part, observer=observer, controller=law)
 
 
 def in_space(region: Any) -> ij.Scenario:
@@ -87,18 +89,18 @@ SPECIAL: dict[str, Callable[[Any], ij.Scenario]] = {
         model=part,
         controller=ij.controllers.BarrierBackstepping(k=(2.0, 2.0), filter=0.01),
     ),
-    "reference ellipse": lambda part: ij.with_parts(VESSEL, reference=part, bounds=FAR),
+    "reference ellipse": lambda part: ij.with_parts(vessel(), reference=part, bounds=FAR),
     "region half_space_of_the_elbow": lambda part: in_space(dataclasses.replace(part, offset=-2.0)),
     "region sphere_inside": in_space,
-    "observer level": lambda part: ij.with_parts(CHAIN, observer=part),
-    "observer state_observer": lambda part: ij.with_parts(FLEXIBLE, observer=part),
-    "observer state_observer_two_encoders": lambda part: ij.with_parts(FLEXIBLE, observer=part),
-    "sensor levels": lambda part: sampled(CHAIN, sensor=part),
-    "sensor levels_encoders": lambda part: sampled(FLEXIBLE, sensor=part),
+    "observer level": lambda part: ij.with_parts(chain(), observer=part),
+    "observer state_observer": lambda part: ij.with_parts(flexible(), observer=part),
+    "observer state_observer_two_encoders": lambda part: ij.with_parts(flexible(), observer=part),
+    "sensor levels": lambda part: sampled(chain(), sensor=part),
+    "sensor levels_encoders": lambda part: sampled(flexible(), sensor=part),
     "sensor levels_unmeasured": estimated,
     "law barrier_backstepping_velocities": with_velocity_bounds,
     "law barrier_backstepping_mixed": with_velocity_bounds,
-    "law with_drive": lambda part: ij.with_parts(CHAIN, controller=part, model=part.drive.robot),
+    "law with_drive": lambda part: ij.with_parts(chain(), controller=part, model=part.drive.robot),
 }
 """Members that fit into a loop of their own."""
 

@@ -6,8 +6,6 @@ which compute nothing then.
 computes all of them anew, or some, in minutes.
 """
 
-from __future__ import annotations
-
 import sys
 import warnings
 from collections.abc import Callable

@@ -5,8 +5,6 @@ As a script it does the small sweep in a process of its own: `python study_cases
 [--devices N] [--shared]`; with `--serve` alone, in a process for each line that comes in (`Forks`).
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os
@@ -17,7 +15,7 @@ import tomllib
 import traceback
 from pathlib import Path
 from subprocess import PIPE
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -144,7 +142,7 @@ class Forks:
         with errors.open("w") as file:
             self.server = start_python(cache, __file__, "--serve", stderr=file)
 
-    def __enter__(self) -> Forks:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from claim_terms import terms_at
 from conftest import PAPER, SHORT
+from refused import assert_refused
 
 import iblf_jax as ij
 from iblf_jax.certificates import Certificate, certify, counterexample, summary
@@ -271,8 +272,7 @@ def test_paper_run_keeps_the_printed_inequality(paper, paper_run):
     assert 1e-3 < by_law.value < by_observer.value < 0.05 and "at most 18.5 %" in by_observer.note
     with pytest.raises(KeyError, match="envelope, case 1"):
         paper_certificate["envelopes"]
-    with pytest.raises(ValueError, match="until"):
-        paper_certificate.plot(until=1e-6)
+    assert_refused("until", paper_certificate.plot, until=1e-6)
     # M0 of two links depends on q2 alone: it is largest at the end of the box, 0.06.
     M0 = np.asarray(paper.model.mass_matrix(jnp.array([0.0, 0.06])))
     largest = np.linalg.eigvalsh(M0)[-1]
@@ -428,8 +428,7 @@ def test_decimated_run_is_judged_at_every_step_and_must_be_reproduced(corrected_
         {"t": run.t.at[2].add(0.01)},
     ):
         other = dataclasses.replace(run, **changes)
-        with pytest.raises(ValueError, match=r"^run.*Simulate it again"):
-            certify(other.scenario, other)
+        assert_refused(r"^run.*Simulate it again", certify, other.scenario, other)
 
 
 def joined(*runs):
@@ -733,8 +732,7 @@ def test_wrong_arguments_are_named(paper, short_run, own):
         (lambda: counterexample(without, {"initial.q": between(0.4, 0.7)}), "claim"),
         (lambda: certify(incomplete, **OWN), "with lyapunov and without decay"),
     ):
-        with pytest.raises(ValueError, match=words):
-            call()
+        assert_refused(words, call)
 
 
 BRIEF = {"duration": 0.01, "dt": 1e-3}
@@ -784,8 +782,7 @@ def test_many_runs_and_studies_are_judged_at_their_worst_runs(corrected_run):
         ((stiffer, study), "a run of a scenario with other numbers"),
         ((ij.presets.zhang_yan_2024(law="log"), study), "a run of another kind of scenario"),
     ):
-        with pytest.raises(ValueError, match=words):
-            certify(*arguments)
+        assert_refused(words, certify, *arguments)
 
 
 @pytest.mark.slow

@@ -5,8 +5,6 @@ The default run checks one instance of every class, the first that `members.py` 
 without derivatives; CI checks all of them.
 """
 
-from __future__ import annotations
-
 import pytest
 from members import FAMILIES, FOLDS, further
 

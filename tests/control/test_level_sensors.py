@@ -3,7 +3,6 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from iblf_jax.sensors import (
     Direct,
     Encoder,
@@ -61,14 +60,11 @@ def test_the_derivative_of_a_rounded_reading_is_1():
         np.testing.assert_array_equal(slope, [1.0, 1.0])
 
 
-def test_levels_that_are_not_measured_and_advice_that_names_the_part():
+def test_levels_that_are_not_measured_advice_that_names_the_part_and_what_is_no_sensor():
     sensor = Levels((Ideal(), None, Unmeasured(), Direct()))
     assert sensor.measured == (1, 2, 5) and isinstance(sensor.parts[1], Unmeasured)
     fast = Encoder(velocity=FilteredDifference(cutoff=1e5))
     (text,) = Levels((Direct(), fast)).advice(PERIOD)
     assert text.startswith("sensor.parts[1].velocity.cutoff = 100000 rad/s")
-
-
-@pytest.mark.parametrize("parts", [(), ENCODER, (3.0,), (Levels((ENCODER,)),), (Measured(),)])
-def test_what_is_no_sensor_is_refused(parts):
-    assert_refused(r"Levels\.parts", Levels, parts)
+    for parts in ((), ENCODER, (3.0,), (Levels((ENCODER,)),), (Measured(),)):
+        assert_refused(r"Levels\.parts", Levels, parts)

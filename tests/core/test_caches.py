@@ -8,7 +8,9 @@ from iblf_jax.core import caches
 from iblf_jax.core.caches import CACHE, Cache
 
 
-def test_the_least_recently_used_results_leave():
+def test_the_least_recently_used_results_leave_and_the_cache_of_the_package_can_be_cleared():
+    from iblf_jax.control.controllers.adaptive_rbf import sobol_centres
+
     cache, calls = Cache(), []
 
     @cache.memoised(2)
@@ -21,6 +23,11 @@ def test_the_least_recently_used_results_leave():
     assert len(cache) == cache.bound == 2
     cache.clear()
     assert len(cache) == 0 and square(1) == 1 and calls[-1] == 1
+    first = sobol_centres(4, 2)
+    assert sobol_centres(4, 2) is first and len(CACHE) > 0
+    CACHE.clear()
+    assert len(CACHE) == 0
+    assert (sobol_centres(4, 2) == first).all()
 
 
 def test_a_mark_is_new_once(monkeypatch):
@@ -35,16 +42,6 @@ def test_a_mark_is_new_once(monkeypatch):
     assert not cache.is_marked("texts", "c") and cache.is_marked("kernels", "a")
     cache.clear()
     assert len(cache) == 0
-
-
-def test_the_cache_of_the_package_can_be_cleared():
-    from iblf_jax.control.controllers.adaptive_rbf import sobol_centres
-
-    first = sobol_centres(4, 2)
-    assert sobol_centres(4, 2) is first and len(CACHE) > 0
-    CACHE.clear()
-    assert len(CACHE) == 0
-    assert (sobol_centres(4, 2) == first).all()
 
 
 def test_core_world_and_control_have_no_other_cache():

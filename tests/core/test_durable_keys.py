@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from refused import assert_refused
 
 import iblf_jax as ij
 from iblf_jax import _start
@@ -33,25 +34,20 @@ DIFFERENT = (
 """Values of which no two are the same to a program."""
 
 
-def test_values_that_differ_have_different_texts():
-    texts = [text_of(value) for value in DIFFERENT]
-    assert len(set(texts)) == len(texts)
-    assert [text_of(value) for value in DIFFERENT] == texts
-
-
 def structure_of(scenario):
     return text_of(jax.tree.structure(canonical(scenario)))
 
 
-def test_scenarios_that_differ_in_a_static_field():
+def test_values_scenarios_and_requests_that_differ_have_different_texts():
+    """Scenarios in a static field, requests in a constant that is compiled in."""
+    texts = [text_of(value) for value in DIFFERENT]
+    assert len(set(texts)) == len(texts)
+    assert [text_of(value) for value in DIFFERENT] == texts
     paper = ij.presets.zhang_yan_2024()
     samplings = (None, ij.Sampling(period=1e-3), ij.Sampling(period=1e-3, observer="euler"))
     texts = {structure_of(ij.with_parts(paper, sampling=x)) for x in samplings}
     assert len(texts) == 3
     assert structure_of(ij.presets.zhang_yan_2024()) in texts
-
-
-def test_requests_that_differ_in_a_constant_that_is_compiled_in():
     known = (None, Known(), Known(0.0), Known(-0.0), Known(1.0), Known(same=1), Known(1.0, None, 2))
     requests = [RunRequest(10, constants=StructuralConstants((x, Known(1.0)))) for x in known]
     texts = {text_of(x) for x in (*requests, RunRequest(10))}
@@ -81,20 +77,17 @@ def test_what_cannot_be_described_has_no_text(value):
         text_of(value)
 
 
-def test_a_number_of_the_package_that_was_replaced(monkeypatch):
+def test_a_number_and_code_of_the_package_that_were_replaced(monkeypatch):
     before = environment()
     assert environment() == before
     monkeypatch.setattr(stability, "THIRD_SIZE", 2.0 * stability.THIRD_SIZE)
     assert environment() != before
-    monkeypatch.undo()
-    assert environment() == before
-
-
-@pytest.mark.parametrize("place", [(stability, "growth_rate"), (ij.Sampling, "check")])
-def test_code_of_the_package_that_was_replaced(monkeypatch, place):
-    monkeypatch.setattr(*place, lambda *args: None)
-    with pytest.raises(NoKeyError):
-        environment()
+    for place in ((stability, "growth_rate"), (ij.Sampling, "check")):
+        monkeypatch.undo()
+        assert environment() == before
+        monkeypatch.setattr(*place, lambda *args: None)
+        with pytest.raises(NoKeyError):
+            environment()
 
 
 @pytest.mark.parametrize(
@@ -120,8 +113,7 @@ def test_code_of_a_folder_counts_for_what_names_it(traced, number, code, monkeyp
         environment(texts[1])
     monkeypatch.undo()
     assert [environment(text) for text in texts] == before
-    with pytest.raises(NoKeyError, match="certificates"):
-        environment(text_of(ij.certify))
+    assert_refused("certificates", environment, text_of(ij.certify), error=NoKeyError)
 
 
 def test_options_of_jax_and_of_xla(monkeypatch):
@@ -144,6 +136,5 @@ def test_a_file_of_the_package_that_is_newer_than_the_process(monkeypatch):
     monkeypatch.setattr(_start, "STARTED", newest + 2.0)
     environment()
     monkeypatch.setattr(_start, "STARTED", newest - 2.0)
-    with pytest.raises(NoKeyError, match="changed"):
-        environment()
+    assert_refused("changed", environment, error=NoKeyError)
     assert newest < time.time()

@@ -11,6 +11,7 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 import pytest
+from refused import assert_refused
 
 import iblf_jax as ij
 from iblf_jax.core.families import Part, adopt
@@ -151,8 +152,7 @@ def test_a_field_without_a_value_is_required_although_the_base_class_has_a_defau
         def effective_gain(self, t, k, V):
             return k
 
-    with pytest.raises(ValueError, match="smooth_derivatives"):
-        Timed()
+    assert_refused("smooth_derivatives", Timed)
     assert Timed(smooth_derivatives=3).smooth_derivatives == 3
 
 
@@ -161,11 +161,9 @@ def test_a_method_that_is_missing_is_an_error_at_the_definition_or_the_use():
         guard: float = ij.static(default=1e-3)
 
     inheriting = type("Inheriting", (Half, ij.barriers.Barrier), {"value": lambda *_: 0.0})
-    with pytest.raises(ValueError, match=r"It lacks slope, virtual_velocity\."):
-        ij.component(inheriting)
+    assert_refused(r"It lacks slope, virtual_velocity\.", ij.component, inheriting)
     half = ij.component(Half)()
-    with pytest.raises(ValueError, match="It lacks slope, value, virtual_velocity"):
-        law_with(half)
+    assert_refused("It lacks slope, value, virtual_velocity", law_with, half)
 
 
 def test_a_class_that_takes_members_from_another_object_takes_the_defaults_last():

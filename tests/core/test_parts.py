@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from members import DISTURBANCES, LAWS, OBSERVERS, REFERENCES, ROBOTS, SIDES
+from refused import assert_refused
 
 import iblf_jax as ij
 
@@ -49,19 +50,15 @@ def test_plant_alone_leaves_the_model_and_robot_takes_both(paper):
     both = ij.with_parts(paper, robot=HEAVY)
     assert both.model is both.plant
     assert same(ij.with_parts(other, model=None).model, HEAVY), "model=None is the plant itself"
-
-
-def test_a_robot_of_other_joints_takes_its_surroundings_with_it(paper):
-    made = ij.with_parts(
-        paper,
-        robot=CHAIN,
-        reference=ij.references.Sinusoid(offset=0.0, amplitude=0.1),
-        bounds=WIDE,
-        controller=ij.controllers.PDGravity(Kp=40.0, Kd=10.0),
-        observer=ij.observers.NoObserver(),
-        disturbance=ij.disturbances.Nothing(),
-        initial=ij.Initial(q=0.1),
-    )
+    surroundings = {
+        "reference": ij.references.Sinusoid(offset=0.0, amplitude=0.1),
+        "bounds": WIDE,
+        "controller": ij.controllers.PDGravity(Kp=40.0, Kd=10.0),
+        "observer": ij.observers.NoObserver(),
+        "disturbance": ij.disturbances.Nothing(),
+        "initial": ij.Initial(q=0.1),
+    }
+    made = ij.with_parts(paper, robot=CHAIN, **surroundings)
     assert made.n == 3
     assert made.controller.Kp.shape == (3,)
 
@@ -85,13 +82,12 @@ def test_a_robot_of_other_joints_takes_its_surroundings_with_it(paper):
     ],
 )
 def test_what_is_refused(paper, parts, words):
-    with pytest.raises(ValueError, match=words):
-        ij.with_parts(paper, **parts)
+    assert_refused(words, ij.with_parts, paper, **parts)
 
 
 def test_the_scenario_is_one_and_has_the_type_of_the_numbers(paper):
-    with pytest.raises(ValueError, match="scenario: got 3, expected a Scenario"):
-        ij.with_parts(3, observer=ij.observers.NoObserver())
+    none = ij.observers.NoObserver()
+    assert_refused("scenario: got 3, expected a Scenario", ij.with_parts, 3, observer=none)
     small = ij.with_parts(ij.astype(paper, "float32"), observer=ij.observers.Momentum(kf=20.0))
     assert {x.dtype for x in jax.tree.leaves(small)} == {jnp.dtype("float32")}
 

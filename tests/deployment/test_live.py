@@ -1,8 +1,6 @@
 """The live page: its sliders, and its curves against `simulate`, in Node.js and in a browser where
 there is one."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -141,9 +141,6 @@ def test_in_float32_and_of_a_sampled_loop(whole):
     assert_close(problem.gradient()[1], problem.gradient("vmap")[1], 1e-10)
 
 
-# ------------------------------------------------------------------------------------------- cost
-
-
 def programs(problem: Problem):
     inputs = compile.inputs_of(problem.scenario, problem.folds, problem.dt, problem.request)
     batch = Batch.of(inputs, problem.varied, constants=problem.constants)
@@ -178,9 +175,6 @@ def test_the_memory_grows_as_the_square_root_of_the_steps(monkeypatch):
     small, large = (largest_array(Problem(steps=T).traced("native")) for T in (10_000, 40_000))
     assert small > 100 * len(GAINS)
     assert large < 2.05 * small
-
-
-# ------------------------------------------------------------------------------------ which kernel
 
 
 @pytest.mark.slow
@@ -253,9 +247,6 @@ def test_derivatives_of_the_gradient_are_those_of_the_scan(in_reverse):
     assert in_reverse == [1]
     np.testing.assert_allclose(jax.jit(jax.jacfwd(gradient))(Kp), expected, rtol=1e-9)
     np.testing.assert_allclose(jax.jit(jax.jacrev(gradient))(Kp), expected, rtol=1e-9)
-
-
-# -------------------------------------------------------------------------------------- the series
 
 
 @pytest.mark.parametrize("segment", [None, 2])

@@ -31,8 +31,6 @@ from iblf_jax.kernels import cpu
 FILE = Path(__file__).parents[1] / "data" / "costs.json"
 JAX = ".".join(jax.__version__.split(".")[:2])
 
-# ------------------------------------------------------------ a step
-
 
 def planar_chain(n: int) -> ij.Scenario:
     """n equal links, each joint with the paper's kind of path and gains."""
@@ -77,8 +75,6 @@ def test_operations_of_a_step(name):
     # If a change is intended, `python tests/engine/test_costs.py` writes the file anew.
     assert step_counts(name) == table["a step"][name]
 
-
-# ------------------------------------------------------------ a first call
 
 CALLS = {
     "certify": lambda paper: ij.certify(paper, **SHORT),

@@ -40,8 +40,6 @@ QUICK = ("zhang_yan_2024", "printed_gap")
 """Presets whose scenario is made at once; they share the program of their runs."""
 SLOW = [pytest.param(x, marks=pytest.mark.slow) for x in ij.presets.PRESETS if x not in QUICK]
 
-# ------------------------------------------------------------ what is stored
-
 
 def with_digest(array: Any, **fields: Any) -> dict[str, Any]:
     """Fields of an array, with the SHA-256 of its type, shape and bytes."""
@@ -80,9 +78,6 @@ def as_text(table: Any, depth: int = 3, indent: str = "") -> str:
     inner = indent + " "
     rows = [f"{inner}{json.dumps(key)}: {as_text(x, depth - 1, inner)}" for key, x in table.items()]
     return "{\n" + ",\n".join(rows) + f"\n{indent}}}"
-
-
-# ------------------------------------------------------------ what moved
 
 
 def is_same(found: Any, stored: Any, slack: float = ABSOLUTE) -> bool:

@@ -5,6 +5,7 @@ import inspect
 
 import numpy as np
 import pytest
+from refused import assert_refused
 
 import iblf_jax as ij
 
@@ -16,16 +17,12 @@ TAKING = (
 
 
 @pytest.mark.slow
-def test_a_run_is_that_of_the_keywords(paper):
+def test_a_run_and_a_study_are_those_of_the_keywords(paper):
     by_keywords = ij.simulate(paper, duration=0.02, method="heun")
     by_object = ij.simulate(paper, runs_as=SHORT)
     np.testing.assert_array_equal(by_object.q, by_keywords.q)
     assert by_object.method == "heun" and SHORT.steps == by_object.steps == 20
     assert SHORT.request(by_object.scenario).steps == 20
-
-
-@pytest.mark.slow
-def test_a_study_has_the_seed_and_the_backend(paper):
     draws = {"initial.q": ij.offset(ij.uniform(-0.01, 0.01))}
     runs = ij.Runs(0.005, backend="vmap", seed=3)
     by_object = ij.monte_carlo(paper, draws, runs=2, runs_as=runs)
@@ -42,21 +39,13 @@ def test_signature_and_docstring_name_the_object_and_its_fields(function):
     assert "runs_as" in function.__doc__
 
 
-def test_what_contradicts_the_object_is_refused(paper):
+def test_what_contradicts_the_object_and_fields_that_are_not_valid_are_refused(paper):
     with pytest.raises(ValueError, match=r"runs_as: got dt beside it.*dataclasses.replace"):
         ij.simulate(paper, dt=1e-3, runs_as=SHORT)
-    with pytest.raises(ValueError, match=r"runs_as: got 20.*ij.Runs\(duration=20.0\)"):
-        ij.simulate(paper, runs_as=20.0)
+    assert_refused(r"runs_as: got 20.*ij.Runs\(duration=20.0\)", ij.simulate, paper, runs_as=20.0)
     with pytest.raises(ValueError, match=r"runs_as.seed: got 3.*compare has no argument seed"):
         ij.compare(paper, runs_as=ij.Runs(0.02, seed=3))
-    with pytest.raises(TypeError, match="duration"):
-        ij.simulate(paper)
-
-
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [("duration", 0.0105), ("dt", -1.0), ("method", "rk5"), ("backend", "abacus"), ("seed", -1)],
-)
-def test_a_field_that_is_not_valid_is_refused(field, value):
-    with pytest.raises(ValueError, match=f"^{field}: got"):
-        ij.Runs(**{"duration": 0.02, field: value})
+    assert_refused("duration", ij.simulate, paper, error=TypeError)
+    wrong = {"duration": 0.0105, "dt": -1.0, "method": "rk5", "backend": "abacus", "seed": -1}
+    for field, value in wrong.items():
+        assert_refused(f"^{field}: got", ij.Runs, **{"duration": 0.02, field: value})

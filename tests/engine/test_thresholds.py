@@ -8,14 +8,12 @@ import pytest
 from iblf_jax.engine import thresholds
 
 
-def test_few_numbers_are_differentiated_forward_and_a_limit_is_within_itself():
+def test_few_numbers_are_differentiated_forward_and_few_runs_of_many_steps_have_short_vectors():
+    """A limit is within itself."""
     most = thresholds.MAX_FORWARD_NUMBERS
     forward = [thresholds.differentiates_forward(numbers) for numbers in (1, most, most + 1)]
     assert forward == [True, True, False]
     assert [thresholds.is_within(3, limit) for limit in (None, 4, 3, 2)] == [True] * 3 + [False]
-
-
-def test_short_vectors_are_for_few_runs_of_many_steps():
     runs, steps = (8, 16, 17), (thresholds.FEW_STEPS, thresholds.FEW_STEPS + 1)
     short = {x for x in itertools.product(runs, steps) if thresholds.uses_short_vector(*x)}
     assert short == set(itertools.product(runs[:2], steps[1:]))

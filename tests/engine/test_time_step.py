@@ -12,8 +12,6 @@ settings of XLA: 8e-5).  After a change that is to move them,
 writes the file anew; its difference names what moved.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import sys
@@ -54,7 +52,6 @@ METHODS = ("heun", "euler", "rk4")
 SHIFTS = np.array([0.0, 0.13, -0.21])
 """By which the states of the three runs differ: one of them leaves its bounds."""
 
-# ------------------------------------------------------------ the loops
 
 REFERENCES = ("sinusoid", "quintic", "smooth_step", "waypoint_spline")
 DISTURBANCES = ("model_shaped", "sinusoids", "step", "tip_force", "friction", "sum")
@@ -116,7 +113,7 @@ def loop_of_law(name: str, i: int) -> ij.Scenario:
         )
     if i % 3 == 2:
         parts["regions"] = (members.REGIONS["half_space"], members.REGIONS["sphere"])
-    return ij.with_parts(loops.PAPER, **parts)
+    return ij.with_parts(loops.paper(), **parts)
 
 
 LOOPS: dict[str, Callable[[], ij.Scenario]] = {
@@ -140,9 +137,6 @@ QUICK = (
 
 def values_of(loop: str) -> dict[str, float]:
     return sums(*steps_of(LOOPS[loop](), METHODS[[*LOOPS].index(loop) % 3]))
-
-
-# ------------------------------------------------------------ their steps by NumPy
 
 
 def record(folds: Any, found: Any) -> Any:
@@ -201,9 +195,6 @@ def sums(carry: Any, records: Any, state: list[Any], rows: list[Any]) -> dict[st
             weights = np.cos(1.0 + np.arange(finite.size))
             found[jax.tree_util.keystr(path)] = float(f"{finite @ weights:.12g}")
     return found
-
-
-# ------------------------------------------------------------ the tests
 
 
 @pytest.mark.parametrize(

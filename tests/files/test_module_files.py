@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from module_cases import Learned, NetworkObserver
+from refused import assert_refused
 
 import iblf_jax as ij
 from iblf_jax.files.identification import load_identification_file
@@ -85,8 +86,7 @@ def test_the_weights_of_another_scenario_are_refused(tmp_path):
         (weights.unlink, "Nothing is there"),
     ):
         change()
-        with pytest.raises(ValueError, match=words):
-            ij.load_scenario(tmp_path / "a.toml")
+        assert_refused(words, ij.load_scenario, tmp_path / "a.toml")
 
 
 def test_a_module_that_a_file_cannot_describe_is_passed(tmp_path):
@@ -103,8 +103,7 @@ def test_a_module_that_a_file_cannot_describe_is_passed(tmp_path):
         ("a", {"disturbance.net": mlp()}, r"modules\['disturbance.net'\]"),
         ("a", {"disturbance.nets": mlp()}, r"Did you mean disturbance\.net"),
     ):
-        with pytest.raises(ValueError, match=words):
-            ij.load_scenario(tmp_path / f"{name}.toml", modules=modules)
+        assert_refused(words, ij.load_scenario, tmp_path / f"{name}.toml", modules=modules)
     # A lambda has no import path.
     scenario = with_net(mlp(activation=lambda x: jnp.tanh(2.0 * x)))
     ij.save_scenario(scenario, tmp_path / "b.toml")
@@ -134,8 +133,7 @@ def test_files_of_studies_receive_modules(kind, tmp_path):
     path = tmp_path / "a.toml"
     ij.save_scenario(scenario, path)
     path.write_text(path.read_text() + RUN + tables)
-    with pytest.raises(ValueError, match=r'modules=\{"disturbance.net": module\}'):
-        load(path)
+    assert_refused(r'modules=\{"disturbance.net": module\}', load, path)
     found = load(path, modules={"disturbance.net": Opaque(jnp.zeros((2, 4)))})
     assert same(found["scenario"] if isinstance(found, dict) else found.scenario, scenario)
 
@@ -149,8 +147,7 @@ def test_files_lead_to_no_function_of_python_and_import_nothing(tmp_path):
         "jax.nn:no_such_function",
     ):
         (tmp_path / "a.toml").write_text(text.replace("jax.nn:tanh", path))
-        with pytest.raises(ValueError, match="import path"):
-            ij.load_scenario(tmp_path / "a.toml")
+        assert_refused("import path", ij.load_scenario, tmp_path / "a.toml")
 
 
 BROKEN = {
@@ -170,8 +167,7 @@ BROKEN = {
 def test_a_broken_description_is_refused_with_its_key(case):
     tables = scenario_to_dict(with_net({"w": np.ones(2)}))
     tables["disturbance"]["net"]["structure"] = BROKEN[case]
-    with pytest.raises(ValueError, match=r"disturbance\.net\.(structure|arrays)"):
-        from_dict(tables)
+    assert_refused(r"disturbance\.net\.(structure|arrays)", from_dict, tables)
 
 
 @pytest.mark.slow

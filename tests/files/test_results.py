@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 from conftest import ROOT
 from matplotlib.figure import Figure
+from refused import assert_refused
 from stored_results import stored
 
 import iblf_jax as ij
@@ -380,8 +381,7 @@ UNREADABLE = [
 def test_what_could_not_be_read_is_not_saved(run, tmp_path, monkeypatch):
     for value, words in UNREADABLE:
         odd = dataclasses.replace(run, measured=value)
-        with pytest.raises(ValueError, match=rf"Rollout\.measured{words}"):
-            odd.save(tmp_path / "odd")
+        assert_refused(rf"Rollout\.measured{words}", odd.save, tmp_path / "odd")
     with pytest.raises(ValueError, match="traced"):
         jax.jit(lambda x: dataclasses.replace(run, x=x).save(tmp_path / "odd"))(run.x)
     assert not list(tmp_path.iterdir())
@@ -392,8 +392,7 @@ def test_what_could_not_be_read_is_not_saved(run, tmp_path, monkeypatch):
         raise OSError("no space left on device")
 
     monkeypatch.setattr(np, "save", full)
-    with pytest.raises(OSError, match="no space"):
-        run.save(path)
+    assert_refused("no space", run.save, path, error=OSError)
     assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
 
 
@@ -428,13 +427,12 @@ def test_a_changed_file_is_refused_with_its_key(run, tmp_path):
         files = {name: archive.read(name) for name in archive.namelist()}
     text, other = files.pop("result.json"), tmp_path / "changed"
 
-    def assert_refused(description, files, words):
+    def assert_named(description, files, words):
         with zipfile.ZipFile(other, "w") as archive:
             for name, content in files.items():
                 archive.writestr(name, content)
             archive.writestr("result.json", json.dumps(description))
-        with pytest.raises(ValueError, match=f"changed: .*{words}"):
-            ij.load(other)
+        assert_refused(f"changed: .*{words}", ij.load, other)
 
     for key, value, words in CHANGES:
         description = json.loads(text)
@@ -443,12 +441,12 @@ def test_a_changed_file_is_refused_with_its_key(run, tmp_path):
         node[last] = value
         if value is ...:
             del node[last]
-        assert_refused(description, files, words)
+        assert_named(description, files, words)
     description, content = json.loads(text), io.BytesIO()
     np.save(content, np.array([print], object), allow_pickle=True)
     number = description["result"]["fields"]["x"]["jax"]
     objects = files | {f"{number}.npy": content.getvalue()}
-    assert_refused(description, objects, "result.x: got no array that can be read")
+    assert_named(description, objects, "result.x: got no array that can be read")
 
 
 def test_damaged_and_foreign_files_are_refused_with_their_name(run, tmp_path):
@@ -457,14 +455,11 @@ def test_damaged_and_foreign_files_are_refused_with_their_name(run, tmp_path):
     cut = [content[:size] for size in (0, 1, 10, len(content) // 2, len(content) - 1)]
     for text in (*cut, b"PK", b"CDF", b"{", b"hello", np.random.default_rng(0).bytes(1000)):
         place.write_bytes(text)
-        with pytest.raises(ValueError, match="damaged"):
-            ij.load(place)
+        assert_refused("damaged", ij.load, place)
     with zipfile.ZipFile(place, "w") as archive:
         archive.writestr("other.txt", "text")
-    with pytest.raises(ValueError, match=r"damaged: result\.json: got nothing"):
-        ij.load(place)
-    with pytest.raises(FileNotFoundError, match="Nothing is there"):
-        ij.load(tmp_path / "none")
+    assert_refused(r"damaged: result\.json: got nothing", ij.load, place)
+    assert_refused("Nothing is there", ij.load, tmp_path / "none", error=FileNotFoundError)
     generator, place = np.random.default_rng(0), tmp_path / "flipped"
     for position in generator.integers(0, len(content), 60):
         changed = bytearray(content)

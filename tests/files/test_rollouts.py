@@ -13,6 +13,7 @@ from conftest import SHORT
 from loops_of_plants import rigid_law
 from made_up_runs import ALWAYS
 from plant_cases import body, pendulum
+from refused import assert_refused
 
 import iblf_jax as ij
 from iblf_jax.files import rollouts
@@ -104,19 +105,15 @@ def test_bad_arguments_and_files(short_run, tmp_path):
         ({"a": 3}, path, "expected a Rollout"),
         *((path, run, turned) for run in (short_run, {"a": short_run})),
     ):
-        with pytest.raises(ValueError, match=words):
-            ij.save_rollouts(runs, place)
-    with pytest.raises(ValueError, match=r"ends in \.nc"):
-        load_datasets(tmp_path / "a")
-    with pytest.raises(ValueError, match="jit"):
-        jax.jit(lambda run: rollouts.rollout_to_xarray(run) and 0)(short_run)
+        assert_refused(words, ij.save_rollouts, runs, place)
+    assert_refused(r"ends in \.nc", load_datasets, tmp_path / "a")
+    assert_refused("jit", jax.jit(lambda run: rollouts.rollout_to_xarray(run) and 0), short_run)
     for path in (tmp_path / "a.nc", tmp_path / "a.npz"):
         with pytest.raises(FileNotFoundError):
             load_datasets(path)
         for content in (b"", b"hello", b"CDF\x01" + bytes(40), b"PK\x03\x04"):
             path.write_bytes(content)
-            with pytest.raises(ValueError, match="expected a file written by save_rollouts"):
-                load_datasets(path)
+            assert_refused("expected a file written by save_rollouts", load_datasets, path)
 
 
 @pytest.fixture(scope="module")

@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import members
 import pytest
+from refused import assert_refused
 
 import iblf_jax as ij
 from iblf_jax.core.pytree import field_values
@@ -73,13 +74,11 @@ def test_a_class_of_a_user_in_a_scenario_file(family, tmp_path, monkeypatch):
 
     given = _changed(scenario, as_mine)
     assert mine in set(_classes(given))
-    with pytest.raises(ValueError, match=rf'{table}\["my_name"\] = Mine'):
-        ij.save_scenario(given, tmp_path / "mine.toml")
+    assert_refused(rf'{table}\["my_name"\] = Mine', ij.save_scenario, given, tmp_path / "mine.toml")
     monkeypatch.setitem(found, "mine", mine)
     ij.save_scenario(given, tmp_path / "mine.toml")
     again = ij.load_scenario(tmp_path / "mine.toml")
     assert jax.tree.structure(again) == jax.tree.structure(given) and mine in set(_classes(again))
     monkeypatch.delitem(found, "mine")
     remedy = rf'kind: .*register it first: .*{table}\["mine"\] = TheClass'
-    with pytest.raises(ValueError, match=remedy):
-        ij.load_scenario(tmp_path / "mine.toml")
+    assert_refused(remedy, ij.load_scenario, tmp_path / "mine.toml")

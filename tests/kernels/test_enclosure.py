@@ -357,8 +357,7 @@ UNSUPPORTED = {
 
 @pytest.mark.parametrize("words", UNSUPPORTED)
 def test_unsupported_operations_and_bad_numbers_are_named(words):
-    with pytest.raises(UnsupportedError, match=words):
-        enclose(UNSUPPORTED[words], [[0.1]], [[0.3]], [])
+    assert_refused(words, enclose, UNSUPPORTED[words], [[0.1]], [[0.3]], [], error=UnsupportedError)
     constants = [math.nan]
     assert_refused(r"constants\[0\]", enclose, lambda x, c: x * c[0], [[0.1]], [[0.3]], constants)
     assert_refused("above the upper one", enclose, jnp_square, [[1.0]], [[0.0]])

@@ -21,6 +21,7 @@ import pytest
 from conftest import ROOT
 from fallback import with_fallback
 from jax.experimental.compilation_cache.compilation_cache import reset_cache
+from refused import assert_refused
 
 from iblf_jax import cli
 from iblf_jax.core import devices
@@ -127,8 +128,7 @@ def test_a_whole_kernel_is_not_built_again_and_what_was_checked_is_loaded(librar
         file.truncate(100)  # a library that was mapped from this file would now kill with SIGBUS
     assert loaded.value() == 41 and toolchain.loaded(library) is loaded
     toolchain.CACHES.libraries.clear()
-    with pytest.raises(ToolchainError, match="damaged"):
-        toolchain.loaded(library)
+    assert_refused("damaged", toolchain.loaded, library, error=ToolchainError)
 
 
 def test_machine_code_of_gpus_is_checked_too(cache, monkeypatch):
@@ -207,8 +207,7 @@ def test_files_and_folders_of_others_are_not_used(cache, monkeypatch):
     (cache / "jit_run-cache").unlink()
     os.chown(cache, 12345, 12345)
     assert chosen_cache(monkeypatch)[0] is None
-    with pytest.raises(OSError, match="not a directory of this user"):
-        directory()
+    assert_refused("not a directory of this user", directory, error=OSError)
 
 
 def made(path, days):
@@ -366,8 +365,7 @@ def test_what_is_built_ahead_is_built_once(slow_compiler, tmp_path, monkeypatch)
     toolchain.build_ahead(OTHER)
     wait_for(calls)
     for tries in (1, 2):
-        with pytest.raises(ToolchainError, match="error: no"):
-            toolchain.built(OTHER)
+        assert_refused("error: no", toolchain.built, OTHER, error=ToolchainError)
         assert len(calls.read_text().split()) == tries
 
 
@@ -652,8 +650,7 @@ def test_a_broken_compiler_is_one_line_and_vmap(cache, tmp_path, monkeypatch, wh
 def test_a_compiler_that_hangs_takes_its_children_along(cache, tmp_path, monkeypatch):
     fake(tmp_path, monkeypatch, compiles(f"sh -c 'echo $$ > {tmp_path}/pid; exec sleep 100'"))
     monkeypatch.setattr(toolchain, "TIMEOUT", 0.5)
-    with pytest.raises(ToolchainError, match="longer"):
-        value()
+    assert_refused("longer", value, error=ToolchainError)
     assert has_ended(tmp_path / "pid")
 
 

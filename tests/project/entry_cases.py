@@ -5,8 +5,6 @@ They are found by their signatures and docstrings: a new function, argument or m
 without a new line here, with None where no value of the argument's name is listed.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import datetime

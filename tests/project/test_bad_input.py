@@ -1,8 +1,6 @@
 """Bad input is a ValueError that names the field, the value and the remedy; a doubtful one is a
 warning."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import functools

@@ -321,7 +321,7 @@ def parts(tmp_path):
     return field.parts(results, tmp_path)
 
 
-def test_the_page_of_the_benchmark(parts):
+def test_the_pages_of_the_benchmark_and_of_all_corrections(parts):
     page = field.benchmark_page(parts)
     numbers = sum(len(part.contents.published) for part in parts)
     assert f"{len(NAMES)} published examples" in page
@@ -334,9 +334,6 @@ def test_the_page_of_the_benchmark(parts):
     assert all(f"- {work.reference}" in page for work in not_readable.NOT_READABLE)
     assert page.count(f"found {len(NAMES)} of {len(NAMES)} entries correct.") == 2
     assert page.count("It did not read") == 0
-
-
-def test_the_page_of_the_corrections_has_all_of_them(parts):
     page = field.corrections_page(parts)
     count = sum(len(part.contents.corrected) for part in parts)
     assert page.startswith("# Corrections of publications and programs")

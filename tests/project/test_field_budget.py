@@ -29,9 +29,6 @@ def a_task(name):
     return task_of(entry.definition(entry.ENTRIES / name).scenario)
 
 
-# ---------------------------------------------------------------------------- what is equal
-
-
 @pytest.mark.parametrize("name", equal_budget.TASKS)
 def test_every_law_of_a_task_has_two_or_three_gains_in_the_same_range(name):
     task = a_task(name)
@@ -95,9 +92,6 @@ def test_two_barriers_give_one_law_up_to_a_weight():
     q = jnp.array([0.3])
     integral, log = (task_laws.BARRIERS[name].slope(tube, q) for name in ("Integral", "Log"))
     np.testing.assert_allclose(integral, 2.0 * log, rtol=1e-12)
-
-
-# ---------------------------------------------------------------------------- the task
 
 
 @pytest.mark.parametrize(
@@ -174,9 +168,6 @@ def test_the_quick_comparison(tmp_path, monkeypatch, capsys):
     check_page({"liu_2018": result})
 
 
-# ---------------------------------------------------------------------------- results and page
-
-
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
 def test_a_result_of_the_repository_keeps_what_the_page_says(path):
     result = json.loads(path.read_text(encoding="utf-8"))
@@ -201,14 +192,12 @@ def test_a_result_of_the_repository_keeps_what_the_page_says(path):
         assert errors == sorted(errors, reverse=True), name
 
 
-def test_readme_and_article_have_the_numbers_of_the_results():
+def test_readme_article_and_page_have_the_numbers_of_the_results():
+    """The page has all tasks, and what a law does not keep."""
+    check_page(field_budget.results())
     words = field_budget.in_words(field_budget.results())
     for path in (FIELD / "README.md", ROOT / "paper" / "paper.md"):
         assert words in " ".join(path.read_text(encoding="utf-8").split()), path
-
-
-def test_the_page_has_all_tasks_and_what_a_law_does_not_keep():
-    check_page(field_budget.results())
 
 
 def check_page(found):

@@ -92,17 +92,13 @@ def test_every_module_has_a_layer():
     assert not gone, f"CONTRIBUTING.md has layers for {gone}, which are not there"
 
 
-def test_imports_go_down_only():
+def test_imports_go_down_only_and_in_no_cycle():
     """Inside functions, too: results reach figures, reports and files through
     `core/presentation.py`."""
-    for path, text in SOURCES.items():
-        assert not module_of(path) or not upward(module_of(path), text, at_the_top=False), path
-
-
-def test_no_cycle_between_modules():
     graph = {name: set() for name in LAYER_OF}
     for path, text in SOURCES.items():
         if module := module_of(path):
+            assert not upward(module, text, at_the_top=False), path
             graph[module] |= edges(text) & set(LAYER_OF) - {module}
     # An order exists only if there is no cycle.
     tuple(graphlib.TopologicalSorter(graph).static_order())
@@ -132,14 +128,11 @@ def test_libraries_stay_in_their_place(library):
     assert {Path(name).parts[0] for name in users(uses)} <= {*ONLY_IN[library]}
 
 
-def test_internals_of_jax_stay_in_their_modules():
+def test_internals_of_jax_stay_in_their_modules_and_jaxprs_are_read_by_interpreters_only():
+    """The others ask `kernels.jaxprs`."""
     found = users(lambda text: any(x.startswith(INTERNAL) for x in imports(text, at_the_top=False)))
     found |= users(lambda text: any(calls(text, name) for name in INTERNAL))
     assert found <= set(INTERNALS)
-
-
-def test_equations_of_jaxprs_are_read_by_interpreters_only():
-    """The others ask `kernels.jaxprs`."""
     interpreters = {"core/taylor.py", "kernels/from_jaxpr.py", "proofs/examination.py"}
     found = users(lambda text: re.search(r"\.(eqns|constvars|call_jaxpr)\b", text))
     assert found <= set(INTERNALS) | interpreters
@@ -169,15 +162,11 @@ def test_the_session_is_left_alone():
     assert not readers & users(lambda text: calls(text, "jax.config.update"))
 
 
-def test_no_prints():
+def test_no_prints_and_no_leftovers():
     for path, text in SOURCES.items():
         if module_of(path) != "cli" and "print(" in text:
             called = [n.func for n in ast.walk(ast.parse(text)) if isinstance(n, ast.Call)]
             assert not [f for f in called if isinstance(f, ast.Name) and f.id == "print"], path
-
-
-def test_no_leftovers():
-    for path, text in SOURCES.items():
         assert not re.search(r"\b(TODO|FIXME|XXX|HACK)\b", text), path
         assert not re.search(r"/(home|Users|work|opt)/\w", text), path
 

@@ -95,14 +95,12 @@ def missing_parts(cells: list) -> list[str]:
 
 
 def test_notebooks_have_goals_prerequisites_and_exercises_and_lead_to_the_next():
+    """One without these parts is found."""
     assert NOTEBOOKS[0].name == "01_reproduce_the_paper.ipynb"
     for path, following in itertools.zip_longest(NOTEBOOKS, NOTEBOOKS[1:]):
         cells = nbformat.read(path, as_version=4).cells
         assert missing_parts(cells) == [], path
         assert following is None or target_of_next(cells) == following, path
-
-
-def test_a_notebook_without_these_parts_is_refused():
     cells = nbformat.read(NOTEBOOKS[0], as_version=4).cells
     assert "## Goals" in missing_parts(cells[:1] + cells[2:])
     assert "two to four exercises, not 0" in missing_parts(cells[:4] + cells[-1:])

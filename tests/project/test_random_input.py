@@ -1,8 +1,6 @@
 """Random input at the entry points: a ValueError or a result, never a crash of another kind, never
 a silent NaN."""
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import functools

@@ -7,6 +7,7 @@ import sys
 
 import pytest
 from conftest import ROOT
+from refused import assert_refused
 
 
 def module_of(path, name):
@@ -24,10 +25,6 @@ release = module_of(ROOT / "tools" / "release", "release")
 comparison = module_of(ROOT / "benchmarks" / "comparison.py", "comparison")
 
 
-def test_all_files_name_the_same_version():
-    assert release.check_versions() == release.project()["version"]
-
-
 @pytest.mark.parametrize(
     ("file", "old", "new", "message"),
     [
@@ -36,16 +33,18 @@ def test_all_files_name_the_same_version():
         ("CHANGELOG.md", "\n## {version} - ", "\n## 0.0.1 - ", "no heading '## "),
     ],
 )
-def test_a_file_with_another_version_is_found(file, old, new, message, tmp_path):
+def test_all_files_name_the_same_version_and_another_one_is_found(
+    file, old, new, message, tmp_path
+):
     for name in ("pyproject.toml", "CITATION.cff", "CHANGELOG.md"):
         shutil.copy(ROOT / name, tmp_path)
-    version = release.project()["version"]
+    version = release.check_versions()
+    assert version == release.project()["version"]
     text = (tmp_path / file).read_text(encoding="utf-8")
     changed = text.replace(old.format(version=version), new.format(version=version), 1)
     assert changed != text
     (tmp_path / file).write_text(changed, encoding="utf-8")
-    with pytest.raises(release.ReleaseError, match=message):
-        release.check_versions(tmp_path)
+    assert_refused(message, release.check_versions, tmp_path, error=release.ReleaseError)
 
 
 def test_readme_and_article_have_the_measured_numbers_and_another_one_is_found():
@@ -53,11 +52,9 @@ def test_readme_and_article_have_the_measured_numbers_and_another_one_is_found()
     text = comparison.FILES[0].read_text(encoding="utf-8")
     changed = text.replace(" ms of a processor", " s of a processor", 1)
     assert changed != text and comparison.replaced(changed) == text
-    with pytest.raises(LookupError, match="has no place for the table"):
-        comparison.replaced("nothing")
+    assert_refused("has no place for the table", comparison.replaced, "nothing", error=LookupError)
     wrong = comparison.COMPARISONS[0]._replace(ours={"row": "native"})
-    with pytest.raises(LookupError, match="rows with"):
-        comparison.row(wrong)
+    assert_refused("rows with", comparison.row, wrong, error=LookupError)
 
 
 def test_the_article_shows_the_figures_that_its_program_makes():

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from arm_cases import random_arm
 from by_numpy import computed
+from refused import assert_refused
 
 import iblf_jax as ij
 from iblf_jax.kernels.enclosure import enclose
@@ -218,8 +219,7 @@ REFUSED |= {text: (paper_loop, numbers) for text, numbers in REFUSED_PARAMETERS.
 @pytest.mark.parametrize("text", REFUSED)
 def test_what_the_bound_does_not_know_is_refused_with_the_reason(text):
     scenario, parameters = REFUSED[text]
-    with pytest.raises(ValueError, match=re.escape(text)):
-        arm_problem(scenario(), parameters)
+    assert_refused(re.escape(text), arm_problem, scenario(), parameters)
 
 
 def test_a_link_of_a_box_can_be_named_and_a_level_at_the_guard_is_refused():
@@ -237,5 +237,4 @@ def test_a_link_of_a_box_can_be_named_and_a_level_at_the_guard_is_refused():
     }.items():
         assert (of(named).places, of(named).names) == (of(numbered).places, of(numbered).names)
     problem = arm_problem(paper_loop(), MASSES)
-    with pytest.raises(ValueError, match="guard"):
-        problem.constants(WEIGHT, 8.0)
+    assert_refused("guard", problem.constants, WEIGHT, 8.0)

@@ -160,9 +160,6 @@ def test_limits_that_no_torque_reaches_change_nothing():
     np.testing.assert_allclose(bounds[:, 0], expected.min(axis=1), rtol=1e-9)
 
 
-# --- verdicts -----------------------------------------------------------------------------------
-
-
 @functools.cache
 def proof(limit=None, motor=None, **options):
     scenario = pendulum()

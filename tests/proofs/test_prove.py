@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 from proof_cases import MASS, pendulum, within
+from refused import assert_refused
 from test_chains import LEVER, lever
 from test_chains import within as lever_within
 
@@ -104,8 +105,7 @@ def test_runs_start_at_the_beginning_where_a_reference_cannot_be_moved_in_time()
     problem = arm_problem(scenario, within(3.0), duration=4.0)
     constants = problem.constants(2e-3, LEVEL)
     points = problem.sample(0, 1)
-    with pytest.raises(ValueError, match="Quintic cannot be moved in time"):
-        problem.scenario_at(points[0], constants)
+    assert_refused("Quintic cannot be moved in time", problem.scenario_at, points[0], constants)
     sampled = Sampled(2e-3, points, np.zeros(1))
     with pytest.warns(UserWarning, match="start at t = 0: Quintic cannot be moved in time"):
         assert _refuted(problem, LEVEL, sampled, 1) is None
@@ -210,8 +210,7 @@ def test_deviations_are_scaled_about_the_value_that_changes_nothing_and_parsed_f
     (path, given) = perturbations(["plant.mass[0], plant.inertia[0]=offset:-0.1:0.2"]).popitem()
     assert path == "plant.mass[0], plant.inertia[0]" and given.kind == "offset"
     for word in ("plant.mass", "plant.mass=factor:1", "plant.mass=scale:1:2"):
-        with pytest.raises(ValueError, match="PATH=KIND:LOW:HIGH"):
-            perturbations([word])
+        assert_refused("PATH=KIND:LOW:HIGH", perturbations, [word])
 
 
 @pytest.mark.parametrize(
@@ -236,8 +235,7 @@ def test_deviations_are_scaled_about_the_value_that_changes_nothing_and_parsed_f
 )
 def test_bad_input_is_named(options, words):
     given = {"scenario": pendulum(), "level": LEVEL, "parameters": within(1.0)} | options
-    with pytest.raises(ValueError, match=words):
-        ij.prove(**given)
+    assert_refused(words, ij.prove, **given)
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from refused import assert_refused
 from test_cpu import needs_compiler
 
 from iblf_jax.kernels import interval_kernel
@@ -44,8 +45,7 @@ def test_a_kernel_that_has_not_run_or_rounds_to_nearest_proves_nothing():
     functions = dict.fromkeys(("search_box", "divide_box"), lambda *a: -1)
     refused = types.SimpleNamespace(record_size=kernel.library.record_size, **functions)
     problem = module._Problem(kernel._replace(library=refused), LOW[None], HIGH[None])
-    with pytest.raises(ToolchainError, match="rounding mode"):
-        problem.divided(100)
+    assert_refused("rounding mode", problem.divided, 100, error=ToolchainError)
     with pytest.raises(ToolchainError, match="rounding mode"):
         problem.searched(np.zeros(problem.size), 100)
 
@@ -287,5 +287,4 @@ def test_no_two_problems_have_the_bytes_of_a_digest_in_common():
     ],
 )
 def test_bad_input_is_refused(lower, options, message):
-    with pytest.raises(ValueError, match=message):
-        search(bowl, lower, [1.0, 1.0], [0.0], **options)
+    assert_refused(message, search, bowl, lower, [1.0, 1.0], [0.0], **options)

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import study_cases as cases
 from conftest import ROOT
+from refused import assert_refused
 from scipy import stats
 
 import iblf_jax as ij
@@ -175,8 +176,7 @@ def test_an_index_selects_a_run_and_what_a_study_shows(study):
     one = study[-1]
     assert one.index == len(study) - 1
     np.testing.assert_array_equal(one.metrics.margin, study.metrics.margin[-1])
-    with pytest.raises(IndexError, match="runs 0 to 599"):
-        study.replay(600)
+    assert_refused("runs 0 to 599", study.replay, 600, error=IndexError)
     data = study.to_xarray()
     assert data.margin.attrs["units"] == "rad" and data.sizes == {"run": 600, "joint": 2}
     assert data["plant.mass[1]"].attrs["units"] == "kg" and data.attrs["seed"] == 3
@@ -216,8 +216,7 @@ def test_inadmissible_draws_are_flagged_and_left_out():
     assert study.violation_probability.runs == (~bad).sum()
     assert study.quantiles().attrs["excluded"] == bad.sum()
     assert np.all(study.made[study.worst(200)])
-    with pytest.raises(ValueError, match="admissible"):
-        study.replay(int(np.argmax(bad)))
+    assert_refused("admissible", study.replay, int(np.argmax(bad)))
 
 
 def test_rank_correlation_agrees_with_scipy_and_bands_enclose_the_runs(study):
@@ -251,8 +250,7 @@ def test_sobol_indices_of_what_is_known():
     assert found.runs == 320 and "initial.q[1]" in repr(found)
     assert found.to_xarray().sizes["parameter"] == 3
     words = "first_violation_time: got '64 of 64 runs without a finite value'"
-    with pytest.raises(ValueError, match=words):
-        ij.sensitivity(SCENARIO, ways, output="first_violation_time", **options)
+    assert_refused(words, ij.sensitivity, SCENARIO, ways, output="first_violation_time", **options)
 
 
 def refused(perturbations=None, **options):
@@ -286,8 +284,7 @@ TENTH = ij.factor(ij.uniform(0.9, 1.1))
     ],
 )
 def test_what_cannot_be_drawn_is_refused(call, message):
-    with pytest.raises(ValueError, match=message):
-        call()
+    assert_refused(message, call)
 
 
 INTERRUPTED = """
@@ -363,8 +360,7 @@ def test_an_interval_has_ends_which_are_rounded_outward_and_no_quantile():
     np.testing.assert_array_less(1.03, float(interval.high[0]))
     assert float(interval.high[1]) == 2.0
     for ends in ((1.1, 0.9), (1.0, 1.0), (0.9, np.inf), (np.nan, 1.0)):
-        with pytest.raises(ValueError, match=r"low < high|finite"):
-            ij.interval(*ends)
+        assert_refused(r"low < high|finite", ij.interval, *ends)
 
 
 STUDIES = {
@@ -379,8 +375,7 @@ STUDIES = {
 
 @pytest.mark.parametrize("study", STUDIES)
 def test_studies_refuse_intervals_and_name_the_remedy(study):
-    with pytest.raises(ValueError, match=r"without probabilities.*ij\.uniform\(low, high\)"):
-        STUDIES[study]()
+    assert_refused(r"without probabilities.*ij\.uniform\(low, high\)", STUDIES[study])
 
 
 def test_a_proof_refuses_a_distribution_and_names_the_remedy():

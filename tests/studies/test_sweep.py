@@ -16,6 +16,7 @@ import loops_of_plants
 import numpy as np
 import pytest
 import study_cases as cases
+from refused import assert_refused
 
 import iblf_jax as ij
 from iblf_jax.engine import native
@@ -125,8 +126,7 @@ def test_executors_give_the_same_numbers_and_a_sweep_over_a_gain_of_a_level_is_s
     ],
 )
 def test_bad_grids_are_refused(grid, more, message):
-    with pytest.raises(ValueError, match=message):
-        ij.sweep(SCENARIO, grid, duration=0.01, **more)
+    assert_refused(message, ij.sweep, SCENARIO, grid, duration=0.01, **more)
 
 
 LOADED = ij.with_parameters(SCENARIO, {"plant.payload": 1.0})
@@ -177,8 +177,7 @@ def test_torn_missing_and_foreign_chunks_are_found(finished, table, tmp_path):
     torn.write_bytes(torn.read_bytes()[:-7])
     missing.unlink()
     foreign.write_bytes(chunks(finished)[5].read_bytes())
-    with pytest.raises(ij.StoreError, match="unit 0 is damaged"):
-        ij.load_sweep(finished)
+    assert_refused("unit 0 is damaged", ij.load_sweep, finished, error=ij.StoreError)
     with pytest.warns(UserWarning, match="3 units are damaged"):
         assert cases.table(store=finished).identical(table)
     other = tmp_path / "other.zarr"
@@ -189,8 +188,7 @@ def test_torn_missing_and_foreign_chunks_are_found(finished, table, tmp_path):
             shutil.copytree(source, target, dirs_exist_ok=True)
         else:
             shutil.copy(source, target)
-    with pytest.raises(ij.StoreError, match="unit 0 is damaged"):
-        ij.load_sweep(finished)
+    assert_refused("unit 0 is damaged", ij.load_sweep, finished, error=ij.StoreError)
 
 
 def test_what_is_no_store_or_cannot_be_written_is_refused(tmp_path, finished, monkeypatch):
@@ -204,8 +202,7 @@ def test_what_is_no_store_or_cannot_be_written_is_refused(tmp_path, finished, mo
         with pytest.raises(ij.StoreError, match=rf"{name}.*(not a store|did not write)"):
             cases.table(store=tmp_path / name)
     assert (tmp_path / "folder" / "notes.txt").read_text() == "mine"
-    with pytest.raises(ij.StoreError, match="no store here"):
-        ij.load_sweep(tmp_path / "nothing")
+    assert_refused("no store here", ij.load_sweep, tmp_path / "nothing", error=ij.StoreError)
     with pytest.raises(ij.StoreError, match="cannot be written"):
         cases.table(store=tmp_path / "file" / "sweep.zarr")
     if os.getuid() == 0:
@@ -218,8 +215,7 @@ def test_what_is_no_store_or_cannot_be_written_is_refused(tmp_path, finished, mo
     with pytest.raises(ij.StoreError, match=r"cannot be written \(Permission denied\)"):
         cases.table(store=finished)
     monkeypatch.setitem(sys.modules, "zarr", None)
-    with pytest.raises(ij.StoreError, match=r"\.\[sweep\]"):
-        cases.table(store=tmp_path / "sweep.zarr")
+    assert_refused(r"\.\[sweep\]", cases.table, store=tmp_path / "sweep.zarr", error=ij.StoreError)
 
 
 class Payload:
@@ -331,8 +327,7 @@ def test_a_full_disk_keeps_what_was_written(tmp_path, table, monkeypatch):
     assert cases.table(store=path).identical(table)
     shutil.rmtree(path)
     monkeypatch.setattr(zarr, "consolidate_metadata", full)
-    with pytest.raises(store.StoreWriteError, match="no space left"):
-        cases.table(store=path)
+    assert_refused("no space left", cases.table, store=path, error=store.StoreWriteError)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -359,8 +354,7 @@ def test_a_store_that_is_deleted_meanwhile_is_begun_anew(tmp_path, table, monkey
     with monkeypatch.context() as patch:
         cut_in(patch, count, lambda: shutil.rmtree(path))
         words = r"was deleted while it was in use\. Start the same call again"
-        with pytest.raises(store.StoreWriteError, match=words):
-            cases.table(store=path)
+        assert_refused(words, cases.table, store=path, error=store.StoreWriteError)
     assert list(tmp_path.iterdir()) == []
     assert cases.table(store=path).identical(table)
 
@@ -374,8 +368,7 @@ def test_a_store_that_is_deleted_at_the_very_end_is_noticed(tmp_path, monkeypatc
             shutil.rmtree(path)
 
     monkeypatch.setattr(store.Store, "write", write)
-    with pytest.raises(store.StoreWriteError, match="was deleted"):
-        cases.table(store=path)
+    assert_refused("was deleted", cases.table, store=path, error=store.StoreWriteError)
 
 
 @pytest.mark.parametrize("words", ["lost arrays", "was replaced"])
@@ -393,8 +386,7 @@ def test_a_store_that_is_changed_is_not_written_on(tmp_path, finished, monkeypat
             (path / "zarr.json").write_text(json.dumps(settings))
 
     cut_in(monkeypatch, 9, deed)
-    with pytest.raises(store.StoreWriteError, match=words):
-        cases.table(store=path)
+    assert_refused(words, cases.table, store=path, error=store.StoreWriteError)
 
 
 KILLED_CREATION = """

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import study_cases as cases
+from refused import assert_refused
 from scipy.stats import norm
 
 import iblf_jax as ij
@@ -159,8 +160,7 @@ def test_without_failures_the_estimate_is_a_bound(scenario):
     assert "no sample failed in 101 runs; at most" in repr(crude)  # with the nominal one
     with pytest.raises(ValueError, match="draws near failure"):
         _ = crude.rare_draws
-    with pytest.raises(ValueError, match="in which runs failed"):
-        ij.objectives.failure_probability_below(1e-3, crude)
+    assert_refused("in which runs failed", ij.objectives.failure_probability_below, 1e-3, crude)
 
 
 MASS = {"plant.mass": ij.factor(ij.uniform(0.9, 1.1))}
@@ -182,8 +182,7 @@ MASS = {"plant.mass": ij.factor(ij.uniform(0.9, 1.1))}
     ],
 )
 def test_bad_arguments(scenario, perturbations, options, words):
-    with pytest.raises(ValueError, match=words):
-        failure_probability(scenario, perturbations, **options)
+    assert_refused(words, failure_probability, scenario, perturbations, **options)
 
 
 def test_tails_of_float32_draws_and_noise_as_a_function_of_the_point():
@@ -356,8 +355,7 @@ def test_joint_samples(scenario):
     np.testing.assert_array_equal(drawn.quantile(np.array([0.6])), values[2])
     assert [x.tolist() for x in drawn.support()] == [values[1].tolist(), values[2].tolist()]
     for bad in ({"values": 1.0}, {"group": ""}, {"weights": [1.0]}, {"weights": np.zeros(4)}):
-        with pytest.raises(ValueError, match="joint_samples"):
-            ij.joint_samples(**({"values": values, "group": "g"} | bad))
+        assert_refused("joint_samples", ij.joint_samples, **{"values": values, "group": "g"} | bad)
     samples = 'value = "joint_samples", values = [[0.1, 0.2], [0.3, 0.4]], group = "g"'
     text = cases.STUDY.replace('offset = "normal", std = 0.05', samples)
     drawn = study_from_dict(tomllib.loads(text), "study").perturbations["initial.q"].distribution
@@ -370,8 +368,7 @@ def test_joint_samples(scenario):
     other = (mass, weighted, "weights of samples")
     for of_mass, of_load, message in ((mass, two, words), (normal, two, words), other):
         perturbations = {"plant.mass": ij.factor(of_mass), "plant.payload": ij.value(of_load)}
-        with pytest.raises(ValueError, match=message):
-            study_of(scenario, perturbations, 8)
+        assert_refused(message, study_of, scenario, perturbations, 8)
 
 
 @pytest.mark.slow

@@ -59,7 +59,7 @@ def test_what_the_file_leaves_out_follows_from_the_arm(folder):
     assert np.min(weight) < np.min(scenario.controller.law.weight)
 
 
-def test_what_it_says_counts(folder):
+def test_what_it_says_counts_and_joints_have_one_name_in_paths_and_messages(folder):
     text = ROBOT + '[controller]\nkind = "computed_torque"\nKp = 30.0\nKd = 11.0\n'
     text += "[initial]\nq = [0.1, -1, 1.4, -1.2, -1.5, 0.2]\n"
     text += '[parameters]\n"plant.payload" = 2.0\n"plant.link[forearm_link].mass" = 3.0\n'
@@ -67,9 +67,6 @@ def test_what_it_says_counts(folder):
     assert scenario.controller.law.Kp[3] == 30.0 and scenario.initial.q[0] == 0.1
     assert (float(scenario.plant.payload), float(scenario.model.payload)) == (2.0, 0.0)
     assert (float(scenario.plant.mass[2]), float(scenario.model.mass[2])) == (3.0, 2.275)
-
-
-def test_joints_have_one_name_in_paths_and_messages(folder):
     scenario = loaded(folder, ROBOT + '[parameters]\n"controller.K2[elbow_joint]" = 9.0\n')
     assert scenario.controller.law.K2[2] == 9.0
     for path, value, words in (
@@ -82,7 +79,7 @@ def test_joints_have_one_name_in_paths_and_messages(folder):
 
 
 @pytest.mark.slow
-def test_plant_and_model_from_two_files_and_a_locked_joint(folder):
+def test_plant_and_model_from_two_files_a_locked_joint_and_repair(folder):
     believed = (folder / "ur5.urdf").read_text().replace("2.275", "2.0")
     (folder / "believed.urdf").write_text(believed)
     locked = 'tip = "tool0"\nlocked = { wrist_3_joint = 0.3 }\n'
@@ -91,10 +88,22 @@ def test_plant_and_model_from_two_files_and_a_locked_joint(folder):
     scenario = ij.load_scenario(folder / "both.toml")
     assert scenario.n == 5
     assert (float(scenario.plant.mass[2]), float(scenario.model.mass[2])) == (2.275, 2.0)
+    text = (folder / "ur5.urdf").read_text()
+    (folder / "ur5.urdf").write_text(text.replace('ixx="0.049443313556"', 'ixx="9"'))
+    assert_refused("repair=True", loaded, folder, ROBOT)
+    with pytest.warns(UserWarning, match="repaired: link 'forearm_link': inertia"):
+        scenario = loaded(folder, ROBOT + "repair = true\n")
+    assert len(scenario.plant.repaired) == 1
+    ij.save_scenario(scenario, folder / "saved.toml")
+    assert ij.load_scenario(folder / "saved.toml").plant.repaired == scenario.plant.repaired
 
 
-def test_saved_it_needs_no_other_file(folder):
-    scenario = loaded(folder, ROBOT)
+def test_the_plant_may_have_other_rotors_and_what_is_saved_needs_no_other_file(folder):
+    tables = '[plant]\nfile = "ur5.urdf"\narmature = 0.01\n[model]\nfile = "ur5.urdf"\n'
+    rotors, scenario = loaded(folder, tables), loaded(folder, ROBOT)
+    np.testing.assert_array_equal(rotors.plant.armature, 0.01)
+    np.testing.assert_array_equal(rotors.model.armature, scenario.plant.armature)
+    np.testing.assert_array_equal(rotors.controller.law.K2, scenario.controller.law.K2)
     (folder / "ur5.urdf").unlink()
     ij.save_scenario(scenario, folder / "saved.toml")
     again = ij.load_scenario(folder / "saved.toml")
@@ -128,23 +137,3 @@ def test_what_is_wrong_is_said(folder, text, message):
 def test_without_the_extra_it_says_so(folder, monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco", None)
     assert_refused(r"robot\.file: .*\.\[robots\]", loaded, folder, ROBOT)
-
-
-def test_the_plant_may_have_other_rotors_than_the_model(folder):
-    tables = '[plant]\nfile = "ur5.urdf"\narmature = 0.01\n[model]\nfile = "ur5.urdf"\n'
-    scenario, plain = loaded(folder, tables), loaded(folder, ROBOT)
-    np.testing.assert_array_equal(scenario.plant.armature, 0.01)
-    np.testing.assert_array_equal(scenario.model.armature, plain.plant.armature)
-    np.testing.assert_array_equal(scenario.controller.law.K2, plain.controller.law.K2)
-
-
-@pytest.mark.slow
-def test_repair(folder):
-    text = (folder / "ur5.urdf").read_text()
-    (folder / "ur5.urdf").write_text(text.replace('ixx="0.049443313556"', 'ixx="9"'))
-    assert_refused("repair=True", loaded, folder, ROBOT)
-    with pytest.warns(UserWarning, match="repaired: link 'forearm_link': inertia"):
-        scenario = loaded(folder, ROBOT + "repair = true\n")
-    assert len(scenario.plant.repaired) == 1
-    ij.save_scenario(scenario, folder / "saved.toml")
-    assert ij.load_scenario(folder / "saved.toml").plant.repaired == scenario.plant.repaired

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from bag_files import effort_message, messages_of, state_message, string_message, write_bag
 from conftest import ROOT
+from refused import assert_refused
 from rosbags.rosbag2 import Writer
 
 import iblf_jax as ij
@@ -205,8 +206,7 @@ def test_times_and_a_part_are_selected(scenario, motion, tmp_path):
     unset = [state_message(0, NAMES, x) for x in q]
     broken[::2] = [(*x[:2], y) for x, y in zip(broken[::2], unset, strict=True)]
     folder = write_bag(tmp_path / "zero", broken)
-    with pytest.raises(ValueError, match=r'stamps: got 0 s and then 0 s.*times="receive"'):
-        read_log(folder, scenario)
+    assert_refused(r'stamps: got 0 s and then 0 s.*times="receive"', read_log, folder, scenario)
     np.testing.assert_allclose(read_log(folder, scenario, times="receive")["t"], t, atol=1e-9)
 
 
@@ -224,16 +224,14 @@ def test_states_that_come_twice_efforts_of_states_and_namespaces(scenario, motio
     log = read_log(folder, scenario, efforts=None)
     np.testing.assert_array_equal(log["tau"], tau)
     words = r"efforts: got no topics .*topics: /joint_states.*efforts=None"
-    with pytest.raises(ValueError, match=words):
-        read_log(folder, scenario)
+    assert_refused(words, read_log, folder, scenario)
     messages = [(f"/left{topic}", at, x) for topic, at, x in messages_of(t, NAMES, q, tau)]
     log = read_log(write_bag(tmp_path / "one", messages), scenario)
     np.testing.assert_array_equal(log["q"], q)
     messages += [(f"/right{topic}", at, x) for topic, at, x in messages_of(t, NAMES, -q, tau)]
     folder = write_bag(tmp_path / "two", messages)
     words = r"got 2 topics .*/left/joint_states .*/right/joint_states"
-    with pytest.raises(ValueError, match=words):
-        read_log(folder, scenario)
+    assert_refused(words, read_log, folder, scenario)
     log = read_log(folder, scenario, joint_states="right/joint_states", efforts="/right/efforts")
     np.testing.assert_array_equal(log["q"], -q)
 
@@ -359,38 +357,31 @@ def test_a_truncated_recording_is_refused(storage, share, scenario, motion, tmp_
     data = path.read_bytes()
     path.write_bytes(data[: int(share * len(data))])
     words = r"expected a complete rosbag2 recording.*ros2 bag reindex"
-    with pytest.raises(ValueError, match=words):
-        read_log(folder, scenario)
+    assert_refused(words, read_log, folder, scenario)
 
 
 def test_incomplete_and_other_paths_are_refused(scenario, motion, bag, tmp_path, monkeypatch):
     folder = shutil.copytree(bag, tmp_path / "bag")
     with sqlite3.connect(folder / "bag.db3") as database:
         database.execute("DELETE FROM messages WHERE id > 350")
-    with pytest.raises(ValueError, match=r"got 50 messages less than its metadata count"):
-        read_log(folder, scenario)
+    assert_refused(r"got 50 messages less than its metadata count", read_log, folder, scenario)
     # A single byte is missing at the end.
     data = (bag / "bag.db3").read_bytes()
     (folder / "bag.db3").write_bytes(data[:-1])
     words = rf"got {len(data) - 1} bytes of bag\.db3, which had {len(data)}"
     for path in (folder, folder / "bag.db3"):
-        with pytest.raises(ValueError, match=words):
-            read_log(path, scenario)
+        assert_refused(words, read_log, path, scenario)
     (folder / "bag.db3").write_bytes(data)
     (folder / "metadata.yaml").unlink()
-    with pytest.raises(ValueError, match=r"ros2 bag reindex .*, or read the file bag.db3"):
-        read_log(folder, scenario)
+    assert_refused(r"ros2 bag reindex .*, or read the file bag.db3", read_log, folder, scenario)
     np.testing.assert_array_equal(read_log(folder / "bag.db3", scenario)["q"], motion[1])
-    with pytest.raises(ValueError, match=r"without metadata.yaml.*\.csv or \.nc"):
-        read(tmp_path, 2)
+    assert_refused(r"without metadata.yaml.*\.csv or \.nc", read, tmp_path, 2)
     (tmp_path / "log.csv").write_text("t\n")
     csv = r"path: got .*log.csv.*\.db3 or \.mcap"
     for name, words in (("none", "Nothing is there"), ("log.csv", csv)):
-        with pytest.raises(ValueError, match=words):
-            read_log(tmp_path / name, scenario)
+        assert_refused(words, read_log, tmp_path / name, scenario)
     monkeypatch.setitem(sys.modules, "rosbags", None)
-    with pytest.raises(ImportError, match=r"rosbags.*\.\[ros\]"):
-        read_log(tmp_path, scenario)
+    assert_refused(r"rosbags.*\.\[ros\]", read_log, tmp_path, scenario, error=ImportError)
 
 
 def one_state(names=NAMES, q=(0.0, 0.0), dq=(), stamp=0):
@@ -422,14 +413,11 @@ WRONG = [
 def test_what_is_wrong_and_numbers_that_are_not_finite_are_refused(scenario, motion, tmp_path):
     for number, (messages, options, words) in enumerate(WRONG):
         folder = write_bag(tmp_path / f"bag_{number}", messages)
-        with pytest.raises(ValueError, match=words):
-            read_log(folder, scenario, **options)
+        assert_refused(words, read_log, folder, scenario, **options)
     t, q, _, tau = motion
     q = q.copy()
     q[7, 1] = np.nan
     folder = recorded(tmp_path / "bag", (t, q, None, tau))
     words = r"q that is not finite: got 1 of 200 rows, .* t = 0.014 s"
-    with pytest.raises(ValueError, match=words):
-        read(folder, 2, joints=NAMES)
-    with pytest.raises(ValueError, match=r"q that is not finite"):
-        ij.deployment.read_bag(folder, scenario, joints=NAMES)
+    assert_refused(words, read, folder, 2, joints=NAMES)
+    assert_refused(r"q that is not finite", ij.deployment.read_bag, folder, scenario, joints=NAMES)

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import ROOT
+from refused import assert_refused
 
 import iblf_jax as ij
 from iblf_jax.deployment.control_law import SampleInputs, sample, start
@@ -181,8 +182,7 @@ def test_a_payload_changes_the_motion_as_that_of_the_plant_does_and_a_file_may_b
     run = ij.simulate(ij.with_parameters(PAPER, {"plant.payload": 0.3}), duration=0.2, dt=DT)
     np.testing.assert_allclose(motion.q[motion.instant], run.q, atol=1e-7)
     assert np.max(np.abs(np.asarray(ij.simulate(PAPER, duration=0.2, dt=DT).q - run.q))) > 1e-3
-    with pytest.raises(ValueError, match=r"plant: got 'Arm'.*--plant"):
-        plant_of(ij.presets.ur5(), None, None)
+    assert_refused(r"plant: got 'Arm'.*--plant", plant_of, ij.presets.ur5(), None, None)
 
 
 def test_a_payload_that_mujoco_does_not_have_is_refused_and_joints_have_the_names_of_a_file():
@@ -192,12 +192,10 @@ def test_a_payload_that_mujoco_does_not_have_is_refused_and_joints_have_the_name
         (ARM, ij.robots.Payload(mass=0.3, start=1.0), "payload.start: got"),
         (compiled, ij.robots.Payload(mass=0.3), r"payload: got .* Give the file or an MjSpec"),
     ):
-        with pytest.raises(ValueError, match=words):
-            MujocoPlant(model, JOINTS, 2, {}, "RK4", payload)
+        assert_refused(words, MujocoPlant, model, JOINTS, 2, {}, "RK4", payload)
     assert plant_of(PLAIN, ARM, None) == (ARM, ("shoulder", "elbow"))
     assert plant_of(PLAIN, ARM, ["elbow", "shoulder"]) == (ARM, ("elbow", "shoulder"))
-    with pytest.raises(ValueError, match=r"joints: got .*--joints"):
-        plant_of(PLAIN, ARM, ["elbow"])
+    assert_refused(r"joints: got .*--joints", plant_of, PLAIN, ARM, ["elbow"])
 
 
 PLAIN = ij.with_parts(ij.presets.zhang_yan_2024(), sampling=ij.Sampling(1e-3))
