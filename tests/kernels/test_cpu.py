@@ -1,5 +1,6 @@
 """Kernels on processors agree with the reference run, and runs do not touch each other."""
 
+import re
 import shutil
 from functools import partial
 
@@ -171,6 +172,19 @@ def test_a_long_step_is_cut_into_functions(monkeypatch):
     # The mode comes from differences of rates, which magnify the last digit.
     np.testing.assert_allclose(cut.fastest_mode, whole.fastest_mode, rtol=1e-9)
     assert_same(cut._replace(fastest_mode=whole.fastest_mode), whole, 1e-12)
+
+
+def test_a_place_is_used_again_when_no_later_function_reads_its_number():
+    def step(shared, per_run, carry, index):
+        (x,) = carry
+        for _ in range(40):
+            x = jnp.sin(x) * x + 1.0
+        return [x], ()
+
+    number = np.dtype("float64")
+    program = compile_step(step, number, Shapes(()), Shapes(()), Shapes((((), number),))).program
+    places = re.findall(r"F x\[(\d+)\]", cpu.c_source(program, 0, 0, 2))
+    assert places and 1 < max(map(int, places)) < 10
 
 
 DIRECTIONS = {"controller.K2": np.eye(3, 2), "observer.kf": np.eye(3, 2, -1)}
