@@ -10,6 +10,8 @@ from conftest import SHORT
 from refused import assert_refused
 
 import iblf_jax as ij
+from iblf_jax.core.status import Status
+from iblf_jax.engine.status_flags import sample_status
 from iblf_jax.testing.metrics import folded, samples
 from iblf_jax.tuning.quantities import Quantities
 
@@ -73,6 +75,10 @@ def test_margins_go_on_through_zero(q, slope):
     assert float(value) == pytest.approx(min(q - 0.2, 0.85 - q)) and float(gradient) == slope
 
 
+VIOLATIONS = int(Status.BOUND_VIOLATED | Status.VELOCITY_VIOLATED)
+VIOLATIONS |= int(Status.STATE_BOUND_VIOLATED | Status.REGION_VIOLATED)
+
+
 @pytest.mark.parametrize(
     ("name", "fold", "place"),
     [
@@ -83,13 +89,17 @@ def test_margins_go_on_through_zero(q, slope):
     ],
 )
 def test_the_first_violation_has_its_time_and_place(name, fold, place):
-    """Component 2 and region 1 from the second instant on; at the third one all others."""
+    """Component 2 and region 1 from the second instant on; at the third one all others.  Only what
+    is violated has a flag."""
     some = jax.tree.map(lambda x: x[:3], samples(np.random.default_rng(0), 3))
     middle = 0.5 * (some.level_lower + some.level_upper)
     x = middle.at[1:, :, 2].add(5.0).at[2].add(6.0)
     walls = jnp.asarray([[0.1, 0.1], [0.1, -0.1], [-0.2, -0.2]])
-    found = folded((fold,), dataclasses.replace(some, x=x, region_margin=walls))
+    some = dataclasses.replace(some, x=x, region_margin=walls)
+    found = folded((fold,), some)
     assert found[f"first_{name}_time"] == some.t[1]
+    flags = jax.vmap(sample_status)(some)
+    assert [int(x) & VIOLATIONS for x in flags] == [0, VIOLATIONS, VIOLATIONS]
     assert {key: int(found[f"first_{name}_{key}"]) for key in place} == place
 
 

@@ -223,9 +223,8 @@ def test_the_node_moves_a_simulated_robot_as_its_law_does_in_mujoco(law, package
             monkeypatch.setitem(sys.modules, module, ros)
     monkeypatch.setattr(simulated_robot, "DISCOVERY_TIME", 0.0)
     node = runpy.run_path(str(path))["LawNode"](law)
-    arm, start = ROOT / "examples" / "two_link.xml", [0.55, 0.45]
-    options = {"period": ros_package.PERIOD, "dt": 1e-3, "initial": ij.Initial(q=start)}
-    robot = ij.deployment.robot_node(arm, JOINTS, **options)
+    arm, start = ROOT / "examples" / "two_link.xml", ij.Initial(q=[0.55, 0.45])
+    robot = ij.deployment.robot_node(arm, JOINTS, period=ros_package.PERIOD, dt=1e-3, initial=start)
     answer, states = node.topics["joint_states"], []
 
     def start_after_two(state):
@@ -238,8 +237,8 @@ def test_the_node_moves_a_simulated_robot_as_its_law_does_in_mujoco(law, package
     model, own = mujoco.MjModel.from_xml_path(str(arm)), load_law(package.modules / NAME)
     model.opt.timestep, model.opt.integrator = 1e-3, mujoco.mjtIntegrator.mjINT_RK4
     data = mujoco.MjData(model)
-    data.qpos[:] = start
-    own.init(start, [0.0, 0.0])
+    data.qpos[:] = start.q
+    own.init(data.qpos.tolist(), [0.0, 0.0])
     for k in range(100):
         if k % 10 == 0:  # t = 0 is the last state before the start
             state = data.qpos.tolist(), data.qvel.tolist()
