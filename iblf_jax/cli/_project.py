@@ -483,6 +483,20 @@ COMMANDS = (
     ("iblf-jax export tuned/scenario.toml --out law", "the tuned law as C99"),
 )
 """The commands of the README with their purposes: the next three, and the one after a tuning."""
+DRIVES = (
+    "[sensor]",
+    'kind = "encoder"',
+    "counts = 65536.0  # a turn",
+    "",
+    "[sensor.velocity]",
+    'kind = "filtered_difference"',
+    "cutoff = 300.0  # rad/s",
+    "",
+    "[actuator]",
+    'kind = "motor"',
+    "bandwidth = 200.0  # 1/s",
+)
+"""Tables of the README for encoders and motors in place of ideal ones."""
 TIMES = (
     "They took 8, 12 and 46 s of processor time for the three joints of `examples/arm.urdf`, and 8,"
     " 13 and 74 s for the six of ur5 (jax 0.10.2, a shared machine of two cores). The tuning"
@@ -538,8 +552,13 @@ def _readme_text(project: Project, name: str) -> str:
             "| `tune.toml` | gains, objective, requirements | the requirements |",
             "| `project.ipynb` | run and study in Python | |",
             "",
-            "Sensors and motors are ideal until `scenario.toml` has tables [sensor] and"
-            " [actuator]. `iblf-jax doctor` shows what is installed, and"
+            "Sensors and motors are ideal until `scenario.toml` has tables of them, such as",
+            "",
+            "```toml",
+            *DRIVES,
+            "```",
+            "",
+            "`iblf-jax doctor` shows what is installed, and"
             " `iblf-jax parameters scenario.toml` every number that can be changed.",
             "",
         ]

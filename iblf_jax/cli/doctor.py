@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib.metadata
 import os
 import platform
+import stat
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -165,6 +167,12 @@ def _caches() -> Iterator[Finding]:
 
 def _size_of(folder: Path) -> str:
     """A folder, the number of its files and their size."""
-    files = [x for x in folder.rglob("*") if x.is_file() and not x.is_symlink()]
-    size = sum(x.stat().st_size for x in files) / 2**20
-    return f"{folder}, {len(files)} files, {size:.0f} MiB; may be deleted"
+    sizes = []
+    for place, _, names in os.walk(folder):
+        for name in names:
+            # Another process may have removed a program since its name was read.
+            with contextlib.suppress(FileNotFoundError):
+                found = os.lstat(os.path.join(place, name))
+                if stat.S_ISREG(found.st_mode):
+                    sizes.append(found.st_size)
+    return f"{folder}, {len(sizes)} files, {sum(sizes) / 2**20:.0f} MiB; may be deleted"

@@ -188,6 +188,9 @@ def test_every_command_of_a_new_project_runs(command, monkeypatch, tmp_path, opt
     monkeypatch.chdir(folder)
     named = re.findall(r"iblf-jax ([^`#\n]+)", readme)
     assert [words.split()[0] for words in named[:4]] == ["simulate", "montecarlo", "tune", "export"]
+    drives = readme.split("```toml\n")[1].split("```")[0]
+    (folder / "lab.toml").write_text((folder / "scenario.toml").read_text() + drives)
+    assert isinstance(ij.load_scenario("lab.toml").actuator, ij.actuators.Motor)
     for words in named:
         code, out, _ = command(*words.split())
         assert code == 0, (words, out)
