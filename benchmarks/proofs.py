@@ -37,6 +37,8 @@ class Case(NamedTuple):
     uncertain: dict[str, Any]
     weight: float
     scenario: Callable[[], ij.Scenario]
+    limits: tuple[float, ...] | None = None
+    """Of the torque of each joint [N m]; None without limits."""
 
 
 def percent(path: str, width: float, *, shared: bool = False) -> dict[str, Any]:
@@ -140,6 +142,16 @@ CASES = [
         )
         for period in (0.5e-3, 1e-3)
     ],
+    *[
+        Case(
+            f"two links, torque limited to {first:g} and {second:g} N m", K2, kf, 1.0, "masses 1 %",
+            percent(MASSES, 1.0), w, two_links, (first, second),
+        )
+        for K2, kf, w, first, second in (
+            (3.0, 100.0, 3e-3, 42.0, 41.0),
+            (10.0, 200.0, 2e-3, 36.0, 64.0),
+        )
+    ],
     Case(
         "three links", 3.0, 100.0, 0.5, "all masses 1 %",
         percent(MASSES, 1.0, shared=True), 2e-3, three_links,
@@ -150,6 +162,9 @@ CASES = [
 def row(case: Case, boxes: int) -> list[Any]:
     gains = {"controller.K2": case.K2, "observer.kf": case.kf}
     scenario = ij.with_parameters(case.scenario(), gains)
+    if case.limits is not None:
+        law = ij.controllers.Saturated(scenario.controller, limit=list(case.limits))
+        scenario = dataclasses.replace(scenario, controller=law)
 
     def prove(most: int) -> ij.Proof:
         return ij.prove(
