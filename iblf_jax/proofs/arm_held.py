@@ -224,7 +224,7 @@ def rate_limits(parts: ArmParts, rows: jax.Array) -> PathRates:
     if parts.delay is None:
         return PathRates(*rows)
     *rates, growth = rows
-    return PathRates(*rates, growth=growth)
+    return PathRates(*rates)._replace(growth=growth)
 
 
 def innovation_gain(parts: ArmParts) -> jax.Array:
@@ -654,15 +654,15 @@ def held_terms(
     return [*with_powers(fresh, none, power), *with_powers(old, aging, power)]
 
 
-def with_powers(held: HeldTorque, *powers: Affine) -> list[HeldTorque]:
+def with_powers(rest: HeldTorque, *powers: Affine) -> list[HeldTorque]:
     """The terms with e2^T A D, for each choice of one of some powers for every joint."""
-    n = len(held.push)
+    n = len(rest.push)
     terms = []
     for chosen in itertools.product(powers, repeat=n):
-        value, push = held.power, held.push
+        value, push = rest.power, rest.push
         for i, power in enumerate(chosen):
             value, push = value + power.value[i], push + power.slope[i]
-        terms.append(HeldTorque(value, push, held.slope))
+        terms.append(HeldTorque(value, push, rest.slope))
     return terms
 
 
@@ -733,8 +733,8 @@ def held_bound(
         commands = torque.value + matvec(torque.slope, path.f_tilde)
         first = cut_differences(both.parts, commands)
     bounds = [
-        jnp.min(bounds_from(constants, point, losses, vertices, held))
-        for held in held_terms(both, places, point, at.z, path, limits, first)
+        jnp.min(bounds_from(constants, point, losses, vertices, terms))
+        for terms in held_terms(both, places, point, at.z, path, limits, first)
     ]
     # A box of which the path is not enclosed may have a narrower one inside.
     bound = functools.reduce(jnp.maximum, bounds)

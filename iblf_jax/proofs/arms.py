@@ -230,8 +230,8 @@ class SampledArmRate(OfStructure):
         found = []
         for D, L in [(zero, zero), *arm_held.differences_of_ages(at.parts, rates)]:
             # A limit cuts the command u + D of the sample.
-            held = D if limits is None else D + cut(u + D, limits)
-            found.append(addition(at, numbers.weight, held, L))
+            difference = D if limits is None else D + cut(u + D, limits)
+            found.append(addition(at, numbers.weight, difference, L))
         return infinite_unless_defined(rate + jnp.max(jnp.stack(found)), u)
 
 
@@ -432,7 +432,8 @@ def arm_problem(
         within = limits if parts.torque_limits is None else None
         torque = TorqueFunctions(ArmTorque(*of_structure), ArmTorqueExcess(*of_structure), within)
         bound: ArmBound | SampledArmBound | LimitedArmBound = ArmBound(*of_structure)
-        rate, held_torque = ArmRate(*of_structure), None
+        rate: ArmRate | SampledArmRate = ArmRate(*of_structure)
+        held_torque = None
         if parts.torque_limits is not None:
             bound = LimitedArmBound(*of_structure)
         if scenario.sampling is not None:
@@ -588,15 +589,15 @@ def _timing(scenario: Scenario, limits: np.ndarray | None, parts: ArmParts) -> l
         sizes = ", ".join(f"{size:.3g}" for size in np.asarray(error))
         readings = f"positions with errors of at most {sizes} rad, and exact velocities,"
         more = [ENCODERS]
-    held, start = HELD_TORQUE, STARTS_AT_SAMPLE
+    torque, start = HELD_TORQUE, STARTS_AT_SAMPLE
     if parts.delay is not None:
-        held, start = DELAYED_TORQUE, STARTS_WITH_DELAY
+        torque, start = DELAYED_TORQUE, STARTS_WITH_DELAY
     numbers = {
         "period": float(sampling.period),
         "delay": float(sampling.delay),
         "observer": sampling.observer,
     }
-    of_samples = held.format(readings=readings, **numbers)
+    of_samples = torque.format(readings=readings, **numbers)
     return [SAMPLED_REAL_NUMBERS, of_samples, f"{start} {BETWEEN_SAMPLES}", *more]
 
 

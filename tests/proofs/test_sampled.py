@@ -373,8 +373,8 @@ class Enclosures(OfStructure):
         of_path = arm_held.mean_rates(parts, error, rates, means)
         under = arm_held.rates_under(parts, error, rates, D, L)
         e2 = point.errors.e2
-        held = scaled(-jnp.ones(()), under.command), under.lag
-        added = arm_held.added_terms(numbers, e2, error, rates.mismatch, *held)
+        D_and_L = scaled(-jnp.ones(()), under.command), under.lag
+        added = arm_held.added_terms(numbers, e2, error, rates.mismatch, *D_and_L)
         outputs = [(path.at.xi, path.at.e2, path.f_tilde), means, of_path, under, added, on_set]
         outputs.append((first or no_error)[:2])
         given = arm_held.FirstDifferences(D, L, True)
