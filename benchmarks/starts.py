@@ -367,7 +367,6 @@ def tuning(problem: TuningProblem, z: np.ndarray, seed: int, effort: Effort) -> 
         "stopped": outcome.stopped,
         "unresolved": search.state.unresolved,
         "starts_near_best": int(search.state.valleys[2]),
-        "z": outcome.z.tolist(),
         "phases": phases,
     }
 

@@ -96,8 +96,8 @@ def _initialize(arguments: Arguments, *, batch: CompiledBatch) -> tuple[Carry, L
 def _all_steps(
     arguments: Arguments, carry: Carry, instants: jax.Array, *, batch: CompiledBatch
 ) -> Carry:
-    """The carry after all steps; the executor is told their number by `instants`, or by the request
-    if it must know it beforehand.
+    """The carry after all steps, whose number is `instants`, or that of the request for an executor
+    that compiles it in.
     """
     request = batch.request
     executor = registry.EXECUTORS[batch.backend]
@@ -105,7 +105,7 @@ def _all_steps(
     number: int | jax.Array = request.instants
     if executor.accepts_first_step:
         bytes_of_runs = (runs.runs or 1) * runs.dtype.itemsize
-        short = thresholds.uses_short_vector(bytes_of_runs, number)
+        short = thresholds.uses_short_vector(bytes_of_runs, request.instants)
         run_steps = kernel_stepper(executor, short_vector=short)
         number = instants
     return run_steps(TimeStep.of(request), runs, carry, number, None)[0]

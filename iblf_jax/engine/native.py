@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import jax
 
 from iblf_jax.core.devices import threads
@@ -32,7 +34,8 @@ def _kernel_build(
         a short vector; `runs` and `steps` decide if None.
     """
     if short_vector is None:
-        short_vector = thresholds.uses_short_vector(runs * program.dtype.itemsize, steps)
+        size = runs * program.dtype.itemsize
+        short_vector = thresholds.uses_short_vector(size, cast(int, steps))
     return Build(*thresholds.native_build(program.size, short_vector))
 
 

@@ -289,7 +289,11 @@ def _chosen_starts(
         if len(screening.points) > 1 or best.margin[0] > 0:
             return z
     first = jax.tree.map(lambda x: x[:1], screening.found)
-    return usable_starts(problem, seed, problem.box.z[None], first)
+    z = usable_starts(problem, seed, problem.box.z[None], first)
+    if comparison is not None:
+        # Its limit is that of the starts, also in a search that continues from a checkpoint.
+        comparison(z, values(problem, z).objective)
+    return z
 
 
 def _run(

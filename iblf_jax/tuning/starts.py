@@ -180,8 +180,9 @@ class StepComparison:
         """Whether points, (N, p), with these objectives, (N,), count, (N,)."""
         if not len(z):
             return np.ones(0, bool)
-        change = np.abs(self.at_quarter_step(z) - objective)
-        change /= np.maximum(1e-3, np.abs(objective))
+        fine = self.at_quarter_step(z)
+        with np.errstate(invalid="ignore"):  # runs may be invalid at both steps
+            change = np.abs(fine - objective) / np.maximum(1e-3, np.abs(objective))
         change[~np.isfinite(change)] = np.inf
         if np.isnan(self.largest_change):
             typical = STEP_FACTOR * float(np.median(change))
