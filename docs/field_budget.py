@@ -260,8 +260,11 @@ def task_in_words(name: str, result: dict[str, Any]) -> str:
         text += f" Constraints: {escaped('; '.join(result['constraints']))}."
     uncertain = ", ".join(f"`{path}`" for path in result["uncertain"])
     text += f" Uncertain parameters: {uncertain}." if uncertain else " None is uncertain."
+    left_out: dict[str, list[str]] = {}
     for law, reason in result["not_applicable"].items():
-        text += f" Not in the table: {escaped(law)}, {escaped(reason)}."
+        left_out.setdefault(escaped(reason), []).append(escaped(law))
+    for reason, laws in left_out.items():
+        text += f" Not in the table ({reason}): {'; '.join(laws)}."
     return f"{text} {REMARKS[name]}" if name in REMARKS else text
 
 
