@@ -364,7 +364,7 @@ def shown(result: Any) -> Shown:
     return Shown(name, _described(result), found, figures, scenario, on_card=len(found))
 
 
-@without_garbage_collection()  # which takes a tenth of the time of a layout
+@without_garbage_collection()  # the search takes a tenth of the time of a layout
 def _image(figure: Figure, dpi: int, words: str) -> str:
     """A figure as an HTML image."""
     picture = io.BytesIO()
