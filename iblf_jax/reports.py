@@ -383,7 +383,7 @@ def shown(result: Any) -> Shown:
     return KINDS.get(type(result).__name__, _other)(result)
 
 
-@without_garbage_collection()  # which takes a tenth of the time of a layout
+@without_garbage_collection()  # the search takes a tenth of the time of a layout
 def _image(figure: Figure, dpi: int, words: str) -> str:
     """A figure as an HTML image."""
     picture = io.BytesIO()
