@@ -142,16 +142,10 @@ CASES = [
         )
         for period in (0.5e-3, 1e-3)
     ],
-    *[
-        Case(
-            f"two links, torque limited to {first:g} and {second:g} N m", K2, kf, 1.0, "masses 1 %",
-            percent(MASSES, 1.0), w, two_links, (first, second),
-        )
-        for K2, kf, w, first, second in (
-            (3.0, 100.0, 3e-3, 42.0, 41.0),
-            (10.0, 200.0, 2e-3, 36.0, 64.0),
-        )
-    ],
+    Case(
+        "two links, torque limited to 42 and 41 N m", 3.0, 100.0, 1.0, "masses 1 %",
+        percent(MASSES, 1.0), 3e-3, two_links, (42.0, 41.0),
+    ),
     Case(
         "three links", 3.0, 100.0, 0.5, "all masses 1 %",
         percent(MASSES, 1.0, shared=True), 2e-3, three_links,
