@@ -79,7 +79,7 @@ def test_a_proof_says_what_it_proves_is_repeatable_and_nothing_contradicts_it():
 @pytest.mark.slow
 def test_points_refute_the_lyapunov_function_and_a_run_that_leaves_the_bounds_refutes_them():
     found = proof(K2=20.0, kf=20.0, percent=20.0)
-    assert found.verdict == Verdict.NOT_PROVED and found.seconds < 60.0
+    assert found.verdict == Verdict.NOT_PROVED
     assert len(found.growth_points) == len(found.rates) > 10
     assert all(point.rate > 0.0 for point in found.growth_points)
     assert "This refutes the Lyapunov function, not the bounds." in repr(found)
