@@ -98,7 +98,6 @@ LOOKS = (
     *("color", "facecolor", "edgecolor", "alpha", "zorder", "linewidth", "markersize", "sizes"),
     *("position", "fontsize", "rotation"),
 )
-"""What `get_` of lines, patches, areas or texts returns."""
 
 
 def looks(axes: Any) -> Iterator[Any]:
@@ -199,7 +198,6 @@ def of_runs() -> Iterator[str]:
 
 
 def of_messages() -> Iterator[str]:
-    """What is said of each flag of a run, whether the run has it or not."""
     run = stored("Rollout_1")
     values = run.metrics.values_by_name | {RADIUS: np.array(1.2), BOUND: np.array(0.1)}
     values |= {"first_level_violation_level": 3, "first_level_violation_component": 0}
