@@ -166,9 +166,8 @@ STARTS_AROUND = 8
 """Number of starts of the phase SEARCH_AROUND."""
 AROUND_SHARE = 1 / 8
 """Share of the starts that come within SAME_OBJECTIVE of the best objective below which this phase
-follows.  It takes a quarter of a search.  Of a sliding mode with one to three of 32 starts there it
-found the best known objective in three of six tunings, and nothing in three of nine gains that four
-to seven starts came near."""
+follows.  It takes a quarter of a search.  Below a third it would follow in most tunings of nine
+gains, where four to seven of 32 starts came near and it changed nothing in three."""
 MOST_AROUND = 3
 """Largest number of phases that begin at points around the incumbent."""
 MOST_COMPARED = 32
