@@ -88,8 +88,8 @@ def array_function(name: str) -> str:
       ToolchainError: no compiler, or an error from it.
     """
     definitions = ["#define RECORDED 0", "#define RECORDED_SIZES {0}"]
-    headers = map(header, ("frame.h", "leaves.h", "products.h"))
-    library, key = built("\n".join([*definitions, *headers]))
+    own = "products.h" if name == "multiply" else "leaves.h"
+    library, key = built("\n".join([*definitions, header("frame.h"), header(own)]))
     return register(f"iblf_jax_{name}_{key}", library, f"iblf_jax_{name}", "cpu")
 
 
