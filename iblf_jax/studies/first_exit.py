@@ -95,8 +95,8 @@ def _recorded_times(study: Study, joint: int | str | None) -> np.ndarray:
     metric = "Margin"
     if joint is not None:
         names = plants.component_names(study.scenario.plant)
-        if joint in names:
-            joint = names.index(str(joint))
+        if isinstance(joint, str) and joint in names:
+            joint = names.index(joint)
         joint = checks.entry("joint", joint, study.scenario.n, "joints")
         name = "first_exit_time"
         metric = "FirstExit"

@@ -198,7 +198,7 @@ REFUSED_LOOPS = {
     "controller.barrier": with_law(barrier=ij.barriers.StateBarrier(), o=None),
     "observer": with_parts(observer=ij.observers.NoObserver()),
     "actuator": with_parts(actuator=MOTOR),
-    "sampling.delay": with_parts(sampling=ij.Sampling(period=1e-3, delay=1e-3)),
+    "sampling.delay": with_parts(sampling=ij.Sampling(period=1e-3, delay=2e-3)),
     "jump_times": with_parts(disturbance=ij.disturbances.Step(1.0, 2.0)),
     "model": with_parts(model=OTHER_ARM),
     "duration": with_parts(reference=ij.references.Quintic(0.4, 0.6, 2.0)),
