@@ -37,6 +37,8 @@ class Case(NamedTuple):
     uncertain: dict[str, Any]
     weight: float
     scenario: Callable[[], ij.Scenario]
+    limits: tuple[float, ...] | None = None
+    """Of the torque of each joint [N m]; None without limits."""
 
 
 def percent(path: str, width: float, *, shared: bool = False) -> dict[str, Any]:
@@ -141,6 +143,10 @@ CASES = [
         for period in (0.5e-3, 1e-3)
     ],
     Case(
+        "two links, torque limited to 42 and 41 N m", 3.0, 100.0, 1.0, "masses 1 %",
+        percent(MASSES, 1.0), 3e-3, two_links, (42.0, 41.0),
+    ),
+    Case(
         "three links", 3.0, 100.0, 0.5, "all masses 1 %",
         percent(MASSES, 1.0, shared=True), 2e-3, three_links,
     ),
@@ -150,6 +156,9 @@ CASES = [
 def row(case: Case, boxes: int) -> list[Any]:
     gains = {"controller.K2": case.K2, "observer.kf": case.kf}
     scenario = ij.with_parameters(case.scenario(), gains)
+    if case.limits is not None:
+        law = ij.controllers.Saturated(scenario.controller, limit=list(case.limits))
+        scenario = dataclasses.replace(scenario, controller=law)
 
     def prove(most: int) -> ij.Proof:
         return ij.prove(

@@ -52,6 +52,7 @@ PAGES: dict[str, tuple[str, str]] = {
         (
             "prove Proof largest_level largest_parameters largest_period gains_for_guarantee"
             " GuaranteedGains proofs.Verdict proofs.GrowthPoint proofs.GuaranteedTube"
+            " proofs.DelayedStart"
         ),
     ),
     "tuning": (

@@ -16,6 +16,7 @@ from iblf_jax.proofs.largest import largest_level as largest_level
 from iblf_jax.proofs.largest import largest_parameters as largest_parameters
 from iblf_jax.proofs.largest import largest_period as largest_period
 from iblf_jax.proofs.proposal import LevelChoice as LevelChoice
+from iblf_jax.proofs.result import DelayedStart as DelayedStart
 from iblf_jax.proofs.result import GrowthPoint as GrowthPoint
 from iblf_jax.proofs.result import GuaranteedTube as GuaranteedTube
 from iblf_jax.proofs.result import Proof as Proof

@@ -13,7 +13,8 @@ V_w = V with the weight w of the estimation error.  Four steps answer:
    where no proof is found that the torque is within the limits, steps 1 and 2 are repeated for the
    loop whose limits are active.
 4. Without a proof, runs start at the points with the largest V_w': one that violates the bounds
-   refutes the statement, and of a sampled loop one with V_w > level at a sample.
+   refutes the statement, and of a sampled loop one with V_w > level at a sample.  A loop with a
+   delay has no such runs.
 """
 
 from __future__ import annotations
@@ -44,7 +45,14 @@ from iblf_jax.proofs.periods import AperiodicError
 from iblf_jax.proofs.points import PARENTS, Sampled, sample_weights
 from iblf_jax.proofs.problem import LevelSetProblem
 from iblf_jax.proofs.proposal import LevelChoice, Proposal, Start, proposed_level, start_of
-from iblf_jax.proofs.result import GrowthPoint, Proof, Verdict, Violation, WorstBox
+from iblf_jax.proofs.result import (
+    GrowthPoint,
+    Proof,
+    Verdict,
+    Violation,
+    WorstBox,
+    starts_below_the_level,
+)
 from iblf_jax.proofs.sampled_values import sampled_values
 from iblf_jax.proofs.search import SearchedBox, SearchResult, search
 from iblf_jax.proofs.support import step_within
@@ -106,10 +114,11 @@ def prove(
     Args:
       scenario: the loop of a robot with the corrected backstepping law and the momentum observer,
         whose torque may have limits (`Saturated`, `Motor`; those of `Saturated` without an
-        auxiliary state may be active in a continuous loop), or of a plant in strict-feedback form
+        auxiliary state may be active), or of a plant in strict-feedback form
         of order 2 or 3 with one number per level and the law `BarrierBackstepping`.  The loop of a
-        robot may be sampled, without delay, with exact measurements or positions rounded to counts
-        of an `Encoder`; the statement then is about all times, also between samples.
+        robot may be sampled, with exact measurements and delays up to a period, or with positions
+        rounded to counts of an `Encoder`; the statement then is about all times, also between
+        samples, and with a delay about the starts of `Proof.start`.
       level: level c of V_w, in its unit, N m rad for robots. If not given, for a robot half of the
         greatest level at which no point with V_w' > 0 was found, or the least level whose set
         contains the start if that is more; `Proof.level_choice` has both. `largest_level` searches
@@ -193,6 +202,9 @@ def _chosen_level(
     problem: LevelSetProblem, weights: Sequence[float], options: _Options
 ) -> tuple[Start, Proposal]:
     """A level whose set contains the start of a robot's scenario."""
+    if starts_below_the_level(problem.scenario):
+        remedy = "A start must be below the level, by what V_w may grow before the first command."
+        raise checks.fail("level", None, "a level of V_w with a delay", remedy)
     if not isinstance(problem, ArmProblem):
         expected = "a level of V_w, such as level=0.5 [the unit of V_w]"
         remedy = (
@@ -451,7 +463,9 @@ def _rate_searched(
     constants = problem.constants(weight, level)
     searched = functools.partial(_searched, problem, options)
     if problem.held_torque is not None:
-        limits, result = proved_rates(problem, constants, searched, options.max_boxes, options.seed)
+        limits, result = proved_rates(
+            problem, weight, level, searched, options.max_boxes, options.seed
+        )
         if limits is None:
             return _RateSearch(result, constants, is_of_held_rates=True)
         constants = [*constants, limits]
@@ -499,13 +513,14 @@ def _searched(
 def _of_search(problem: LevelSetProblem, found: _RateSearch, seed: int) -> dict[str, Any]:
     """The fields of a `Proof` that describe its search."""
     result, constants = found.result, found.constants
-    if found.is_of_held_rates:
-        return {"boxes": result.boxes}
-    fields: dict[str, Any] = {"boxes": result.boxes, "done": result.done}
-    if problem.held_torque is not None:
-        fields["held_rates"] = constants[-1]
+    fields: dict[str, Any] = {"boxes": result.boxes}
     if result.expected is not None:
         fields["expected_boxes"] = tuple(result.expected)
+    if found.is_of_held_rates:
+        return fields
+    fields["done"] = result.done
+    if problem.held_torque is not None:
+        fields["held_rates"] = constants[-1]
     if result.worst is not None:
         fields["worst_box"] = _worst_box(problem, constants, result.worst)
     if result.proved:
@@ -545,8 +560,10 @@ def _refuted(
     Runs start at the points with the largest V_w' that were found, or, if a part of the scenario
     cannot be moved in time, at t = 0 with the other coordinates of these points.  The time step is
     reduced until the run is accurate; a run that is not accurate with the smallest one refutes
-    nothing.
+    nothing.  The statement of a loop with a delay is not about starts on the level.
     """
+    if starts_below_the_level(problem.scenario):
+        return None
     constants = problem.constants(sampled.weight, level)
     for point in sampled.points[:runs]:
         try:

@@ -50,16 +50,46 @@ where d is the difference between the measured state and the true one.  D and L 
 D_0 and L_0, which are enclosed by the mean value theorem over a box of the path and of what may be
 measured on it; |D_0| <= E_u and |L_0| <= E_L on the whole set, and the bounds of D and L in the
 section above are h R_u + E_u and h R_L + E_L.
+
+**Active limits.**  A sample commands tau_k = sat(u), and the observer receives it: (H.2) and (H.3)
+hold with D_0 = sat(u) - u at the sample and L_0 = 0, which are enclosed as those of (H.5).  The
+term e2^T A D is treated as in `arm_limits`: with c = A^T e2 and the P of (T.2), at any age
+
+    c_i D_i <= max(-s c_i u_i', P_i),                                                         (H.6)
+
+where P_i is that of u(X) at the age s, because a limit that cuts the command leaves D_i = limit -
+u_i.  Each choice of one of both for every joint is affine in f_tilde and in s.
+
+**Delays.**  Commands arrive in their order, each after a delay in [0, d], d <= h, which may differ
+from sample to sample.  The active torque tau_a is that of the last sample or of the one before it,
+and the observer has that of the last sample.  (H.2) and (H.3) hold with D = tau_a - u and L = n -
+n_k + phi - phi_k + tau_a - tau_k.  If the command of the last sample has not arrived,
+
+    D = -(s + h) u',   L = D + s (u_h' + n'),   0 <= s <= d,                                  (H.7)
+
+with means over the path since either sample, because L - D = u_h + n - (u_h + n)_k.  Otherwise
+(H.4) holds.  So V_w' is bounded at s = 0 and s = d of (H.7) as well.  The path is one of the length
+h + d, and the bounds of the section above are |D| <= (h + d) R_u and |L| <= h R_L + h R_u.
+
+Until the first command arrives, the torque is a foreign one.  If it differs from u at the start by
+at most h R_u, these bounds hold from the start on, because then |D| <= (h + s) R_u at any time s <=
+d, and |L| <= s R_L + h R_u.  With a bound V_w' <= R_V on the whole set for all such D and L, a run
+that starts with V_w <= c - d R_V has V_w <= c when the first command arrives.  At an exit after it,
+both samples are at or after the start, the path since them lies in {V_w <= c} with these bounds,
+and V_w' < 0.
 """
 
 from __future__ import annotations
 
 import copy
+import functools
+import itertools
 from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
 
+from iblf_jax.core import checks
 from iblf_jax.core.linalg import inner, matmul, matvec
 from iblf_jax.kernels import hull, lower, meet, upper, with_sign
 from iblf_jax.proofs import arm_motion
@@ -69,6 +99,7 @@ from iblf_jax.proofs.arm_bound import (
     Constants,
     Coordinates,
     HeldTorque,
+    add,
     arm_errors,
     bounds_from,
     coordinates,
@@ -79,9 +110,11 @@ from iblf_jax.proofs.arm_bound import (
     is_inside_guard,
     mass_along,
     mismatch,
+    scaled,
     with_plant,
 )
-from iblf_jax.proofs.arm_motion import ArmParts, Errors, Kinematics, position, velocity
+from iblf_jax.proofs.arm_motion import ArmParts, Errors, kinematics, position, velocity
+from iblf_jax.proofs.arm_torque import cut, law_torque, power_of_cut, values_of
 from iblf_jax.proofs.forms import along
 from iblf_jax.proofs.matrices import norm, solve_general
 from iblf_jax.proofs.uncertainty import Places
@@ -107,13 +140,18 @@ class PathRates(NamedTuple):
     mismatch: jax.Array
     """R_f."""
     first_command: jax.Array | None = None
-    """E_u; None for exact measurements."""
+    """E_u; None for exact measurements without active limits."""
     first_lag: jax.Array | None = None
     """E_L."""
+    growth: jax.Array | None = None
+    """R_V for each joint, equal entries [N m rad/s]; None without a delay."""
 
-    def differences(self, h: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """D and L at all ages up to the period h."""
-        D, L = h * self.command, h * self.lag
+    def differences(self, parts: ArmParts) -> tuple[jax.Array, jax.Array]:
+        """D and L at all ages."""
+        h = period(parts)
+        D, L = oldest_age(parts) * self.command, h * self.lag
+        if parts.delay is not None:
+            L = L + h * self.command
         if self.first_command is not None and self.first_lag is not None:
             D, L = D + self.first_command, L + self.first_lag
         return symmetric(D), symmetric(L)
@@ -176,6 +214,19 @@ def period(parts: ArmParts) -> jax.Array:
     return parts.period
 
 
+def oldest_age(parts: ArmParts) -> jax.Array:
+    """The greatest age of an active torque, h + d, () [s]."""
+    return period(parts) if parts.delay is None else period(parts) + parts.delay
+
+
+def rate_limits(parts: ArmParts, rows: jax.Array) -> PathRates:
+    """The bounds in the rows of the last constant of a problem."""
+    if parts.delay is None:
+        return PathRates(*rows)
+    *rates, growth = rows
+    return PathRates(*rates)._replace(growth=growth)
+
+
 def innovation_gain(parts: ArmParts) -> jax.Array:
     """The gain g, (n,) [1/s]."""
     return parts.kf if parts.innovation_gain is None else parts.innovation_gain
@@ -202,12 +253,6 @@ def momentum_term(parts: ArmParts, at: Errors) -> jax.Array:
 def momentum_rate(parts: ArmParts, at: Errors) -> jax.Array:
     """The rate u_h + n of the momentum M0 v at f_tilde = 0 and D = 0, (n,) [N m]."""
     return free_torque(parts, at) + momentum_term(parts, at)
-
-
-def kinematics(parts: ArmParts, at: Errors, f_tilde: jax.Array) -> Kinematics:
-    """The motion under the law's torque."""
-    a = arm_motion.alpha_rate(parts, at) + arm_motion.velocity_error_rate(parts, at, f_tilde)
-    return Kinematics(at.t, position(parts, at), velocity(parts, at), a)
 
 
 def path_rates(parts: ArmParts, at: Errors, f_tilde: jax.Array, push: jax.Array | float) -> Errors:
@@ -334,11 +379,13 @@ class Path(NamedTuple):
 def _path(
     constants: Constants, places: Places, point: ArmErrors, z: jax.Array, limits: PathRates
 ) -> Path:
-    """The box of a path backward from `point`, up to the period; see the head of this module."""
+    """The box of a path backward from `point`, up to the greatest age; see the head of this
+    module.
+    """
     parts = constants.parts
-    h, g, at = period(parts), parts.kf, point.errors
+    h, g, at = oldest_age(parts), parts.kf, point.errors
     sign = cast(TwoSided, parts.law.barrier).sign
-    D, L = limits.differences(h)
+    D, L = limits.differences(parts)
 
     # u_h + n = u + phi + n changes along the path as u and L do.
     p_rate = momentum_rate(parts, at) + symmetric(h * (limits.command + limits.lag))
@@ -387,10 +434,21 @@ def _path(
     return Path(found, f_tilde, is_enclosed)
 
 
+class AgingRates(NamedTuple):
+    """Rates along the path as functions of f_tilde."""
+
+    command: Affine
+    """u' [N m/s]."""
+    lag: Affine
+    """n' + phi', which is L' between samples without a delay."""
+    p_rate: Affine
+    """u_h' + n'."""
+
+
 def rates_under(
     parts: ArmParts, error: MassError, rates: FirstRates, D: jax.Array, L: jax.Array
-) -> tuple[Affine, Affine]:
-    """The rates of u and L under differences D and L, as functions of f_tilde."""
+) -> AgingRates:
+    """The rates under differences D and L."""
     AD = matvec(error.ratio, D)
     push, estimate = matvec(error.inverse, AD), estimate_rate(parts, error, rates.p_rate, AD, L)
 
@@ -400,9 +458,10 @@ def rates_under(
 
     command, momentum = under(rates.torque), under(rates.momentum)
     decay = jnp.diag(parts.kf)
-    return (
+    return AgingRates(
         Affine(command.value - estimate, command.slope - decay),
         Affine(momentum.value + estimate, momentum.slope + decay),
+        add(command, momentum),
     )
 
 
@@ -439,6 +498,16 @@ class FirstDifferences(NamedTuple):
     """L_0."""
     is_inside: jax.Array | bool
     """Whether no guard of the barrier is active at what is measured, ()."""
+    commands: jax.Array | None = None
+    """u of samples, (n,) [N m], where limits may be active."""
+
+
+def cut_differences(parts: ArmParts, commands: jax.Array) -> FirstDifferences:
+    """D_0 of commands that limits cut; L_0 is 0."""
+    limits = parts.torque_limits
+    assert limits is not None
+    D = cut(commands, limits)
+    return FirstDifferences(D, jnp.zeros_like(D), is_inside=True, commands=commands)
 
 
 def first_sizes(parts: ArmParts, at: Errors) -> tuple[jax.Array, jax.Array]:
@@ -503,20 +572,22 @@ def path_means(
     limits: PathRates,
     first: FirstDifferences | None = None,
 ) -> PathMeans:
-    """The means over a path of any age up to the period."""
-    h, g = period(parts), parts.kf
-    D, L = limits.differences(h)
-    # The rates on the path, within the bounds on the whole set.
-    u_rate, L_rate = (
-        meet(rate.value + matvec(rate.slope, path.f_tilde), symmetric(limit))
-        for rate, limit in zip(
-            rates_under(parts, error, rates, D, L), (limits.command, limits.lag), strict=True
-        )
-    )
+    """The means over a path of any age."""
+    h, g = oldest_age(parts), parts.kf
+    D, L = limits.differences(parts)
     change = change_of_f_tilde(parts, error, rates.p_rate, limits, D, L)
     # The mean of a difference that grows from 0 on at such a rate has half of the age.
     half = up_to(0.5 * h)
     rest = half * (g * (up_to(h) * (g * path.f_tilde - change)) - change)
+    if parts.delay is not None:
+        # On the path, commands are active that are older than it.
+        return PathMeans(D, L, 1.0 + half * g, rest)
+    # The rates on the path, within the bounds on the whole set.
+    under = rates_under(parts, error, rates, D, L)
+    u_rate, L_rate = (
+        meet(rate.value + matvec(rate.slope, path.f_tilde), symmetric(limit))
+        for rate, limit in ((under.command, limits.command), (under.lag, limits.lag))
+    )
     mean_D, mean_L = -half * u_rate, half * L_rate
     if first is not None:
         mean_D, mean_L = first.D + mean_D, first.L + mean_L
@@ -525,14 +596,13 @@ def path_means(
 
 def mean_rates(
     parts: ArmParts, error: MassError, rates: FirstRates, means: PathMeans
-) -> tuple[Affine, Affine]:
-    """The means of u' and L' over the path, as functions of f_tilde at its end, (H.4)."""
+) -> AgingRates:
+    """The means of the rates over the path, as functions of f_tilde at its end."""
 
     def over_path(rate: Affine) -> Affine:
         return Affine(rate.value + matvec(rate.slope, means.rest), rate.slope * means.growth)
 
-    command, lag = rates_under(parts, error, rates, means.D, means.L)
-    return over_path(command), over_path(lag)
+    return AgingRates(*map(over_path, rates_under(parts, error, rates, means.D, means.L)))
 
 
 def held_terms(
@@ -543,18 +613,57 @@ def held_terms(
     path: Path,
     limits: PathRates,
     first: FirstDifferences | None,
-) -> tuple[HeldTorque | None, HeldTorque]:
-    """What the held torque adds at the ages 0 and h."""
+) -> list[HeldTorque | None]:
+    """What the held torque adds at the ages between which V_w' is affine, and with limits for each
+    choice of (H.6).
+    """
     parts, e2 = constants.parts, point.errors.e2
+    limits_of_torque = parts.torque_limits
     error = mass_error(constants, places, path.at, z)
     rates = first_rates(constants, places, path.at, z)
     means = path_means(parts, path, error, rates, limits, first)
-    command, lag = mean_rates(parts, error, rates, means)
-    added = added_terms(constants, e2, error, rates.mismatch, command, lag)
+    mean = mean_rates(parts, error, rates, means)
+    h = period(parts)
+    # The choices add e2^T A D.
+    in_sum = e2 if limits_of_torque is None else jnp.zeros_like(e2)
+
+    def added(D: Affine, L: Affine) -> HeldTorque:
+        return added_terms(constants, in_sum, error, rates.mismatch, D, L)
+
+    aged = scaled(-h, mean.command)
+    old = added(aged, scaled(h, mean.lag))
+    if parts.delay is not None:
+        late = scaled(-oldest_age(parts), mean.command)
+        return [
+            None,
+            old,
+            added(aged, aged),
+            added(late, add(late, scaled(parts.delay, mean.p_rate))),
+        ]
     if first is None:
-        return None, added
-    fresh = first_terms(constants, e2, error, rates.mismatch, first)
-    return fresh, HeldTorque(fresh.power + added.power, fresh.push + added.push, added.slope)
+        return [None, old]
+    fresh = first_terms(constants, in_sum, error, rates.mismatch, first)
+    old = HeldTorque(fresh.power + old.power, fresh.push + old.push, old.slope)
+    if limits_of_torque is None:
+        return [fresh, old]
+    c = matvec(error.ratio.T, e2)
+    torque = law_torque(constants, places, point.errors, z)
+    power = power_of_cut(c, torque, checks.given(first.commands), limits_of_torque)
+    none = Affine(jnp.zeros_like(e2), jnp.zeros_like(error.ratio))
+    aging = Affine(c * aged.value, c[:, None] * aged.slope)
+    return [*with_powers(fresh, none, power), *with_powers(old, aging, power)]
+
+
+def with_powers(rest: HeldTorque, *powers: Affine) -> list[HeldTorque]:
+    """The terms with e2^T A D, for each choice of one of some powers for every joint."""
+    n = len(rest.push)
+    terms = []
+    for chosen in itertools.product(powers, repeat=n):
+        value, push = rest.power, rest.push
+        for i, power in enumerate(chosen):
+            value, push = value + power.value[i], push + power.slope[i]
+        terms.append(HeldTorque(value, push, rest.slope))
+    return terms
 
 
 def weight_of_command(parts: ArmParts, error: MassError, F: jax.Array) -> jax.Array:
@@ -578,25 +687,19 @@ def first_terms(
 
 
 def added_terms(
-    constants: Constants,
-    e2: jax.Array,
-    error: MassError,
-    F: jax.Array,
-    command: Affine,
-    lag: Affine,
+    constants: Constants, e2: jax.Array, error: MassError, F: jax.Array, D: Affine, L: Affine
 ) -> HeldTorque:
-    """The terms of (H.3) with D = -h u' and L = h L', for means u' (`command`) and L' (`lag`)."""
-    parts, weight = constants.parts, constants.weight
-    h, g = period(parts), innovation_gain(parts)
+    """The terms of (H.3) with D and L."""
+    weight, g = constants.weight, innovation_gain(constants.parts)
     K, A = error.relative, error.ratio
-    G = weight_of_command(parts, error, F)
-    # A D and the bracket of (H.3), in parts of -h.
-    value = command.value - matvec(K, matvec(A, command.value))
-    slope = matmul(A, command.slope)
-    inside = matvec(G, value) + g * lag.value
-    of_f_tilde = matmul(G, slope) + g[:, None] * lag.slope
+    G = weight_of_command(constants.parts, error, F)
+    # A D and the bracket of (H.3).
+    value = D.value - matvec(K, matvec(A, D.value))
+    slope = matmul(A, D.slope)
+    inside = matvec(G, value) - g * L.value
+    of_f_tilde = matmul(G, slope) - g[:, None] * L.slope
     push = matvec(slope.T, e2) + weight * matvec(A, inside)
-    return HeldTorque(-h * inner(e2, value), -h * push, -h * matmul(A, of_f_tilde))
+    return HeldTorque(inner(e2, value), push, matmul(A, of_f_tilde))
 
 
 def bias(constants: Constants, places: Places, at: Errors, z: jax.Array) -> jax.Array:
@@ -622,12 +725,20 @@ def held_bound(
     losses = dissipation_bound(constants, point)
     both = constants._replace(parts=two_sided(constants.parts, at.sign))
     path = _path(both, places, point, at.z, limits)
-    first = None if both.parts.measurement_error is None else first_differences(both.parts, path.at)
-    at_sample, held_torque = held_terms(both, places, point, at.z, path, limits, first)
-    fresh = jnp.min(bounds_from(constants, point, losses, vertices, at_sample))
-    old = jnp.min(bounds_from(constants, point, losses, vertices, held_torque))
+    first = None
+    if both.parts.measurement_error is not None:
+        first = first_differences(both.parts, path.at)
+    elif both.parts.torque_limits is not None:
+        torque = law_torque(both, places, path.at, at.z)
+        commands = torque.value + matvec(torque.slope, path.f_tilde)
+        first = cut_differences(both.parts, commands)
+    bounds = [
+        jnp.min(bounds_from(constants, point, losses, vertices, terms))
+        for terms in held_terms(both, places, point, at.z, path, limits, first)
+    ]
     # A box of which the path is not enclosed may have a narrower one inside.
-    bound = jnp.where(path.is_enclosed, jnp.maximum(fresh, old), hull(jnp.inf, -LARGE))
+    bound = functools.reduce(jnp.maximum, bounds)
+    bound = jnp.where(path.is_enclosed, bound, hull(jnp.inf, -LARGE))
     if first is not None:
         bound = jnp.where(first.is_inside, bound, hull(jnp.inf, -LARGE))
     return jnp.where(is_inside_guard(constants, point), bound, jnp.inf)[None]
@@ -650,24 +761,45 @@ def rate_excess(places: Places, x: jax.Array, constants: Constants, limits: Path
         for rate in found
     ]
     is_inside = is_inside_guard(constants, point)
+    first = None
     if constants.parts.measurement_error is not None:
         first = first_differences(two_sided(constants.parts, at.sign), point.errors)
+    elif constants.parts.torque_limits is not None:
+        torque = law_torque(constants, places, point.errors, at.z)
+        first = cut_differences(constants.parts, values_of(torque, point.b))
+    if first is not None:
         sizes += [jnp.abs(first.D), jnp.abs(first.L)]
         is_inside = is_inside & first.is_inside
+    if limits.growth is not None:
+        sizes.append(growth_bound(constants, places, point, at.z, limits) * jnp.ones(n))
     given = [limit for limit in limits if limit is not None]
     excess = jnp.max(jnp.stack([s / most for s, most in zip(sizes, given, strict=True)]))
     return jnp.where(is_inside, excess - 1.0, jnp.inf)[None]
 
 
+def growth_bound(
+    constants: Constants, places: Places, point: ArmErrors, z: jax.Array, limits: PathRates
+) -> jax.Array:
+    """An upper bound of V_w' for all D, L and f' within their bounds, () [N m rad/s]."""
+    parts, at, b, weight = constants.parts, point.errors, point.b, constants.weight
+    error = mass_error(constants, places, at, z)
+    D, L = limits.differences(parts)
+    AD = matvec(error.ratio, D)
+    # f_tilde' + (g + r) f_tilde
+    change = change_of_f_tilde(parts, error, momentum_rate(parts, at), limits, D, L)
+    drive = inner(at.e2, AD - parts.law.K2 * at.e2) + b * norm(at.e2 + weight * change)
+    return drive - dissipation_bound(constants, point) - weight * jnp.min(parts.kf) * b**2
+
+
 def _rates(
     constants: Constants, places: Places, point: ArmErrors, at: Coordinates, limits: PathRates
 ) -> list[Affine]:
-    """The rates of u, L and f as functions of f_tilde."""
+    """u', n' + phi' and f' as functions of f_tilde."""
     parts, errors = constants.parts, point.errors
     n = errors.xi.shape[-1]
     inside, directions, sizes = differences(constants, places, at.z)
     error = mass_error(constants, places, errors, at.z)
-    D, L = limits.differences(period(parts))
+    D, L = limits.differences(parts)
     AD = matvec(error.ratio, D)
     push = matvec(error.inverse, AD)
     lagging = estimate_rate(parts, error, momentum_rate(parts, errors), AD, L)
@@ -722,9 +854,29 @@ def mass_ratio(parts: ArmParts, at: Errors, vector: jax.Array) -> jax.Array:
     return matvec(M0, jnp.linalg.solve(M, vector))
 
 
-def rates_at(parts: ArmParts, at: Errors, f_tilde: jax.Array) -> HeldRates:
-    """The rates of u, L and f at the age 0, of the true plant in `parts`."""
+def differences_of_ages(parts: ArmParts, rates: HeldRates) -> list[tuple[jax.Array, jax.Array]]:
+    """D and L to first order at the ages between which V_w' is affine, but for those of 0."""
+    h = period(parts)
+    aged = -h * rates.command
+    found = [(aged, h * rates.lag)]
+    if parts.delay is None:
+        return found
+    late = -oldest_age(parts) * rates.command
+    return [*found, (aged, aged), (late, late + parts.delay * (rates.command + rates.lag))]
+
+
+def rates_at(
+    parts: ArmParts, at: Errors, f_tilde: jax.Array, D: jax.Array | None = None
+) -> HeldRates:
+    """The rates of u, L and f at the age 0, of the true plant in `parts`; with a D there, that of f
+    is an estimate.
+    """
     step, bias = arm_motion.rates_of_errors(parts, at, f_tilde), biased_rate(parts, at)
+    if D is not None:
+        AD, g = mass_ratio(parts, at, D), innovation_gain(parts)
+        push = matvec(arm_motion.inverse_mass(parts, at), AD)
+        step = step._replace(e2=step.e2 + push)
+        bias = bias + g * (AD - D) + (parts.kf - g) * AD
     estimate = parts.kf * f_tilde + bias
     torque = along(lambda at: free_torque(parts, at), (at,), (step,))
     momentum = along(lambda at: momentum_term(parts, at), (at,), (step,))

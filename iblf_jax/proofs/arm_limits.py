@@ -16,16 +16,13 @@ f_tilde that raises the torque beyond its limit is not the one that raises e2.
 from __future__ import annotations
 
 import functools
-import itertools
 
 import jax
 import jax.numpy as jnp
 
 from iblf_jax.core.linalg import matvec
 from iblf_jax.proofs.arm_bound import (
-    Affine,
     Constants,
-    HeldTorque,
     arm_errors,
     bounds_from,
     coordinates,
@@ -34,8 +31,14 @@ from iblf_jax.proofs.arm_bound import (
     is_inside_guard,
     mismatch,
 )
-from iblf_jax.proofs.arm_held import FirstDifferences, first_terms, mass_error, mismatch_slope
-from iblf_jax.proofs.arm_torque import cut, law_torque, power_of_cut, values_of
+from iblf_jax.proofs.arm_held import (
+    cut_differences,
+    first_terms,
+    mass_error,
+    mismatch_slope,
+    with_powers,
+)
+from iblf_jax.proofs.arm_torque import law_torque, power_of_cut, values_of
 from iblf_jax.proofs.uncertainty import Places
 
 
@@ -52,29 +55,16 @@ def limited_bound(places: Places, n: int, x: jax.Array, constants: Constants) ->
     losses = dissipation_bound(constants, point)
     error = mass_error(constants, places, point.errors, at.z)
     F = mismatch_slope(constants, places, point.errors, at.z)
-    torque = law_torque(constants, places, point, at.z)
-    values = values_of(torque, point.b)
-    D = FirstDifferences(cut(values, limits), jnp.zeros(n), is_inside=True)
-    of_errors = first_terms(constants, e2, error, F, D)
-    power = power_of_cut(matvec(error.ratio.T, e2), torque, values, limits)
-    bounds = []
-    for value, push in sums_over_sets(power):
-        added = HeldTorque(value, of_errors.push + push, of_errors.slope)
-        bounds.append(jnp.min(bounds_from(constants, point, losses, vertices, added)))
+    torque = law_torque(constants, places, point.errors, at.z)
+    commands = values_of(torque, point.b)
+    first = cut_differences(constants.parts, commands)
+    # e2^T A D is that of the powers.
+    of_errors = first_terms(constants, jnp.zeros_like(e2), error, F, first)
+    power = power_of_cut(matvec(error.ratio.T, e2), torque, commands, limits)
+    none = jax.tree.map(jnp.zeros_like, power)
+    bounds = [
+        jnp.min(bounds_from(constants, point, losses, vertices, added))
+        for added in with_powers(of_errors, none, power)
+    ]
     bound = functools.reduce(jnp.maximum, bounds)
     return jnp.where(is_inside_guard(constants, point), bound, jnp.inf)[None]
-
-
-def sums_over_sets(power: Affine) -> list[tuple[jax.Array, jax.Array]]:
-    """The sum of P_i of (T.2) over each set of joints: its value at f_tilde = 0, () [N m rad/s],
-    and its derivative, (n,) [rad/s].
-    """
-    n = power.slope.shape[-1]
-    sums = []
-    for chosen in itertools.product((False, True), repeat=n):
-        value, push = jnp.zeros(()), jnp.zeros(n)
-        for i in range(n):
-            if chosen[i]:
-                value, push = value + power.value[i], push + power.slope[i]
-        sums.append((value, push))
-    return sums

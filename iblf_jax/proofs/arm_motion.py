@@ -73,9 +73,13 @@ class ArmParts(NamedTuple):
     in a period, (n,) [1/s]; None where it is kf."""
     measurement_error: jax.Array | None = None
     """Bound of the errors of the positions that samples read, (n,) [rad]; None for exact ones."""
+    delay: jax.Array | None = None
+    """The longest delay of a command, () [s]; None without one."""
     torque_limits: jax.Array | None = None
     """Least and greatest torque, (2, n) [N m], where a torque of the law may be beyond them; None
     where none is."""
+    is_at_numbers: bool | None = None
+    """True in functions of points, which need no enclosures; None in those of boxes."""
 
 
 class Errors(NamedTuple):
@@ -117,6 +121,9 @@ def course(parts: ArmParts, t: jax.Array) -> Course:
         lower, upper = parts.bounds.lower.at(t, q_d), parts.bounds.upper.at(t, q_d)
         return Course(q_d, q_d - lower, upper - q_d)
 
+    if parts.is_at_numbers:
+        # Most of the time that the program takes to compile is that of the enclosures.
+        return at(t)
     return enclosed(at, smoothness(parts.reference, parts.bounds))(t)
 
 
@@ -255,6 +262,12 @@ def rates_of_errors(parts: ArmParts, at: Errors, f_tilde: jax.Array) -> Errors:
     """The rates of t, xi and e2."""
     e2_rate = velocity_error_rate(parts, at, f_tilde)
     return Errors(jnp.ones_like(at.t), xi_rate(parts, at), e2_rate)
+
+
+def kinematics(parts: ArmParts, at: Errors, f_tilde: jax.Array) -> Kinematics:
+    """The motion under the law's torque."""
+    a = alpha_rate(parts, at) + velocity_error_rate(parts, at, f_tilde)
+    return Kinematics(at.t, position(parts, at), velocity(parts, at), a)
 
 
 class Motion(NamedTuple):

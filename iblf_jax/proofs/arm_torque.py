@@ -32,7 +32,6 @@ from iblf_jax.core.linalg import matmul, matvec
 from iblf_jax.kernels import hull, lower, upper
 from iblf_jax.proofs.arm_bound import (
     Affine,
-    ArmErrors,
     Constants,
     arm_errors,
     coordinates,
@@ -42,10 +41,11 @@ from iblf_jax.proofs.arm_bound import (
     with_plant,
 )
 from iblf_jax.proofs.arm_motion import (
+    Errors,
     alpha_rate,
     external_torque,
     inverse_mass,
-    motion,
+    kinematics,
     reference_rate,
     relative_alpha,
     required_torque,
@@ -77,7 +77,7 @@ def torque_excess(
     share = x[2 * n + 1 + m]
     at = coordinates(jnp.concatenate([x[: 2 * n + 1 + m], x[2 * n + 2 + m :]]), n, m)
     point = arm_errors(constants._replace(level=constants.level * share**2), at)
-    torque = law_torque(constants, places, point, at.z)
+    torque = law_torque(constants, places, point.errors, at.z)
     middle, reach = torque.value, point.b * row_lengths(torque.slope)
     above = middle + reach - highest
     below = lowest - (middle - reach)
@@ -86,11 +86,11 @@ def torque_excess(
     return jnp.where(inside, excess, jnp.inf)[None]
 
 
-def law_torque(constants: Constants, places: Places, point: ArmErrors, z: jax.Array) -> Affine:
+def law_torque(constants: Constants, places: Places, at: Errors, z: jax.Array) -> Affine:
     """The torque (T.1) as a function of f_tilde [N m]."""
-    parts, at = constants.parts, point.errors
+    parts = constants.parts
     n = at.xi.shape[-1]
-    now = motion(parts, at, jnp.zeros(n)).now
+    now = kinematics(parts, at, jnp.zeros(n))
     change = differences(constants, places, z)
     model = parts.model
     alpha = reference_rate(parts, at.t) + relative_alpha(parts, at.t, at.xi)
@@ -138,7 +138,7 @@ def power_of_cut(c: jax.Array, torque: Affine, values: jax.Array, limits: jax.Ar
     Args:
       c: (n,) [rad/s].
       torque: u as a function of f_tilde.
-      values: the torques that are cut, (n,) [N m]; where none is beyond a limit, P is 0.
+      values: the commands that are cut, (n,) [N m]; where none is beyond a limit, P is 0.
       limits: least and greatest torque, (2, n) [N m].
     """
     lowest, highest = limits

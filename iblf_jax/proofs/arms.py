@@ -69,14 +69,28 @@ from iblf_jax.world.disturbances import Disturbance
 from iblf_jax.world.references import WaypointSpline
 from iblf_jax.world.robots import Robot
 
-APPLIED = "The torque of the law is applied as it is: without {parts} or delay."
+APPLIED = "The torque {torque} is applied as it is: without {parts} or delay."
 HELD_TORQUE = (
     "Law and observer read {readings} at the same instant every {period:g} s, and their"
     " torque is held from this instant to the next one; the observer makes a step of the kind"
-    ' "{observer}" meanwhile.',
+    ' "{observer}" meanwhile.'
+)
+DELAYED_TORQUE = (
+    "Law and observer read {readings} at the same instant every {period:g} s; their torque arrives"
+    " at most {delay:g} s later, by a delay that may differ from sample to sample, and is held"
+    ' until the next one arrives; the observer makes a step of the kind "{observer}" with it from'
+    " its sample on."
+)
+STARTS_AT_SAMPLE = (
     "A run starts at a sample, so that each torque is one that the law commanded inside the set."
-    " V_w of a state between samples is that of the torque that the law would command there, and of"
-    " the estimate interpolated by (G.6).",
+)
+STARTS_WITH_DELAY = (
+    "A run starts at a sample, with a torque of the actuator, constant until the first command"
+    " arrives, near that of the law as stated above."
+)
+BETWEEN_SAMPLES = (
+    "V_w of a state between samples is that of the torque that the law would command there, and of"
+    " the estimate interpolated by (G.6)."
 )
 ACTIVE_LIMITS = (
     "The limits cut the torque of the law, and the observer receives what is left. V_w is that of"
@@ -130,15 +144,9 @@ class ArmRate(OfStructure):
         numbers: Constants = jax.tree.unflatten(self.structure, constants)
         at = point_of(self.places, jnp.asarray(point), numbers)
         rate = arm_motion.lyapunov_rate(at.parts, numbers.weight, at.errors, at.f_tilde, at.rate)
-        torque = torque_of(at)
-        rate = infinite_unless_defined(rate, torque)
-        limits = at.parts.torque_limits
-        if limits is None:
-            return rate
-        D = cut(torque, limits)
-        return rate + arm_held.held_addition(
-            at.parts, numbers.weight, at.errors, at.f_tilde, D, jnp.zeros_like(D)
-        )
+        rate = infinite_unless_defined(rate, torque_of(at))
+        D = cut_of(at)
+        return rate if D is None else rate + addition(at, numbers.weight, D, jnp.zeros_like(D))
 
 
 class SampledArmBound(OfStructure):
@@ -151,7 +159,7 @@ class SampledArmBound(OfStructure):
         *leaves, limits = constants
         numbers: Constants = jax.tree.unflatten(self.structure, leaves)
         n = numbers.parts.kf.shape[0]
-        rates = arm_held.PathRates(*limits)
+        rates = arm_held.rate_limits(numbers.parts, limits)
         return arm_held.held_bound(self.places, n, x, numbers, rates), jnp.zeros((0,))
 
 
@@ -162,7 +170,7 @@ class HeldRatesExcess(OfStructure):
         """Its upper bound over a box, and no region; the last constant are the limits."""
         *leaves, limits = constants
         numbers: Constants = jax.tree.unflatten(self.structure, leaves)
-        rates = arm_held.PathRates(*limits)
+        rates = arm_held.rate_limits(numbers.parts, limits)
         return arm_held.rate_excess(self.places, x, numbers, rates), jnp.zeros((0,))
 
 
@@ -170,34 +178,61 @@ class HeldRates(OfStructure):
     """The rates of a held torque at a point of sampled arms of one structure."""
 
     def __call__(self, point: jax.Array, constants: list[jax.Array]) -> jax.Array:
-        """Those at the age 0, (3, n) [N m/s], and with errors of measurements E_u and E_L below
-        them [N m].
+        """Those at the age 0, (3, n) [N m/s], and with errors of measurements or active limits E_u
+        and E_L below them [N m].
         """
         numbers: Constants = jax.tree.unflatten(self.structure, constants)
         at = point_of(self.places, jnp.asarray(point), numbers)
-        rates = [*arm_held.rates_at(at.parts, at.errors, at.f_tilde)]
+        D = cut_of(at)
+        rates = [*arm_held.rates_at(at.parts, at.errors, at.f_tilde, D)]
         if at.parts.measurement_error is not None:
             rates += arm_held.first_sizes(at.parts, at.errors)
+        if D is not None:
+            rates += [D, jnp.zeros_like(D)]
         return jnp.stack(rates)
 
 
-class SampledArmRate(ArmRate):
+class HeldGrowth(OfStructure):
+    """The largest V_w' at a point of sampled arms of one structure while the torque is foreign."""
+
+    def __call__(self, point: jax.Array, constants: list[jax.Array]) -> jax.Array:
+        """That for all D, L and f' within the bounds of the last constant, () [N m rad/s]."""
+        *leaves, rows = constants
+        numbers: Constants = jax.tree.unflatten(self.structure, leaves)
+        at = point_of(self.places, jnp.asarray(point), numbers)
+        limits = arm_held.PathRates(*rows)
+        h, d = arm_held.period(at.parts), arm_held.oldest_age(at.parts)
+        sizes = (d * limits.command, h * (limits.lag + limits.command))
+        zero = jnp.zeros_like(at.f_tilde)
+        # It is affine in D and L.
+        slopes = jax.grad(lambda *x: addition(at, numbers.weight, *x), (0, 1))(zero, zero)
+        rate = arm_motion.lyapunov_rate(at.parts, numbers.weight, at.errors, at.f_tilde)
+        rate = rate + arm_held.bias_addition(at.parts, numbers.weight, at.errors, at.f_tilde)
+        for slope, size in zip(slopes, sizes, strict=True):
+            rate = rate + jnp.sum(jnp.abs(slope) * size)
+        more = numbers.weight * jnp.sum(jnp.abs(at.f_tilde) * limits.mismatch)
+        return rate + more
+
+
+class SampledArmRate(OfStructure):
     """V_w' at a point of sampled arms of one structure, to first order in the period."""
 
     def __call__(self, point: jax.Array, constants: list[jax.Array]) -> jax.Array:
-        """The larger one of those at the ages 0 and a period of the torque, without errors of
-        measurements, () [N m rad/s].
+        """The largest one of those at the ages of the torque between which it is affine, without
+        errors of measurements, () [N m rad/s].
         """
-        rate = super().__call__(point, constants)
         numbers: Constants = jax.tree.unflatten(self.structure, constants)
         at = point_of(self.places, jnp.asarray(point), numbers)
-        fresh = rate + arm_held.bias_addition(at.parts, numbers.weight, at.errors, at.f_tilde)
-        h = cast(jax.Array, numbers.parts.period)
-        rates = arm_held.rates_at(at.parts, at.errors, at.f_tilde)
-        added = arm_held.held_addition(
-            at.parts, numbers.weight, at.errors, at.f_tilde, -h * rates.command, h * rates.lag
-        )
-        return fresh + jnp.maximum(added, 0.0)
+        rate = arm_motion.lyapunov_rate(at.parts, numbers.weight, at.errors, at.f_tilde)
+        rate = rate + arm_held.bias_addition(at.parts, numbers.weight, at.errors, at.f_tilde)
+        zero, limits, u = jnp.zeros_like(at.f_tilde), at.parts.torque_limits, torque_of(at)
+        rates = arm_held.rates_at(at.parts, at.errors, at.f_tilde, cut_of(at))
+        found = []
+        for D, L in [(zero, zero), *arm_held.differences_of_ages(at.parts, rates)]:
+            # A limit cuts the command u + D of the sample.
+            difference = D if limits is None else D + cut(u + D, limits)
+            found.append(addition(at, numbers.weight, difference, L))
+        return infinite_unless_defined(rate + jnp.max(jnp.stack(found)), u)
 
 
 class ArmTorqueExcess(OfStructure):
@@ -229,9 +264,22 @@ class ArmPoint(NamedTuple):
     """Rate of the further disturbance, (n,) [N m/s]."""
 
 
+def cut_of(at: ArmPoint) -> jax.Array | None:
+    """What limits cut from the torque of the law at a point, (n,) [N m]; None without active
+    limits.
+    """
+    limits = at.parts.torque_limits
+    return None if limits is None else cut(torque_of(at), limits)
+
+
+def addition(at: ArmPoint, weight: jax.Array, D: jax.Array, L: jax.Array) -> jax.Array:
+    """What D and L add to V_w' at a point by (H.3), () [N m rad/s]."""
+    return arm_held.held_addition(at.parts, weight, at.errors, at.f_tilde, D, L)
+
+
 def torque_of(at: ArmPoint) -> jax.Array:
     """The torque of the law at a point, which the true plant needs for the motion, (n,) [N m]."""
-    now = arm_motion.motion(at.parts, at.errors, at.f_tilde).now
+    now = arm_motion.kinematics(at.parts, at.errors, at.f_tilde)
     return arm_motion.required_torque(at.parts, now)
 
 
@@ -240,7 +288,7 @@ def point_of(places: Places, point: jax.Array, constants: Constants) -> ArmPoint
 
     s/|s| = (sqrt(w V1/c) with the signs of e1, U^T e2/sqrt(2c), sqrt(w_f/(2c)) f_tilde).
     """
-    parts, level = constants.parts, constants.level
+    parts, level = constants.parts._replace(is_at_numbers=True), constants.level
     n = parts.kf.shape[0]
     t, s, z = split_point(point, 3 * n)
     energy = level * s[:n] ** 2
@@ -322,7 +370,7 @@ def _physical(
     """Time, position, velocity, f_tilde, f_hat, eta and the further rate at a point."""
     at = point_of(bound.places, point, jax.tree.unflatten(bound.structure, constants))
     parts, errors = at.parts, at.errors
-    now = arm_motion.motion(parts, errors, at.f_tilde).now
+    now = arm_motion.kinematics(parts, errors, at.f_tilde)
     f_hat = arm_motion.mismatch_torque(parts, now) - at.f_tilde
     eta = f_hat - parts.kf * matvec(parts.model.mass_matrix(now.q), now.v)
     vectors = dict(zip(VECTORS, (now.q, now.v, at.f_tilde, f_hat, eta), strict=True))
@@ -355,7 +403,7 @@ def arm_problem(
         scenario = canonical(astype(scenario, jnp.float64))
         free, limits = without_limits(scenario)
         _check_rate(disturbance_rate, limits, scenario.sampling)
-        _check_limits(limits, scenario.sensor)
+        _check_limits(limits, scenario)
         parts = _parts_of(free)
         uncertain = uncertain_coordinates(scenario, parameters, disturbance_rate)
         _check_count(len(uncertain.low))
@@ -384,12 +432,16 @@ def arm_problem(
         within = limits if parts.torque_limits is None else None
         torque = TorqueFunctions(ArmTorque(*of_structure), ArmTorqueExcess(*of_structure), within)
         bound: ArmBound | SampledArmBound | LimitedArmBound = ArmBound(*of_structure)
-        rate, held_torque = ArmRate(*of_structure), None
+        rate: ArmRate | SampledArmRate = ArmRate(*of_structure)
+        held_torque = None
         if parts.torque_limits is not None:
             bound = LimitedArmBound(*of_structure)
         if scenario.sampling is not None:
             bound, rate = SampledArmBound(*of_structure), SampledArmRate(*of_structure)
-            held_torque = HeldFunctions(HeldRates(*of_structure), HeldRatesExcess(*of_structure))
+            growth = None if parts.delay is None else HeldGrowth(*of_structure)
+            held_torque = HeldFunctions(
+                HeldRates(*of_structure), HeldRatesExcess(*of_structure), growth
+            )
         return ArmProblem(
             scenario,
             uncertain,
@@ -400,7 +452,7 @@ def arm_problem(
             length,
             is_period,
             (
-                *_timing(scenario, limits, parts.measurement_error),
+                *_timing(scenario, limits, parts),
                 *more,
                 EXACT,
                 *claims,
@@ -415,11 +467,11 @@ def arm_problem(
 
 
 def _law_has_limits(scenario: Scenario, limits: np.ndarray) -> bool:
-    """Whether the loop is continuous and its law itself cuts the torque at the limits, so that the
-    observer receives what is applied, and nothing else changes with it.
+    """Whether the law itself cuts the torque at the limits, so that the observer receives what is
+    applied, and nothing else changes with it.
     """
     law = scenario.controller
-    if type(law) is not controllers.Saturated or law.has_auxiliary or scenario.sampling is not None:
+    if type(law) is not controllers.Saturated or law.has_auxiliary:
         return False
     without_motor = dataclasses.replace(scenario, actuator=Ideal())
     return bool(np.array_equal(np.asarray(without_limits(without_motor)[1]), limits))
@@ -471,12 +523,14 @@ def _check_sampling(scenario: Scenario) -> None:
     if sampling.trigger is not None:
         reason = "A command that is not sent leaves an old torque, whose age has no bound."
         raise unsupported("sampling.trigger", type(sampling.trigger).__name__, "None", reason)
-    if float(sampling.delay) > 0.0:
-        reason = (
-            "The bound is that of a torque that is applied from its sample on, and until the first"
-            " command arrives the torque is not one of the law."
-        )
-        raise unsupported("sampling.delay", float(sampling.delay), "0 s", reason)
+    delay, period = float(sampling.delay), float(sampling.period)
+    if delay > period:
+        reason = "The bound is that of the last command or the one before it."
+        raise unsupported("sampling.delay", delay, f"at most a period, {period:g} s", reason)
+    if delay > 0.0 and type(scenario.sensor) is not sensors.Ideal:
+        reason = "The bound of a delayed torque is that of exact measurements."
+        expected = "sensors.Ideal with a delay"
+        raise unsupported("sensor", type(scenario.sensor).__name__, expected, reason)
 
 
 def _check_sensor(sensor: sensors.AnySensor) -> None:
@@ -507,29 +561,44 @@ def _measurement_error(sensor: sensors.AnySensor, n: int) -> jax.Array | None:
     return jnp.broadcast_to(size, (n,))
 
 
-def _check_limits(limits: np.ndarray | None, sensor: sensors.AnySensor) -> None:
-    """Raises ValueError for limits of a torque that is that of a measured state."""
-    if limits is None or type(sensor) is sensors.Ideal:
+def _check_limits(limits: np.ndarray | None, scenario: Scenario) -> None:
+    """Raises ValueError for limits of a torque that is not the law's one at a state of the set."""
+    if limits is None:
         return
-    reason = "The bound of the torque is that of exact measurements. Leave out the limits."
-    raise unsupported("sensor", type(sensor).__name__, "sensors.Ideal with torque limits", reason)
+    sensor, sampling = scenario.sensor, scenario.sampling
+    if type(sensor) is not sensors.Ideal:
+        reason = "The bound of the torque is that of exact measurements. Leave out the limits."
+        expected = "sensors.Ideal with torque limits"
+        raise unsupported("sensor", type(sensor).__name__, expected, reason)
+    if sampling is not None and float(sampling.delay) > 0.0:
+        reason = "The torque before the first command is not one of the law. Leave out the limits."
+        raise unsupported("sampling.delay", float(sampling.delay), "0 s with torque limits", reason)
 
 
-def _timing(scenario: Scenario, limits: np.ndarray | None, error: jax.Array | None) -> list[str]:
+def _timing(scenario: Scenario, limits: np.ndarray | None, parts: ArmParts) -> list[str]:
     """Sentences on time and on how the torque is applied."""
-    sampling = scenario.sampling
+    sampling, error = scenario.sampling, parts.measurement_error
     if sampling is None:
-        parts = "sampling, saturation" if limits is None else "sampling"
-        return [REAL_NUMBERS, APPLIED.format(parts=parts)]
+        if parts.torque_limits is not None:
+            return [REAL_NUMBERS, APPLIED.format(torque="that the limits leave", parts="sampling")]
+        without = "sampling, saturation" if limits is None else "sampling"
+        return [REAL_NUMBERS, APPLIED.format(torque="of the law", parts=without)]
     readings = "exact measurements"
     more: list[str] = []
     if error is not None:
         sizes = ", ".join(f"{size:.3g}" for size in np.asarray(error))
         readings = f"positions with errors of at most {sizes} rad, and exact velocities,"
         more = [ENCODERS]
-    numbers = {"period": float(sampling.period), "observer": sampling.observer}
-    sentences = [sentence.format(readings=readings, **numbers) for sentence in HELD_TORQUE]
-    return [SAMPLED_REAL_NUMBERS, *sentences, *more]
+    torque, start = HELD_TORQUE, STARTS_AT_SAMPLE
+    if parts.delay is not None:
+        torque, start = DELAYED_TORQUE, STARTS_WITH_DELAY
+    numbers = {
+        "period": float(sampling.period),
+        "delay": float(sampling.delay),
+        "observer": sampling.observer,
+    }
+    of_samples = torque.format(readings=readings, **numbers)
+    return [SAMPLED_REAL_NUMBERS, of_samples, f"{start} {BETWEEN_SAMPLES}", *more]
 
 
 def _check_rate(
@@ -606,8 +675,11 @@ def _parts_of(scenario: Scenario) -> ArmParts:
     object.__setattr__(law, "barrier", without_guard(law.barrier))
     zero = jnp.zeros(())
     observer, period, gain = cast(observers.Momentum, scenario.observer), None, None
+    delay = None
     if scenario.sampling is not None:
         period = scenario.sampling.period
+        if float(scenario.sampling.delay) > 0.0:
+            delay = scenario.sampling.delay
         discrete = observer.at_period(period)
         if scenario.sampling.observer == "poles":
             observer = discrete
@@ -625,6 +697,7 @@ def _parts_of(scenario: Scenario) -> ArmParts:
         period,
         gain,
         _measurement_error(scenario.sensor, scenario.n),
+        delay,
     )
 
 

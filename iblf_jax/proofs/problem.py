@@ -99,6 +99,9 @@ class HeldFunctions(NamedTuple):
     excess: Callable
     """A hashable function for `search.search`: the bound of the rates in parts of those in the last
     constant, minus 1.  It has the coordinate share of `TorqueFunctions.excess`."""
+    growth: Callable[[jax.Array, Any], jax.Array] | None
+    """Of a loop with a delay, the largest V_w' at a point before the first command, with bounds of
+    the rates as last constant; None without a delay."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -251,6 +254,15 @@ class LevelSetProblem(abc.ABC):
         """
         assert self.held_torque is not None
         function = self.held_torque.at_point
+        return np.asarray(_at_points(function, np.asarray(points, float), list(constants)))
+
+    @jax.enable_x64(True)
+    def growth(self, points: np.ndarray, constants: Sequence[np.ndarray]) -> np.ndarray:
+        """The largest V_w' before the first command at points, (count, p) -> (count,), in plain
+        floating-point numbers; bounds of the rates are the last constant.
+        """
+        assert self.held_torque is not None
+        function = checks.given(self.held_torque.growth)
         return np.asarray(_at_points(function, np.asarray(points, float), list(constants)))
 
     @property

@@ -33,6 +33,10 @@ INSTANTS = 512
 """Times of a guaranteed tube."""
 CONSTANT = 1e-9
 """Relative variation of the bound of |xi| below which it does not depend on the time."""
+DOWN, UP = 1.0 - 1e-12, 1.0 + 1e-12
+"""Factors by which numbers that are computed in double precision are rounded down and up."""
+CANDIDATES = 64
+"""Points that are drawn for each start of a loop with a delay, of which few may be starts."""
 AT_REST = 5.0
 """Time that is shown if reference and bounds are constant, so that there is no period [s]."""
 
@@ -110,6 +114,16 @@ class GuaranteedTube(NamedTuple):
     """Bound of |xi|, (T, n) [1]."""
 
 
+class DelayedStart(NamedTuple):
+    """The starts of a loop with a delay about which a proof is."""
+
+    level: float
+    """Largest V_w at the start, in the unit of V_w."""
+    torque: np.ndarray
+    """Largest difference between the torque before the first command and that of the law at the
+    start, (n,) [N m]."""
+
+
 class Attempt(NamedTuple):
     """One proof of a bisection."""
 
@@ -184,9 +198,10 @@ class Proof(Result):
     at each weight."""
     held_rates: np.ndarray | None = None
     """Of a sampled loop, proved bounds on the set of the rates of the law's torque, of the lag of
-    the observer, and of f of the law's torque, (3, n) [N m/s]; with errors of measurements two rows
-    more, by how much they change torque and lag at a sample [N m]; None without a proof of them,
-    and of a continuous loop."""
+    the observer, and of f of the law's torque, (3, n) [N m/s]; with errors of measurements or
+    active limits two rows more, by how much they change torque and lag at a sample [N m]; with a
+    delay one more, of V_w' before the first command [N m rad/s], the same for each joint; None
+    without a proof of them, and of a continuous loop."""
     has_active_limits: bool = False
     """Whether the statement is that of the loop whose limits of the torque are active where the law
     commands more."""
@@ -242,6 +257,18 @@ class Proof(Result):
         return checks.given(problem.with_active_limits)
 
     @property
+    def start(self) -> DelayedStart | None:
+        """The starts of a proved loop with a delay; None without a delay: all of the set, at a
+        sample.
+        """
+        if not self.proved or not starts_below_the_level(self.scenario):
+            return None
+        sampling, rates = checks.given(self.scenario.sampling), checks.given(self.held_rates)
+        growth = float(sampling.delay) * float(rates[-1][0])
+        torque = DOWN * float(sampling.period) * rates[0]
+        return DelayedStart(DOWN * (self.level - UP * growth), torque)
+
+    @property
     def torque_limits(self) -> np.ndarray | None:
         """Least and greatest torque of the loop, (2, n) [N m]; None without limits."""
         return without_limits(self.scenario)[1]
@@ -283,6 +310,9 @@ class Proof(Result):
         """Runs that start at t = 0 at points of V_w = level with parameters at the ends of their
         intervals.
 
+        A loop with a delay starts on the level of `start`, at points with an admitted torque; there
+        may be fewer.
+
         Args:
           count: number of runs.
           duration: length of each run [s]; the time interval of the proof if not given.
@@ -292,9 +322,14 @@ class Proof(Result):
         count = checks.positive_integer("count", count, least=0)
         dt = step_within(self.scenario, dt)
         steps = math.ceil((duration or self.duration or AT_REST) / dt)
-        constants = self.problem.constants(self.weight, self.level)
-        points = self.problem.sample(seed, 2 * count)[::2]
+        start = self.start
+        level = self.level if start is None else start.level
+        constants = self.problem.constants(self.weight, level)
+        candidates = count if start is None else CANDIDATES * count
+        points = self.problem.sample(seed, 2 * candidates)[::2]
         points[:, 0] = 0.0
+        if start is not None:
+            points = self._near_balance(points, constants, start)[:count]
         every = max(1, steps // INSTANTS)
         with jax.enable_x64(True):
             return [
@@ -306,6 +341,17 @@ class Proof(Result):
                 )
                 for point in points
             ]
+
+    def _near_balance(
+        self, points: np.ndarray, constants: list[np.ndarray], start: DelayedStart
+    ) -> np.ndarray:
+        """Points at which the torque before the first command, G0(q), is near that of the law."""
+        torques = self.problem.torques(points, constants)
+        model = checks.given(plants.as_plant(self.scenario.model).robot)
+        with jax.enable_x64(True):
+            q = [self.problem.state_of(point, constants).q for point in points]
+            gravity = np.array([model.gravity(x) for x in q])
+        return points[np.all(np.abs(torques - gravity) <= start.torque, axis=1)]
 
     def plot(self, **options: Any) -> Any:
         """The tube over the reference with the bounds; see `plotting.guaranteed_tube`."""
@@ -335,6 +381,11 @@ class Proof(Result):
         if self.scenario.sampling is not None:
             sampled = f" of the loop sampled every {float(self.scenario.sampling.period):.4g} s"
         statement = _STATEMENTS.get(self.verdict)
+        if starts_below_the_level(self.scenario):
+            delay = float(checks.given(self.scenario.sampling).delay)
+            sampled = f"{sampled} with delays up to {delay:.4g} s"
+            if self.start is not None:
+                statement = f"not left by runs from {{V_w <= {self.start.level:.4g}}}"
         if self.violation is not None:
             statement = self.violation.statement
         return (
@@ -356,7 +407,9 @@ class Proof(Result):
             names = ", ".join(plants.component_names(self.scenario.plant))
             if np.any(np.ptp(self.tube.xi, axis=0) > CONSTANT * xi):
                 names += f", the largest of {INSTANTS} instants"
-            lines.append(f"Guaranteed for every start in the set: |xi| <= {texts} ({names}).")
+            starts = "every start in the set" if self.start is None else "these starts"
+            lines.append(f"Guaranteed for {starts}: |xi| <= {texts} ({names}).")
+            lines += self._about_start()
         lines += self._about_torque()
         if self.verdict == Verdict.NOT_PROVED and self.point is not None:
             tried = len(self.growth_points)
@@ -376,9 +429,11 @@ class Proof(Result):
         if self.verdict == Verdict.UNDECIDED:
             lines += self._why_undecided()
         expected = ""
-        if self.expected_boxes is not None and math.isfinite(self.expected_boxes[0]):
+        if self.expected_boxes is not None:
             boxes, error = self.expected_boxes
             expected = f" ({boxes:.2g} expected, standard error {error:.1g})"
+            if not math.isfinite(boxes):
+                expected = " (no number is enough, by random descents)"
         lines.append(
             f"w = {self.weight:.3g}, {self.boxes:,} boxes{expected}, {self.seconds:.3g} s."
         )
@@ -404,6 +459,19 @@ class Proof(Result):
             f"The greatest value with a proof is {largest:.4g}, the next one that was tried is"
             f" {next_one.value:.4g} ({next_one.verdict}). Nothing is claimed of values that were"
             " not tried.",
+        ]
+
+    def _about_start(self) -> list[str]:
+        """The torque before the first command of a loop with a delay."""
+        if self.start is None:
+            return []
+        names = plants.component_names(self.scenario.plant)
+        sizes = zip(names, self.start.torque, strict=True)
+        # rounded down
+        listed = ", ".join(f"{name} {math.floor(size * 1e3) / 1e3:.6g}" for name, size in sizes)
+        return [
+            "Starts are those at which the torque before the first command differs from the law's"
+            f" one by at most [N m]: {listed}."
         ]
 
     def _about_torque(self) -> list[str]:
@@ -432,12 +500,13 @@ class Proof(Result):
         elif found.excess(limits) > 0.0:
             lines.append(
                 "That is beyond the limits at this weight, and at every other one with V_w' < 0."
-                " A smaller level, larger limits, or gains with less torque help. In a continuous"
-                " loop, those of Saturated without an auxiliary state may be active."
+                " A smaller level, larger limits, or gains with less torque help. Limits of"
+                " Saturated without an auxiliary state may be active."
             )
         elif self.done == 1.0 and not found.is_proved:
             lines.append(
-                "It is not proved to stay within its limits: increase max_boxes, or the limits."
+                f"It is not proved to stay within its limits with {found.boxes:,} boxes: increase"
+                " max_boxes, or the limits."
             )
         return lines
 
@@ -445,7 +514,8 @@ class Proof(Result):
         if self.scenario.sampling is not None and self.held_rates is None:
             return [
                 "The rate of the law's torque on the set has no proved bound, which the statement"
-                " needs: a shorter period, a smaller level, more boxes or other gains help."
+                " needs: a shorter period or delay, a smaller level, more boxes or other gains"
+                " help."
             ]
         lines = [f"V_w' < 0 is proved on {100.0 * self.done:.3g} % of the volume."]
         lines += self._what_is_left()
@@ -482,7 +552,7 @@ class Proof(Result):
 
     def _remedy(self) -> str:
         """What is likely to help."""
-        narrower = "A smaller level, narrower intervals or other gains help."
+        narrower = f"A smaller level, {self._changes()} help."
         if self.left_value is not None and self.left_value >= 0.0:
             return (
                 f"The bound is not negative at a point, so that more boxes do not help. {narrower}"
@@ -496,6 +566,15 @@ class Proof(Result):
             f" {self._about_smaller_level()}"
         )
 
+    def _changes(self) -> str:
+        """What else than a level and boxes may be changed, in words."""
+        changes = ["narrower intervals"]
+        if self.scenario.sampling is not None:
+            changes.append("a shorter period")
+        if self.has_active_limits:
+            changes.append("larger limits")
+        return f"{', '.join(changes)} or other gains"
+
     def _about_smaller_level(self) -> str:
         """Whether a smaller level is likely to help, from the same boxes at such a level."""
         share, now = self.smaller_level_share, self.negative_shares[REACHED]
@@ -503,13 +582,16 @@ class Proof(Result):
         if share == 1.0:
             return f"All of them are negative with {at}, which is likely to be proved."
         if share is None or share <= now:
-            return (
-                f"No more of them are negative with {at}: narrower intervals or other gains help."
-            )
+            return f"No more of them are negative with {at}: {self._changes()} help."
         return (
-            f"With {at}, {_percent(share)} of them are negative: a level below it, narrower"
-            " intervals or other gains help."
+            f"With {at}, {_percent(share)} of them are negative: a level below it,"
+            f" {self._changes()} help."
         )
+
+
+def starts_below_the_level(scenario: Scenario) -> bool:
+    """Whether a delay keeps the first command from the actuator, so that V_w may grow before it."""
+    return scenario.sampling is not None and float(scenario.sampling.delay) > 0.0
 
 
 _STATEMENTS = {

@@ -46,8 +46,7 @@ CASES = {
 def cut_sample(loop, problem, state):
     """Torque within the limits of a problem, estimate and n of a state."""
     tau, phi, n = loop.sample(state)
-    lowest, highest = problem.parts.torque_limits
-    return np.clip(tau, lowest, highest), phi, n
+    return np.clip(tau, *problem.parts.torque_limits), phi, n
 
 
 def states(loop, count, level, width, seed):
@@ -164,8 +163,8 @@ def test_limits_that_no_torque_reaches_change_nothing():
 
 
 @functools.cache
-def proof(limit=None, motor=None, **options):
-    scenario = pendulum()
+def proof(limit=None, motor=None, sampling=None, **options):
+    scenario = dataclasses.replace(pendulum(), sampling=sampling)
     more = {"auxiliary": options.pop("auxiliary")} if "auxiliary" in options else {}
     if limit is not None:
         scenario = limited(scenario, limit, **more)
@@ -217,6 +216,26 @@ def test_a_set_on_which_limits_are_active_is_proved_and_no_run_leaves_it():
 
 
 @pytest.mark.slow
+def test_a_set_of_a_held_torque_with_active_limits_is_proved_and_no_run_leaves_it():
+    period = 1e-3
+    limit = 0.85 * largest_torque()
+    found = proof(limit, sampling=ij.Sampling(period, observer="poles"))
+    assert found.proved and found.has_active_limits and found.held_rates.shape == (5, 1)
+    assert "without" not in " ".join(found.assumptions[:2])
+    loop = SampledPendulum(-np.expm1(-100.0 * period) / period)
+    state, factor = most_limited(loop, found.problem, 1000, LEVEL, 0.01)
+    loop.ends = (-limit, limit)
+    for _ in range(200):
+        sample = loop.sample(state)
+        for _ in range(2):
+            state = loop.moved(state, sample, factor, 0.5 * period, steps=2)
+            assert np.all(loop.lyapunov(*state, factor) < LEVEL)
+    for run in found.adversarial_runs(4, duration=0.2):
+        assert run.ok and np.max(np.abs(run.tau)) <= limit
+        assert np.max(np.abs(run.xi)) <= found.tube.xi.max()
+
+
+@pytest.mark.slow
 def test_limits_that_are_too_small_or_not_those_of_the_law_are_not_proved():
     largest = largest_torque()
     found = proof(0.1 * largest)
@@ -226,9 +245,6 @@ def test_limits_that_are_too_small_or_not_those_of_the_law_are_not_proved():
     for options in ({"motor": 0.8 * largest}, {"limit": 0.8 * largest, "auxiliary": 50.0}):
         found = proof(runs=0, **options)
         assert found.verdict == Verdict.NOT_PROVED and not found.has_active_limits
-        assert "those of Saturated without an auxiliary state may be active" in repr(found)
-    # That of a held torque is not in the bound.
-    sampled = dataclasses.replace(limited(pendulum(), 20.0), sampling=ij.Sampling(1e-3))
-    assert arm_problem(sampled, within(1.0)).with_active_limits is None
+        assert "Saturated without an auxiliary state may be active" in repr(found)
     # The motor cuts less than the law.
     assert proof(0.8 * largest, motor=0.9 * largest).has_active_limits

@@ -17,14 +17,14 @@ from test_torque import TwoLinks, limited
 import iblf_jax as ij
 from iblf_jax.kernels.enclosure import enclose
 from iblf_jax.proofs import Verdict, arm_held, arm_motion
-from iblf_jax.proofs.arm_bound import arm_errors, coordinates
+from iblf_jax.proofs.arm_bound import arm_errors, coordinates, scaled
 from iblf_jax.proofs.arms import arm_problem, point_of
 from iblf_jax.proofs.problem import OfStructure
 from iblf_jax.proofs.proposal import start_of
 from iblf_jax.proofs.support import without_guard
 from iblf_jax.world.bounds import Tube
 
-WEIGHT, LEVEL, PERIOD = 3e-3, 0.1, 1e-3
+WEIGHT, LEVEL, PERIOD, DELAY = 3e-3, 0.1, 1e-3, 0.25e-3
 KF = np.array([100.0, 60.0])
 UNEVEN = 0.75 * np.pi
 """The time at which the widths of the tube on both sides differ most, by a factor of 5.9."""
@@ -57,6 +57,10 @@ def read_by(sensor, observer=POLES):
     return dataclasses.replace(sampled(pendulum(), observer=observer), sensor=sensor)
 
 
+def delayed():
+    return sampled(pendulum(), delay=DELAY)
+
+
 def test_a_sampling_that_is_missing_or_that_the_bound_does_not_know_is_refused():
     filtered = ij.sensors.FilteredDifference(100.0)
     for text, scenario in {
@@ -65,6 +69,9 @@ def test_a_sampling_that_is_missing_or_that_the_bound_does_not_know_is_refused()
         "scenario.sensor.velocity.noise": read_by(encoder(velocity=ij.sensors.Measured(0.1))),
         "positions of several samples": read_by(encoder(velocity=filtered)),
         "with torque limits": limited(read_by(ROUGH), 100.0),
+        "at most a period": sampled(pendulum(), delay=1.1 * PERIOD),
+        "sensors.Ideal with a delay": dataclasses.replace(delayed(), sensor=ROUGH),
+        "0 s with torque limits": limited(delayed(), 100.0),
     }.items():
         with pytest.raises(ValueError, match=re.escape(text)):
             arm_problem(scenario, within(1.0))
@@ -78,7 +85,7 @@ class SampledTwoLinks(TwoLinks):
     """The sampled loop without the package; derivatives are those of analytic functions by complex
     steps. A state is (t, q, v, phi); factors are those of the true masses."""
 
-    step, joints, weight = 1e-30, 2, WEIGHT
+    step, joints, weight, ends = 1e-30, 2, WEIGHT, (-np.inf, np.inf)
 
     def __init__(self, gain, momentum_gain=0.0, measured=None):
         self.gain, self.momentum_gain = gain, momentum_gain
@@ -163,7 +170,8 @@ class SampledTwoLinks(TwoLinks):
         M0, _, _ = self.dynamics(q, np.ones_like(q))
         M0_read, _, _ = self.dynamics(read, np.ones_like(q))
         estimate = phi + (self.gain + self.momentum_gain) * np.einsum("bij,bj->bi", M0_read - M0, v)
-        return self.law(t, read, v, estimate), estimate, self.momentum_term(read, v)
+        command = np.clip(self.law(t, read, v, estimate), *self.ends)
+        return command, estimate, self.momentum_term(read, v)
 
     def moved(self, state, sample, factor, age, steps=8):
         """The state some time after the sample, by Runge and Kutta's method."""
@@ -176,6 +184,16 @@ class SampledTwoLinks(TwoLinks):
             for k, part in ((k1, 1.0), (k2, 2.0), (k3, 2.0), (k4, 1.0)):
                 state = added(state, k, dt * part / 6.0)
         return state
+
+    def period_with_delay(self, state, factor, active, delay, period=PERIOD):
+        """States of a period with the samples that act there, at its ends and where the command
+        arrives, and the command; a sample has the torque of the plant, and n_k that of the observer
+        as well."""
+        u, phi, n = now = self.sample(state)
+        before = (active, phi, n + u - active)
+        arrived = self.moved(state, before, factor, delay, steps=2)
+        end = self.moved(arrived, now, factor, period - delay, steps=2)
+        return [(state, before), (arrived, before), (arrived, now), (end, now)], u
 
     def rate_of_lyapunov(self, state, sample, factor):
         rates = self.rates(state, sample, factor)
@@ -355,7 +373,8 @@ class Enclosures(OfStructure):
         of_path = arm_held.mean_rates(parts, error, rates, means)
         under = arm_held.rates_under(parts, error, rates, D, L)
         e2 = point.errors.e2
-        added = arm_held.added_terms(numbers, e2, error, rates.mismatch, *under)
+        D_and_L = scaled(-jnp.ones(()), under.command), under.lag
+        added = arm_held.added_terms(numbers, e2, error, rates.mismatch, *D_and_L)
         outputs = [(path.at.xi, path.at.e2, path.f_tilde), means, of_path, under, added, on_set]
         outputs.append((first or no_error)[:2])
         given = arm_held.FirstDifferences(D, L, True)
@@ -366,8 +385,9 @@ class Enclosures(OfStructure):
 
 OUTPUTS = (
     *("xi", "e2", "f_tilde", "D", "L", "growth", "rest"),
-    *("command", "command_slope", "lag", "lag_slope"),
+    *("command", "command_slope", "lag", "lag_slope", "p_rate", "p_rate_slope"),
     *("under_command", "under_command_slope", "under_lag", "under_lag_slope"),
+    *("under_p_rate", "under_p_rate_slope"),
     *("power", "push", "slope"),
     *("set_command", "set_command_slope", "set_lag", "set_lag_slope"),
     *("set_mismatch", "set_mismatch_slope"),
@@ -454,6 +474,43 @@ def test_bound_over_boxes_is_above_the_rate_of_runs_between_samples(near, observ
     assert gaps == sorted(gaps)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [POLES, EXACT, "limits"])
+def test_bound_over_boxes_is_above_the_rate_of_runs_with_delays_or_limits(kind):
+    """After three periods, with an active torque that is up to a period and a delay old."""
+    loop = own_loop(EXACT if kind == EXACT else POLES, 100.0, links=SampledPendulum)
+    longest = 0.0 if kind == "limits" else DELAY
+    if kind == "limits":
+        loop.ends = (-9.0, 12.0)
+        scenario = limited(sampled(pendulum()), loop.ends[1], lower_limit=loop.ends[0])
+        problem = arm_problem(scenario, within(1.0)).with_active_limits
+    else:
+        problem = arm_problem(sampled(pendulum(), observer=kind, delay=DELAY), within(1.0))
+    state, factor = loop.starts(60, 0.5, 4)
+    active, generator, states = loop.sample(state)[0], np.random.default_rng(2), []
+    for _ in range(3):
+        delay = longest * generator.choice([0.0, 0.4, 1.0, 1.0], (60, 1))
+        some, active = loop.period_with_delay(state, factor, active, delay)
+        state = some[-1][0]
+        states += some if longest else some[2:]
+    rows = np.abs([loop.held_rates(*some, factor) for some in states]).max(axis=0)
+    more = np.ones((1, *factor.shape))
+    if kind == "limits":
+        more = np.max([np.abs(loop.differences(*some)) for some in states[::2]], axis=0)
+        assert 0.3 < np.mean(more[0] > 0.0) < 0.9
+    limits = 1.05 * np.moveaxis(np.concatenate([rows, more]), 1, 0)
+    for end, sample in states[-4:]:
+        expected = loop.rate_of_lyapunov(end, sample, factor)
+        points, levels = loop.points(end, factor)
+        points[:, 0] = np.mod(points[:, 0], 2.0 * np.pi)
+        x = np.array([coordinates_of(point, 1) for point in points])
+        runs = OwnRuns(problem, loop, None, None, factor, None, end, levels, x, None, limits)
+        for size in (0.0, 1e-2):
+            bounds = enclosed(runs, problem.bound, size, np.random.default_rng(1))[1][0][:, 0]
+            assert not np.any(bounds < expected - 1e-9)
+            assert size or np.isfinite(bounds).mean() > 0.9
+
+
 def enclosures_of(runs, size, *, period=PERIOD, D=None, L=None):
     """Lower and upper ends of `Enclosures` over boxes that contain the ends of runs."""
     bound = runs.problem.bound
@@ -517,7 +574,8 @@ def test_enclosures_contain_paths_and_means_of_runs(near, ends_without_f_tilde, 
         assert_inside(mean_f_tilde, least, most, slack)
         assert_inside(D_0, low.first_D, high.first_D)
         assert_inside(L_0, low.first_L, high.first_L)
-        for name, rate in (("command", (D_0 - D) / age), ("lag", (L - L_0) / age)):
+        changes = (D_0 - D) / age, (L - L_0) / age
+        for name, rate in zip(("command", "lag", "p_rate"), (*changes, sum(changes)), strict=True):
             least, most = affine((low, high), name, f_tildes[-1])
             assert_inside(rate, least, most, 1e-6)
 
@@ -544,10 +602,10 @@ def test_terms_of_the_bound_are_those_of_other_equations(observer, rough):
     # What D = -u' and L = L' add to V_w'.
     added = loop.rate_of_lyapunov(runs.end, [u - command, phi - lag, n], runs.factor)
     added = (added - loop.rate_of_lyapunov(runs.end, now, runs.factor))[:, None]
-    values = [some.power / short for some in found]
-    slopes = [(some.push / short)[:, None, :] for some in found]
+    values = [some.power for some in found]
+    slopes = [some.push[:, None, :] for some in found]
     joints = f_tilde.shape[1]
-    squares = [some.slope.reshape(-1, joints, joints) * WEIGHT / short for some in found]
+    squares = [some.slope.reshape(-1, joints, joints) * WEIGHT for some in found]
     products = [f_tilde[:, None, :] * x for x in slopes]
     pairs = [np.einsum("bi,bij,bj->bij", f_tilde, x, f_tilde) for x in squares]
     least = values[0] + np.minimum(*products).sum(axis=2)
@@ -626,21 +684,30 @@ def rounded(q):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", [*STEPS, f"{POLES} with rounded positions"])
+@pytest.mark.parametrize(
+    "case", [*STEPS, f"{POLES} with rounded positions", f"{EXACT} with a delay"]
+)
 def test_runs_of_the_package_are_those_of_other_equations(case):
     """A run from a point of the level set, with the estimate of its last sample."""
-    observer, _, is_rounded = case.partition(" with ")
-    sensor, measured = (ROUGH, rounded) if is_rounded else (None, None)
+    observer, _, more = case.partition(" with ")
+    sensor, measured = (ROUGH, rounded) if more == "rounded positions" else (None, None)
+    delay = DELAY if more == "a delay" else 0.0
     problem, loop = problem_of_paper_loop(observer, sensor), own_loop(observer, measured=measured)
     state, factor = loop.starts(1, LEVEL, 5)
     points, level = loop.points(state, factor)
     scenario = problem.scenario_at(points[0], problem.constants(WEIGHT, level[0]))
+    scenario = dataclasses.replace(
+        scenario, sampling=ij.Sampling(PERIOD, delay=delay, observer=observer)
+    )
     run = ij.simulate(scenario, duration=6 * PERIOD, dt=PERIOD / 4)
+    # The torque before the first command is that which balances the model's gravity.
+    active = loop.dynamics(state[1], np.ones_like(factor))[2]
     for k in range(6):
-        sample = loop.sample(state)
         np.testing.assert_allclose(run.q[4 * k], state[1][0], rtol=1e-8)
-        np.testing.assert_allclose(run.disturbance_estimate[4 * k], sample[1][0], rtol=1e-6)
-        state = loop.moved(state, sample, factor, PERIOD)
+        estimate = loop.sample(state)[1][0]
+        np.testing.assert_allclose(run.disturbance_estimate[4 * k], estimate, rtol=1e-6)
+        states, active = loop.period_with_delay(state, factor, active, delay)
+        state = states[-1][0]
 
 
 class FirstEnclosures(OfStructure):
@@ -693,9 +760,9 @@ def test_level_of_the_start_is_that_of_the_first_sample(observer):
 
 
 @functools.cache
-def proof(period, observer=POLES, counts=None, **options):
+def proof(period, observer=POLES, counts=None, delay=0.0, **options):
     given = {"level": 0.5, "weight": WEIGHT, "parameters": within(1.0), "progress": False}
-    scenario = sampled(pendulum(), period, observer)
+    scenario = sampled(pendulum(), period, observer, delay=delay)
     if counts is not None:
         scenario = dataclasses.replace(scenario, sensor=encoder(counts))
     return ij.prove(scenario, **given | options)
@@ -752,6 +819,42 @@ def test_a_pendulum_with_the_exact_step_and_rounded_positions_is_proved():
             assert np.all(loop.lyapunov(*state, factor) < 0.5)
     for run in found.adversarial_runs(2, duration=0.2):
         assert run.ok and np.max(np.abs(run.xi)) <= found.tube.xi.max()
+
+
+@pytest.mark.slow
+def test_a_pendulum_with_delays_is_proved_and_no_run_leaves_the_set():
+    """Own runs, with any delays up to the longest one and any admitted torque before."""
+    found = proof(PERIOD, delay=DELAY)
+    assert found.proved and 0.0 < found.start.level < 0.5
+    text = repr(found)
+    assert "with delays up to 0.00025 s is not left by runs from {V_w <= 0." in text
+    assert "Starts are those at which the torque before the first command differs" in text
+    loop, generator = own_loop(POLES, 100.0, links=SampledPendulum), np.random.default_rng(8)
+    state, factor = loop.starts(400, found.start.level, 6)
+    active = loop.sample(state)[0]
+    active = active + found.start.torque * generator.choice([-1.0, -0.3, 1.0], (400, 1))
+    constant = DELAY * generator.uniform(size=(400, 1))
+    constant[::2] = DELAY
+    for _ in range(300):
+        random = DELAY * generator.choice([0.0, 0.5, 1.0], (400, 1))
+        delays = np.where(np.arange(400)[:, None] % 4, constant, random)
+        states, active = loop.period_with_delay(state, factor, active, delays)
+        assert all(np.all(loop.lyapunov(*some, factor) < 0.5) for some, _ in states)
+        state = states[-1][0]
+    # V_w' for all D and L that are allowed before the first command, everywhere in the set.
+    R_u, R_L, _, growth = found.held_rates
+    for level in (0.5, 0.1, 0.02):
+        state, factor = loop.starts(400, level, 9)
+        u, phi, n = loop.sample(state)
+        D = (PERIOD + DELAY) * R_u * generator.choice([-1.0, 0.5, 1.0], (400, 1))
+        L = PERIOD * (R_L + R_u) * generator.choice([-1.0, 0.5, 1.0], (400, 1))
+        assert np.all(loop.rate_of_lyapunov(state, (u + D, phi, n - L), factor) < growth)
+    runs = found.adversarial_runs(2, duration=0.2)
+    assert len(runs) > 0
+    for run in runs:
+        assert run.ok and np.max(np.abs(run.xi)) <= found.tube.xi.max()
+    with pytest.raises(ValueError, match="a level of V_w with a delay"):
+        proof(PERIOD, delay=DELAY, level=None)
 
 
 @pytest.mark.slow
