@@ -45,17 +45,10 @@ from iblf_jax.proofs.periods import AperiodicError
 from iblf_jax.proofs.points import PARENTS, Sampled, sample_weights
 from iblf_jax.proofs.problem import LevelSetProblem
 from iblf_jax.proofs.proposal import LevelChoice, Proposal, Start, proposed_level, start_of
-from iblf_jax.proofs.result import (
-    GrowthPoint,
-    Proof,
-    Verdict,
-    Violation,
-    WorstBox,
-    starts_below_the_level,
-)
+from iblf_jax.proofs.result import GrowthPoint, Proof, Verdict, Violation, WorstBox
 from iblf_jax.proofs.sampled_values import sampled_values
 from iblf_jax.proofs.search import SearchedBox, SearchResult, search
-from iblf_jax.proofs.support import step_within
+from iblf_jax.proofs.support import has_delay, step_within
 from iblf_jax.proofs.torque import TorqueRange, found_torque, proved_torque
 from iblf_jax.proofs.undecided import left_over
 from iblf_jax.simulation.results import Rollout
@@ -202,7 +195,7 @@ def _chosen_level(
     problem: LevelSetProblem, weights: Sequence[float], options: _Options
 ) -> tuple[Start, Proposal]:
     """A level whose set contains the start of a robot's scenario."""
-    if starts_below_the_level(problem.scenario):
+    if has_delay(problem.scenario):
         remedy = "A start must be below the level, by what V_w may grow before the first command."
         raise checks.fail("level", None, "a level of V_w with a delay", remedy)
     if not isinstance(problem, ArmProblem):
@@ -562,7 +555,7 @@ def _refuted(
     reduced until the run is accurate; a run that is not accurate with the smallest one refutes
     nothing.  The statement of a loop with a delay is not about starts on the level.
     """
-    if starts_below_the_level(problem.scenario):
+    if has_delay(problem.scenario):
         return None
     constants = problem.constants(sampled.weight, level)
     for point in sampled.points[:runs]:

@@ -49,6 +49,7 @@ from iblf_jax.proofs.support import (
     check_unchanging,
     claim_sentences,
     examined,
+    has_delay,
     infinite_unless_defined,
     operations_of_plant,
     time_interval,
@@ -527,7 +528,7 @@ def _check_sampling(scenario: Scenario) -> None:
     if delay > period:
         reason = "The bound is that of the last command or the one before it."
         raise unsupported("sampling.delay", delay, f"at most a period, {period:g} s", reason)
-    if delay > 0.0 and type(scenario.sensor) is not sensors.Ideal:
+    if has_delay(scenario) and type(scenario.sensor) is not sensors.Ideal:
         reason = "The bound of a delayed torque is that of exact measurements."
         expected = "sensors.Ideal with a delay"
         raise unsupported("sensor", type(scenario.sensor).__name__, expected, reason)
@@ -570,7 +571,7 @@ def _check_limits(limits: np.ndarray | None, scenario: Scenario) -> None:
         reason = "The bound of the torque is that of exact measurements. Leave out the limits."
         expected = "sensors.Ideal with torque limits"
         raise unsupported("sensor", type(sensor).__name__, expected, reason)
-    if sampling is not None and float(sampling.delay) > 0.0:
+    if sampling is not None and has_delay(scenario):
         reason = "The torque before the first command is not one of the law. Leave out the limits."
         raise unsupported("sampling.delay", float(sampling.delay), "0 s with torque limits", reason)
 
@@ -681,7 +682,7 @@ def _parts_of(scenario: Scenario) -> ArmParts:
     delay = None
     if scenario.sampling is not None:
         period = scenario.sampling.period
-        if float(scenario.sampling.delay) > 0.0:
+        if has_delay(scenario):
             delay = scenario.sampling.delay
         discrete = observer.at_period(period)
         if scenario.sampling.observer == "poles":

@@ -21,7 +21,7 @@ from iblf_jax.core.pytree import astype, unwrapped
 from iblf_jax.engine.simulate import simulate
 from iblf_jax.proofs.problem import LevelSetProblem
 from iblf_jax.proofs.proposal import LevelChoice
-from iblf_jax.proofs.support import step_within
+from iblf_jax.proofs.support import has_delay, step_within
 from iblf_jax.proofs.torque import TorqueRange, without_limits
 from iblf_jax.proofs.undecided import REACHED, SMALLER_LEVEL
 from iblf_jax.simulation.results import Rollout
@@ -261,7 +261,7 @@ class Proof(Result):
         """The starts of a proved loop with a delay; None without a delay: all of the set, at a
         sample.
         """
-        if not self.proved or not starts_below_the_level(self.scenario):
+        if not self.proved or not has_delay(self.scenario):
             return None
         sampling, rates = checks.given(self.scenario.sampling), checks.given(self.held_rates)
         growth = float(sampling.delay) * float(rates[-1][0])
@@ -381,7 +381,7 @@ class Proof(Result):
         if self.scenario.sampling is not None:
             sampled = f" of the loop sampled every {float(self.scenario.sampling.period):.4g} s"
         statement = _STATEMENTS.get(self.verdict)
-        if starts_below_the_level(self.scenario):
+        if has_delay(self.scenario):
             delay = float(checks.given(self.scenario.sampling).delay)
             sampled = f"{sampled} with delays up to {delay:.4g} s"
             if self.start is not None:
@@ -587,11 +587,6 @@ class Proof(Result):
             f"With {at}, {_percent(share)} of them are negative: a level below it,"
             f" {self._changes()} help."
         )
-
-
-def starts_below_the_level(scenario: Scenario) -> bool:
-    """Whether a delay keeps the first command from the actuator, so that V_w may grow before it."""
-    return scenario.sampling is not None and float(scenario.sampling.delay) > 0.0
 
 
 _STATEMENTS = {

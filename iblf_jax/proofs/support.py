@@ -116,6 +116,11 @@ def claim_sentences(barriers: Sequence[Any]) -> list[str]:
     ]
 
 
+def has_delay(scenario: Scenario) -> bool:
+    """Whether a delay keeps the first command from the actuator, so that V_w may grow before it."""
+    return scenario.sampling is not None and float(scenario.sampling.delay) > 0.0
+
+
 def step_within(scenario: Scenario, longest: float) -> float:
     """The longest time step of a run up to `longest`, both in [s]: a period of samples is a whole
     number of steps.

@@ -262,9 +262,9 @@ class Theorem(TwoCases, MainClaim):
         M0 = np.asarray(torque.M0)
         eigenvalues, mu = _eigenvalues(M0), np.nan
         if isinstance(law, Backstepping):
-            # By NumPy: the matrix of K2 alone would compile two programs.
-            K2 = np.asarray(law.K2)
-            gain = np.diag(K2) if law.gain_matrix is None else np.asarray(law.gain_matrix) * K2
+            gain = np.asarray(law.full_gain)
+            if gain.ndim == 1:
+                gain = np.diag(gain)
             values, vectors = np.linalg.eigh(0.5 * (gain + gain.T))
             inverse_root = vectors / np.sqrt(np.where(values > 0.0, values, np.nan))
             mu = (1.0 / _eigenvalues(inverse_root.T @ M0 @ inverse_root)[:, -1]).min()

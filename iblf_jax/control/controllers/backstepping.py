@@ -129,7 +129,7 @@ class Backstepping(RobotLaw):
             raise checks.fail("Backstepping.gain_matrix", words, "one matrix, shape (n, n)")
         fits = jnp.shape(self.K2) in ((), shape[:1])
         if fits and checks.is_concrete((self.K2, self.gain_matrix)):
-            check_definite("Backstepping.gain_matrix", np.asarray(self.gain_matrix * self.K2))
+            check_definite("Backstepping.gain_matrix", np.asarray(self.full_gain))
 
     def check_start(self, context: LawContext) -> None:
         """Raises ValueError for a matrix of another number of joints."""
@@ -168,19 +168,17 @@ class Backstepping(RobotLaw):
 
     @property
     def full_gain(self) -> jax.Array:
-        """K K2, or the diagonal matrix of K2, (n, n) [N m s/rad]."""
-        if self.gain_matrix is None:
-            return jnp.diag(self.K2)
-        return self.gain_matrix * self.K2
+        """K K2, (n, n), or K2, (n,), without a matrix [N m s/rad]."""
+        return self.K2 if self.gain_matrix is None else self.gain_matrix * self.K2
 
     @property
     def least_gain(self) -> jax.Array:
         """K2, or for each joint the least eigenvalue of the symmetric part of K K2, of which
         e2^T K K2 e2 is at least |e2|^2 times; (n,) [N m s/rad].
         """
-        if self.gain_matrix is None:
-            return self.K2
         full = self.full_gain
+        if self.gain_matrix is None:
+            return full
         least = jnp.linalg.eigvalsh(0.5 * (full + full.T))[0]
         return jnp.full(len(full), least)
 
