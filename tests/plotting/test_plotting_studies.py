@@ -8,7 +8,7 @@ import study_cases as cases
 from drawing import drawn, lines_of
 from refused import assert_refused
 
-from iblf_jax import Status, plotting
+from iblf_jax import plotting
 
 
 @pytest.fixture(scope="module")
@@ -23,11 +23,7 @@ def table():
 
 @pytest.mark.slow
 def test_the_overview_of_a_study_its_quantiles_and_histograms_of_every_run(study):
-    figure = drawn(study.plot(runs=256))
-    assert len(figure.axes) == 2 + 1 + 3
-    assert figure.axes[-1].get_xlabel() == "initial.q[1] [rad]"
-    assert "512 runs" in figure.get_suptitle()
-    assert f"{len(study.failed)} failed" in figure.get_suptitle()
+    assert f"512 runs, {len(study.failed)} failed" in drawn(study.plot(runs=256)).get_suptitle()
     figure = drawn(plotting.bands(study, runs=256))
     (median,) = lines_of(figure.axes[0], "50 %")
     expected = study.bands(runs=256).q.sel(quantile=0.5).values[:, 0]
@@ -36,25 +32,6 @@ def test_the_overview_of_a_study_its_quantiles_and_histograms_of_every_run(study
     figure = drawn(plotting.histograms(study, ["margin", "first_violation_time"]))
     counted = sum(patch.get_height() for patch in figure.axes[0].patches)
     assert counted == len(study) and "runs without a value" in figure.axes[1].get_title()
-    assert drawn(plotting.histograms(study)).axes
-
-
-def test_scatter_shows_the_correlation(study):
-    figure = drawn(plotting.scatter(study))
-    found = study.correlations(["margin"]).correlation
-    rho = float(found.sel(parameter="plant.mass[1]", metric="margin"))
-    assert figure.axes[0].get_title() == f"rank correlation {rho:.2f}"
-
-
-@pytest.mark.slow
-def test_heat_maps_show_shares_and_medians(table):
-    figure = drawn(plotting.heat_map(table, ["violated", "margin"]))
-    maps = [axes for axes in figure.axes if axes.images and not axes.get_label()]
-    shares, margins = (axes.images[0].get_array() for axes in maps)
-    violated = (table.status & int(Status.BOUND_VIOLATED)) != 0
-    np.testing.assert_array_equal(shares, violated.mean("run").T)
-    np.testing.assert_array_equal(margins, table.margin.min("joint").median("run").T)
-    assert maps[1].get_xlabel() == "controller.K2 [N m s/rad]"
 
 
 def test_bad_figures_are_refused(study, table):

@@ -64,26 +64,6 @@ def test_falsify_finds_worse_than_random_runs_and_returns_what_can_be_run(paper)
     assert np.all((again.q[0] > again.lower[0]) & (again.q[0] < again.upper[0]))
 
 
-@pytest.fixture(scope="module")
-def front(paper):
-    pair = (ij.objectives.tracking(), ij.objectives.effort())
-    return ij.pareto(paper, GAINS, pair, points=4, iterations=10, **SHORT)
-
-
-@pytest.mark.slow
-def test_pareto_is_a_front(paper, front):
-    a, b = front.objectives.T
-    assert len(front) >= 3
-    assert np.all(np.diff(a) > 0)
-    assert np.all(np.diff(b) < 0)
-    assert not np.any(np.all(front.tried[:, None] < front.objectives[None] - 1e-12, axis=-1))
-    assert a[0] < front.first[0] and b[-1] < front.first[1]
-    ise = [ij.simulate(x, **SHORT).metrics.ise.sum() for x in (front.scenario(0), paper)]
-    assert float(ise[0] / ise[1]) == pytest.approx(a[0], rel=1e-9)
-    with pytest.raises(ValueError, match="one term each"):
-        ij.pareto(paper, GAINS, (ij.objectives.tracking(), ij.objectives.peak_torque()), **SHORT)
-
-
 def area(points, corner):
     """What a front beats, of the logarithms below a corner: the hypervolume."""
     a, b = np.log(points[non_dominated(points)]).T
@@ -114,6 +94,8 @@ def test_a_front_has_its_ends_and_no_gaps(paper):
     assert front.evaluations <= 8 * 12
     metrics = ij.simulate(front.scenario(len(front) - 1), **SHORT).metrics
     assert float(np.min(metrics.margin)) > -float(limit.limit) - 1e-12
+    with pytest.raises(ValueError, match="one term each"):
+        ij.pareto(paper, GAINS, (pair[0], ij.objectives.peak_torque()), **SHORT)
 
 
 TUNING = """
@@ -178,44 +160,9 @@ def test_ends_of_ranges_are_found_at_zero_and_where_there_is_none():
 
 
 @pytest.mark.slow
-def test_figures(paper, front):
-    narrow = ij.tunable("controller.k1", low=1.0, high=2.5)
-    gains, goal = [narrow, "controller.K2"], ij.objectives.tracking()
-    best = ij.tune(paper, gains, goal, effort=ij.tuning.Effort(iterations=3), **SHORT)
-    figure = best.plot(points=3)
-    assert len(figure.axes) == 8
-    # All show torque and ends, although the objective contains neither.
-    runs = [ij.simulate(scenario, **SHORT) for scenario in (paper, best.scenario)]
-    peaks = [np.asarray(run.metrics.peak_torque) for run in runs]
-    assert best.at_limits["controller.k1[0]"] == (best.tuned[0], "upper", 2.5, "as given")
-    before, after = (", ".join(f"{x:.5g}" for x in peak) for peak in peaks)
-    largest = f"peak torque of the nominal run: {peaks[0].max():.5g} -> {peaks[1].max():.5g} N m"
-    assert largest in repr(best)
-    assert f"peak torque, joint by joint: {before} -> {after} N m" in str(best.report)
-    for text in (repr(best), str(best.report)):
-        assert "controller.k1[0] = 2.5 is at the upper end of its range, 2.5" in text
-    figure._repr_png_()
-    assert "at the end of their range: controller.k1[0]" in figure.get_suptitle().replace("\n", " ")
-    panels = {axes.get_ylabel(): axes for axes in figure.axes}
-    signed = [tau[np.argmax(np.abs(tau))] for run in runs for tau in np.asarray(run.tau).T]
-    shown = [text.get_text() for text in panels["peak torque [N m]"].texts]
-    assert shown == [f"{x:.3g}".replace("-", "\N{MINUS SIGN}") for x in signed]
-    gains = panels["gain, relative to start"]
-    legend = gains.get_legend()
-    assert not legend.get_window_extent().overlaps(gains.get_window_extent())
-    labels = [text.get_text() for text in legend.get_texts()]
-    assert "controller.k1[0] (at its upper limit 2.5)" in labels
-    a, b, loss = best.landscape("controller.k1[0]", "controller.K2[1]", points=3, span=0.2)
-    assert loss[1, 1] == pytest.approx(best.report.changes[0].after, rel=1e-9)
-    assert (a[1], b[1]) == (best.tuned[0], best.tuned[3])
-    assert_refused("landscape", best.landscape, "controller.k1[0]", "controller.o[0]")
-    assert front.plot().axes
-
-
-@pytest.mark.slow
 def test_the_path_of_a_tuning_across_what_is_allowed(paper):
     """Two gains, each one number for all joints; what the limit forbids is where runs break it."""
-    gains = [ij.tunable(path, tied=True) for path in GAINS]
+    gains = [ij.tunable(GAINS[0], 1.0, 2.5, tied=True), ij.tunable(GAINS[1], tied=True)]
     goal = ij.objectives.tracking() + ij.objectives.peak_torque_below(12.0)
     options = SHORT | {"effort": ij.tuning.Effort(iterations=3), "progress": False}
     best = ij.tune(paper, gains, goal, **options)
@@ -227,6 +174,21 @@ def test_the_path_of_a_tuning_across_what_is_allowed(paper):
         metrics = ij.simulate(ij.with_parameters(paper, values), **SHORT).metrics
         assert excess[i, j] == pytest.approx(float(np.max(metrics.peak_torque)) / 12 - 1, rel=1e-9)
         assert loss[i, j] == pytest.approx(float(np.sum(metrics.ise) / start), rel=1e-9)
+    figure = best.plot(points=3)
+    assert len(figure.axes) == 8
+    figure._repr_png_()
+    assert "at the end of their range: controller.k1" in figure.get_suptitle().replace("\n", " ")
+    panels = {axes.get_ylabel(): axes for axes in figure.axes}
+    runs = [ij.simulate(scenario, **SHORT) for scenario in (paper, best.scenario)]
+    signed = [tau[np.argmax(np.abs(tau))] for run in runs for tau in np.asarray(run.tau).T]
+    shown = [text.get_text() for text in panels["peak torque [N m]"].texts]
+    assert shown == [f"{x:.3g}".replace("-", "\N{MINUS SIGN}") for x in signed]
+    gains = panels["gain, relative to start"]
+    assert not gains.get_legend().get_window_extent().overlaps(gains.get_window_extent())
+    a, b, loss = best.landscape(*best.names, points=3, span=0.2)
+    assert loss[1, 1] == pytest.approx(best.report.changes[0].after, rel=1e-9)
+    assert (a[1], b[1]) == tuple(best.tuned)
+    assert_refused("landscape", best.landscape, best.names[0], "controller.o[0]")
     figure = Figure()
     others = {"grid": [[1.0, 3.0], [4.0, 40.0]]}
     assert ij.plotting.paths(best, others, points=5, figure=figure) is figure
