@@ -298,25 +298,18 @@ def test_lambda_max_over_the_box_of_many_joints():
 
 
 CALM = {"disturbance.acceleration_amplitude": 0.0, "disturbance.velocity_amplitude": 0.0}
-SEVERAL = {"plant.mass[1]": 1.2, "controller.k1": 8.0, "disturbance.phase": 2.0}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("changes", "still"),
-    [(SEVERAL | {"initial.q": [0.4, 0.7]}, False), (CALM | {"initial.dq": [3.0, 1.0]}, True)],
-    ids=["several", "no disturbance"],
-)
-def test_corrected_holds_on_other_runs(corrected_run, changes, still):
-    scenario = ij.with_parameters(corrected_run.scenario, changes)
+def test_corrected_holds_without_a_disturbance(corrected_run):
+    """V2 falls to what rounding leaves of it, and the envelope is followed down to there."""
+    scenario = ij.with_parameters(corrected_run.scenario, CALM | {"initial.dq": [3.0, 1.0]})
     certificate = certify(scenario, ij.simulate(scenario, **PAPER))
     assert certificate.holds, certificate
-    assert certificate.numbers["case"] == (1 if still else 2)
-    assert (certificate["envelope, case 1"].verdict == "holds") == still
-    assert certificate["e2"].equation == ("(3.23)" if still else "(3.31)")
-    if still:  # V2 falls to what rounding leaves of it, and the envelope is followed down to there.
-        assert certificate.numbers["V2_end"] < 1e-12
-        assert certificate["envelope, case 1"].tolerance < 1e-4
+    assert certificate.numbers["case"] == 1 and certificate["e2"].equation == "(3.23)"
+    assert certificate["envelope, case 1"].verdict == "holds"
+    assert certificate.numbers["V2_end"] < 1e-12
+    assert certificate["envelope, case 1"].tolerance < 1e-4
 
 
 LIGHT = {"controller.K2": [0.3, 0.1], "observer.kf": [0.4, 0.9], "controller.weight": [0.5, 0.05]}
@@ -508,17 +501,6 @@ def test_f_is_constant_only_where_nothing_that_changes_is_left_in_it(changes):
         assert (float(jnp.abs(seen.dd[0])) < 1e-9) == (not changes)
     other = ij.with_parameters(scenario, {"model.mass": 1.2})
     assert not terms_there(other, jnp.asarray(0.15), initial_state(other)).claims["torque"].steady
-
-
-@pytest.mark.slow
-def test_friction_of_one_robot_is_case_2():
-    scenario = one_joint(Growing(mass=[1.3], damping=0.5))
-    certificate = certify(scenario, **OWN)
-    assert certificate.holds and certificate.numbers["case"] == 2
-    # The same physics with a model that has none.
-    bare = certify(ij.with_parameters(scenario, {"model.damping": 0.0}), **OWN)
-    assert bare.numbers["F_d"] == pytest.approx(certificate.numbers["F_d"], rel=1e-9)
-    assert bare.holds
 
 
 @ij.component
@@ -783,23 +765,6 @@ def test_many_runs_and_studies_are_judged_at_their_worst_runs(corrected_run):
         ((ij.presets.zhang_yan_2024(law="log"), study), "a run of another kind of scenario"),
     ):
         assert_refused(words, certify, *arguments)
-
-
-@pytest.mark.slow
-def test_printed_breaks_its_claim_where_corrected_keeps_it():
-    scenarios = [ij.presets.printed_gap(variant=name) for name in ("printed", "corrected")]
-    printed, corrected = (certify(x, ij.simulate(x, **PAPER)) for x in scenarios)
-    for certificate in (printed, corrected):  # inside the paper's own conditions
-        for name in ("K2", "kf, case 1", "kf, case 2", "start inside"):
-            assert certificate[name].verdict == "holds"
-    broken = printed["inequality, case 1"]
-    assert broken.verdict == "fails" and broken.margin < -10.0
-    assert broken.time < 0.03
-    assert printed["inequality, case 2"].verdict == "fails"
-    assert printed["envelope, case 1"].verdict == "fails"
-    assert np.max(printed.traces.V) > 1.02 * printed.numbers["V2_start"]
-    assert corrected.holds, corrected
-    assert np.all(np.diff(corrected.traces.V[:200]) < 0)
 
 
 @pytest.mark.release

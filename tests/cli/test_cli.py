@@ -307,17 +307,6 @@ def test_refusals_are_one_line_and_exit_with_two(argv, message, command, paper, 
 
 
 @pytest.mark.slow
-def test_as_a_process_with_its_own_cache(tmp_path):
-    env = {key: value for key, value in os.environ.items() if not key.startswith("JAX_")}
-    env |= {"XDG_CACHE_HOME": str(tmp_path), "MPLBACKEND": "Agg"}
-    argv = [sys.executable, "-m", "iblf_jax", "simulate", "zhang_yan_2024"]
-    argv += ["--duration", "0.01", "--method", "euler"]
-    done = subprocess.run(argv, env=env, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stderr) == (0, "") and "status: ok" in done.stdout
-    assert any((tmp_path / "iblf_jax").iterdir())
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("module", "started"), [("_start", "-m"), ("iblf_jax.cli", "-m"), ("jax", "script")]
 )

@@ -159,55 +159,6 @@ def test_the_least_decay_of_a_sum_is_that_of_the_worst_distribution(rng):
     assert least >= np.min(found) * 0.98
 
 
-Z = jnp.asarray([1e-4, 3e-3, 0.05, 0.8, 6.0])
-K = jnp.full(5, 2.0)
-
-
-def gains(decay, t=0.0, k=K):
-    """The gain at several values of z = sqrt(2V)."""
-    return np.asarray(decay.effective_gain(jnp.asarray(t), k, 0.5 * Z**2))
-
-
-def test_limits():
-    np.testing.assert_allclose(gains(decays.FiniteTime(k_a=3.0, a=1.0)), 5.0)
-    np.testing.assert_allclose(gains(decays.FixedTime(3.0, 4.0, a=1.0, b=1.0)), 9.0)
-    np.testing.assert_allclose(gains(decays.PrescribedTime(T=1e9)), 2.0, rtol=1e-8)
-    capped = decays.PrescribedTime(T=1.0, gain=3.0, cap=30.0)
-    np.testing.assert_allclose(gains(capped, t=1.0), 32.0, rtol=1e-14)
-    np.testing.assert_allclose(gains(capped, t=70.0), 32.0, rtol=1e-14)
-    np.testing.assert_allclose(gains(capped, t=0.8 - 1e-9), 2.0 + 3.0 / 0.2, rtol=1e-7)
-    np.testing.assert_allclose(gains(decays.FiniteTime(1.5, 0.4, 1e-9)), 2.0 + 1.5 * Z**-0.6)
-
-
-@pytest.mark.parametrize("barrier", [x() for x in barriers.MEMBERS.values()])
-def test_v_decays_at_the_rate_of_the_gain_of_the_instant(barrier, rng):
-    """V1' <= -rate(k(t, V1)) V1 along q' = alpha, an equality where the barrier states one."""
-    law = controllers.Backstepping(2.0, 20.0, barrier=barrier, decays=of_package(FIXED))
-    scenario = ij.with_parts(ij.presets.zhang_yan_2024(), controller=law)
-    context, decay = scenario.context, scenario.controller.decays[0]
-
-    @jax.jit
-    def rates(t, xi):
-        tube = context.tube(t)
-        q = tube.q_d + xi * jnp.where(xi > 0, tube.k_u, tube.k_l)
-        V = barrier.value(tube, q)
-        gain = decay.effective_gain(t, scenario.controller.k1, V)
-        alpha = barrier.virtual_velocity(tube, q, gain, scenario.controller.o)
-
-        def value(t, q):
-            return barrier.value(context.tube(t), q)
-
-        return jax.jvp(value, (t, q), (jnp.ones_like(t), alpha))[1], barrier.decay_rate(gain) * V
-
-    excess = []
-    for t in rng.uniform(0.0, 6.0, 60):
-        dV, decayed = rates(jnp.asarray(t), jnp.asarray(rng.uniform(-0.95, 0.95, 2)))
-        excess.append((dV + decayed) / (1.0 + decayed))
-    assert np.max(excess) < 1e-12
-    is_exact = isinstance(barrier, barriers.TransformedError | barriers.Tan | barriers.Quadratic)
-    assert np.min(excess) > -1e-12 or not is_exact
-
-
 def test_units():
     units = {p.path: p.unit for p in ij.parameters(arm_scenario(PAIRS["mixed"]))}
     assert units["controller.decays[0].delta"] == "rad"

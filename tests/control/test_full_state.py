@@ -153,21 +153,6 @@ def test_any_two_barriers_keep_their_inequality_at_every_state(first, second, we
     np.testing.assert_allclose(proof.V, expected, rtol=1e-9)
 
 
-@pytest.mark.slow
-def test_rate_gain_and_envelope_of_the_certificate():
-    """Its lines are among the texts of `test_certificate_texts.py`."""
-    certificate = ij.certify(ij.presets.zhang_yan_2024_full_state(), duration=3.0, dt=5e-4)
-    lines = {line.name: line for line in certificate.lines}
-    assert certificate.verdict == "holds"
-    rho, smallest = lines["rho, case 2"].value, certificate.numbers["lambda_min_run"]
-    assert rho == pytest.approx(min(4.0, 40.0, 2 * (100.0 - 0.5 - 0.25 / (8.0 * smallest**2))))
-    assert lines["kf and c, case 2"].margin == pytest.approx(99.5 - 0.25 / (8.0 * smallest**2))
-    assert np.all(certificate.traces.e2 <= certificate.traces.e2_bound)
-    V, t, F_d = certificate.traces.V, certificate.traces.t, certificate.numbers["F_d"]
-    expected = V[0] * np.exp(-4.0 * t) + 0.5 * F_d**2 / 4.0
-    np.testing.assert_allclose(certificate.traces.envelope, expected, rtol=1e-9)
-
-
 class Pieces:
     """The independent loop from event to event of e2_i = 0: each joint above 0, below it, or (None)
     sliding along it; `push`: time and size of a torque that appears during the run."""

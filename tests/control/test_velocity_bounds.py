@@ -50,19 +50,6 @@ def test_what_is_watched_is_what_the_samples_say():
     np.testing.assert_array_equal(data.dq_upper, run.dq_upper)
 
 
-@pytest.mark.slow
-def test_a_violation_is_flagged_with_time_and_joint():
-    words = r"Joint 1 left its velocity bounds first, at t = 0\.00\d s"
-    with pytest.warns(ij.SimulationWarning, match=words):
-        run = ij.simulate(paper(speeds((-0.5, -0.3), (0.6, 0.5))), **SHORT)
-    assert ij.Status(int(run.status)) == ij.Status.VELOCITY_VIOLATED | ij.Status.ALPHA_INFEASIBLE
-    outside = np.asarray((run.dq <= run.dq_lower) | (run.dq >= run.dq_upper))
-    first = int(np.flatnonzero(outside.any(axis=1))[0])
-    assert float(run.metrics.first_velocity_violation_time) == pytest.approx(float(run.t[first]))
-    assert int(run.metrics.first_velocity_violation_joint) == 1
-    assert float(np.min(run.metrics.velocity_margin)) < 0
-
-
 def test_a_funnel_of_velocities_follows_the_reference():
     funnel = bounds.Bounds(lower=bounds.Funnel(-1.0, -0.2, 2.0), upper=bounds.Funnel(1.5, 0.2, 2.0))
     context, t = paper(funnel).context, jnp.asarray(0.7)

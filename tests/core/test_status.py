@@ -31,27 +31,6 @@ def all_finite(run) -> bool:
     return all(np.all(np.isfinite(x)) for name, x in arrays.items() if name not in MAY_BE_INFINITE)
 
 
-@pytest.fixture(scope="module")
-def thrown(paper):
-    """A start so near the upper bound of joint 0, 1.04, and so fast, that it leaves it."""
-    return ij.with_parameters(paper, {"initial.q": [1.02, 0.8], "initial.dq": [30.0, 0.0]})
-
-
-@pytest.mark.slow
-def test_violation_with_joint_and_time(thrown):
-    with pytest.warns(ij.SimulationWarning, match=r"Joint 0 left its bounds first, at t = 0\.0"):
-        run = ij.simulate(thrown, **SHORT)
-    assert int(run.status) & Status.BOUND_VIOLATED and int(run.status) & Status.GUARD_ACTIVE
-    outside = np.any((run.q <= run.lower) | (run.q >= run.upper), axis=1)
-    assert float(run.metrics.first_violation_time) == pytest.approx(float(run.t[outside][0]))
-    assert int(run.metrics.first_violation_joint) == 0
-    margin = float(run.metrics.margin[0])
-    assert margin == pytest.approx(float(np.min((run.upper - run.q)[:, 0]))) and margin < 0
-    assert all_finite(run)
-    with pytest.raises(ij.SimulationError, match=r"bound was violated.*Joint 0"):
-        ij.simulate(thrown, **SHORT, throw=True)
-
-
 @pytest.mark.slow
 def test_the_guard_alone_is_not_a_failure(paper):
     law = dataclasses.replace(paper.controller, barrier=ij.barriers.Integral(guard=0.05))
@@ -125,13 +104,6 @@ def test_an_infeasible_reference_is_an_error_with_joint_and_time(paper):
     words = r"reference of joint 1: .* inside .* at t = (5\.49|11\.78|18\.06).*Assumption 2"
     with pytest.raises(ValueError, match=words):
         quiet(scenario, **PAPER)
-
-
-@pytest.mark.slow
-def test_nothing_raises_inside_jit_and_flags_come_back(thrown):
-    with warnings.catch_warnings(action="error"):
-        status = jax.jit(lambda s: ij.simulate(s, **SHORT, throw=True).status)(thrown)
-    assert int(status) & Status.BOUND_VIOLATED
 
 
 @pytest.mark.parametrize("flag", list(Status), ids=lambda flag: flag.name)

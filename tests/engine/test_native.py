@@ -41,7 +41,7 @@ def draws(name, scenario, dtype):
 outcome_of = partial(jax.jit, static_argnames="request")(run_batch)
 CASES = [
     *(("zhang_yan_2024", "float64"), ("zhang_yan_2024", "float32")),
-    *(("zhang_yan_2024_full_state", "float64"), ("motor_driven_pendulum", "float64")),
+    ("motor_driven_pendulum", "float64"),
 ]
 """The pendulum with a drive stands for plants in strict-feedback form, the paper's preset for its
 variants and robots; `test_programs_of_members` compares shorter runs of all."""

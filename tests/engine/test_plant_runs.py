@@ -6,7 +6,6 @@ import jax.numpy as jnp
 import loops_of_plants
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 
 import iblf_jax as ij
 from iblf_jax.engine.structural_constants import robot_constants
@@ -14,18 +13,6 @@ from iblf_jax.simulation.paths import get
 
 SHORT = {"duration": 0.3, "dt": 1e-3}
 CASES = loops_of_plants.CASES
-
-
-@pytest.mark.slow
-def test_names_and_a_solution_of_scipy():
-    scenario = CASES["electric drive"]()
-    field = ij.vector_field(scenario)
-    assert "x[2, 0]" in field.names
-    options = {"rtol": 1e-10, "atol": 1e-12, "method": "LSODA"}
-    found = solve_ivp(field, (0.0, 0.3), np.asarray(field.start), **options)
-    run = ij.simulate(scenario, **SHORT)
-    np.testing.assert_allclose(found.y[: scenario.n, -1], run.q[-1], atol=1e-9)
-    np.testing.assert_array_equal(field.unpack(found.y.T).x.shape[1:], run.x.shape[1:])
 
 
 LEAVES = {

@@ -360,7 +360,6 @@ MOTOR = ij.actuators.Motor(bandwidth=300.0)
 PARTS = {
     "reference": Switched(before=[0.7, 0.7], after=[0.72, 0.69], time=0.0537),
     "actuator": ij.actuators.Chain((ij.actuators.Fault(0.8, time=0.0537), MOTOR)),
-    "plant": ij.plants.Switched(SLOW.plant, {"payload": (0.0, 0.5)}, [0.0537]),
 }
 
 

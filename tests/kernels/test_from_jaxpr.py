@@ -82,9 +82,7 @@ def stepped(program, shared, lane, carry, steps: int) -> np.ndarray:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name", ["law adaptive_rbf", "disturbance sum", "reference waypoint_spline", "robot arm"]
-)
+@pytest.mark.parametrize("name", ["disturbance sum", "reference waypoint_spline"])
 def test_program_and_kernel_do_what_the_step_does(name, monkeypatch):
     """As one function, and with its stages as calls.  `test_programs_of_members` runs the kernels
     of all members on CPUs, `test_cuda`, on a GPU, those for GPUs, and `test_operations` each

@@ -17,7 +17,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 AGAIN = {
     "the paper": [
-        "simulation/test_paper.py::test_all_four_variants_at_one_millisecond[integral-printed]",
+        "simulation/test_paper.py::test_both_laws_at_one_millisecond[integral-printed]",
         "simulation/test_paper.py::test_what_the_paper_shows",
     ],
     "shapes": ["engine/test_loops.py::test_every_loop_makes_the_same_run[euler-None]"],

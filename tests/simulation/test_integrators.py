@@ -12,28 +12,6 @@ methods = pytest.mark.parametrize("method", TABLEAUS)
 
 
 @methods
-def test_order_conditions(method):
-    """Butcher's conditions hold up to the order that the table claims, and not beyond."""
-    table = tableau(method)
-    s = len(table.b)
-    a, b, c = np.zeros((s, s)), np.asarray(table.b), np.asarray(table.c)
-    for i, row in enumerate(table.a):
-        a[i, : len(row)] = row
-    np.testing.assert_allclose(a.sum(axis=1), c)
-    conditions = {
-        1: [b.sum() - 1],
-        2: [b @ c - 1 / 2],
-        3: [b @ c**2 - 1 / 3, b @ a @ c - 1 / 6],
-        4: [b @ c**3 - 1 / 4, (b * c) @ a @ c - 1 / 8, b @ a @ c**2 - 1 / 12],
-        5: [b @ c**4 - 1 / 5],
-    }
-    conditions[4].append(b @ a @ a @ c - 1 / 24)
-    for order in range(1, table.order + 1):
-        np.testing.assert_allclose(conditions[order], 0, atol=1e-15)
-    assert max(abs(x) for x in conditions[table.order + 1]) > 1e-3
-
-
-@methods
 def test_stability_limit(method):
     """y' = -y: the amplification of one step reaches 1 at the limit that the table states."""
 

@@ -12,7 +12,6 @@ import sys
 import time
 from pathlib import Path
 
-import loops_of_plants
 import numpy as np
 import pytest
 import study_cases as cases
@@ -88,24 +87,6 @@ def test_designs_vectors_and_empty_grids():
     ways = {"controller.K2": ij.factor(ij.uniform(0.9, 1.1))}
     data = once(grid={}, perturbations=ways, runs=2)
     assert dict(data["margin"].sizes) == {"run": 2, "joint": 2} and data.attrs["cases"] == 2
-
-
-@pytest.mark.slow
-def test_executors_give_the_same_numbers_and_a_sweep_over_a_gain_of_a_level_is_stored(tmp_path):
-    brief = {"duration": 0.08, "dt": 1e-3}
-    scenario = loops_of_plants.flexible_joint()
-    draws = {"plant.stiffness": ij.factor(ij.uniform(0.8, 1.2))}
-    few = {"runs": 8, "progress": False} | brief
-    runs = [ij.monte_carlo(scenario, draws, backend=name, **few) for name in ("native", "vmap")]
-    for name in runs[0].metrics:
-        first, second = (np.asarray(run.metrics[name], float) for run in runs)
-        np.testing.assert_allclose(first, second, rtol=1e-7, atol=1e-9, err_msg=name)
-    options = {"store": str(tmp_path / "sweep.zarr"), "progress": False} | brief
-    grid = {"controller.k[2]": [20.0, 30.0]}
-    first = ij.sweep(loops_of_plants.user_class(), grid, **options)
-    again = ij.sweep(loops_of_plants.user_class(), grid, **options)
-    np.testing.assert_array_equal(first["rmse"], again["rmse"])
-    assert first.sizes["controller.k[2]"] == 2
 
 
 @pytest.mark.parametrize(

@@ -237,36 +237,6 @@ def test_in_lock_step_the_efforts_are_those_of_the_simulation(client, nodes, pac
     assert client.diagnostics["samples"] == str(len(run.t) - 1)
 
 
-def test_start_hold_and_stop(client, nodes):
-    """Nothing is published before the first complete and fresh state."""
-    nodes.begin(hold_stiffness="[10.0, 5.0]", hold_damping="[0.0, 0.0]")
-    client.connect()
-    for state in ({"names": ("joint_1",), "q": (0.5,)}, {"q": (0.5, math.nan)}, {"stamp": 1.0}):
-        client.drive_for(0.2, **state)
-    assert client.mode == "waiting"
-    assert not client.call("start", drives=False).success
-    assert client.efforts == []
-    client.reach("stopped")
-    assert set(map(tuple, client.efforts)) == {(0.0, 0.0)}
-    response = client.call("start")
-    assert response.success and "runs from t = 0 s" in response.message
-    client.reach("running")
-    client.drive_for(0.2)
-    assert client.efforts[-1] != [0.0, 0.0]
-    assert client.call("hold").success
-    client.reach("holding")
-    client.drive_for(0.2)
-    held = client.efforts[-1]
-    client.drive_for(0.2, q=(INSIDE[0] + 0.01, INSIDE[1] + 0.02))
-    change = np.subtract(client.efforts[-1], held)
-    # The stiffness, and the small change of gravity.
-    assert np.all(np.abs(change - [-0.1, -0.1]) < [0.5, 0.2])
-    assert client.call("stop").success
-    client.reach("stopped")
-    client.drive_for(0.2)
-    assert client.efforts[-1] == [0.0, 0.0]
-
-
 @pytest.mark.parametrize("trigger", ["timer", "state"])
 def test_a_best_effort_driver_reaches_the_trigger_timer_only(client, nodes, trigger):
     quality = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
