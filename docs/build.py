@@ -230,7 +230,10 @@ def assemble() -> None:
         law: ij.presets.zhang_yan_2024(law=law, variant="corrected")
         for law in ("integral", "log", "tan", "pd")
     }
-    ij.explore(laws).save(SOURCE / "extra" / "live_loop.html")
+    page = ij.explore(laws)
+    if page.fallback:
+        sys.exit('the live page needs ziglang: pip install ".[export]"')
+    page.save(SOURCE / "extra" / "live_loop.html")
     reference.write(SOURCE / "reference")
     flags.write(SOURCE / "how_to")
     barriers.write(SOURCE / "theory")

@@ -56,7 +56,10 @@ def build(command: Sequence[str], folder: Path) -> None:
         done = subprocess.run(
             command, cwd=folder, capture_output=True, text=True, timeout=TIMEOUT, check=False
         )
-    except (OSError, subprocess.TimeoutExpired) as error:
+    except subprocess.TimeoutExpired:
+        words = f"the C compiler {command[0]} took more than {TIMEOUT:g} s: repeat this when the"
+        raise ToolchainError(f"{words} machine has less to do") from None
+    except OSError as error:
         raise ToolchainError(f"the C compiler could not be run: {error}") from None
     if done.returncode:
         raise ToolchainError(f"the C compiler failed: {done.stderr[:MAX_OUTPUT]}")

@@ -21,7 +21,7 @@ from iblf_jax.core import checks, notices, tables
 from iblf_jax.core.status import FAILED, WORDS
 from iblf_jax.deployment.cosimulate import check_single
 from iblf_jax.deployment.export import export
-from iblf_jax.kernels import ToolchainError
+from iblf_jax.kernels import ToolchainError, has_ziglang
 from iblf_jax.reports import card
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.paths import sign_at
@@ -99,6 +99,7 @@ def explore(
 
     Raises:
       ValueError: bad arguments, or a loop that cannot be written out.
+      ToolchainError: `ziglang` is installed, and failed or took too long.
 
     Source: design of this package.
     """
@@ -108,6 +109,8 @@ def explore(
     try:
         loops = {name: _loop(each, dt, method) for name, each in several.items()}
     except ToolchainError as error:
+        if has_ziglang():
+            raise  # The page would hide that the compiler was too slow, or failed.
         first = next(iter(several.values()))
         return Page("", f"<p>{html.escape(str(error))}; without it nothing moves.</p>{card(first)}")
     values = {

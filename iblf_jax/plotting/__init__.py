@@ -11,6 +11,12 @@ select one run of a batch first.
 
 Every function also takes `style="paper"` (one column of IEEE), or a `Paper` with another publisher
 or two columns, and `figure=`, a matplotlib Figure or SubFigure to draw into, which it returns.
+
+`ax=` draws into the user's panels, and returns them: an Axes, or as many as the figure has panels,
+`plotting.positions(run, ax=plt.subplots(2)[1])` for two joints.  There a figure against time has no
+column that magnifies the start; with `zoom=0.3` the panels show the first 0.3 s.  The first Axes
+has the title and the legend.  `comparison`, `failure_probability`, `identification`, `overview` and
+`tuning` arrange panels of several kinds, and refuse `ax=`.
 """
 
 from iblf_jax.plotting._failures import failure_probability as failure_probability

@@ -2,7 +2,8 @@
 
 A figure against time has one row per panel; a second column magnifies the start of the run, so
 that the magnification covers no curve.  Its titles state why it ends where it does, and the range
-of the signal after it.
+of the signal after it.  The user's panels, `ax=`, have no such column: they show the whole run, or
+its start if `zoom` is given.
 
 Source: Zhang & Yan 2024, figures 1 to 6.
 """
@@ -13,7 +14,7 @@ import dataclasses
 import string
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -138,6 +139,16 @@ def _rows_with_zoom(
 ) -> Figure:
     """A figure of rows against time, with the start magnified in a second column."""
     full, start = windows(curves, rows, zoom, transients)
+    given = _style.given_panels(len(rows))
+    if given is not None:
+        for axes, row in zip(given, rows, strict=True):
+            show(axes, curves, row.quantity, row.joint, full if zoom is None else start)
+            axes.set_ylabel(row.label)
+        _style.time_axis(given[-1])
+        figure = cast(Figure, given[0].figure)
+        _style.set_title(figure, title, curves, notes=notes)
+        _style.legend_below(figure)
+        return figure
     figure = _style.new_figure(_style.WIDTH, 1.0 + (height + TITLE_HEIGHT) * len(rows))
     table = figure.subplots(len(rows), 2, sharex="col", squeeze=False, width_ratios=columns)
     for (main, inset), row in zip(table, rows, strict=True):
@@ -219,8 +230,7 @@ def tube(scenario: Scenario, *, duration: float = 20.0) -> Figure:
         raise checks.fail("scenario", type(scenario).__name__, "one Scenario", remedy)
     t = np.linspace(0.0, checks.positive_number("duration", duration, "s"), POINTS)
     tube = jax.vmap(scenario.context.tube)(jnp.asarray(t, scenario.initial.q.dtype))
-    figure = _style.new_figure(7.2, 0.6 + 1.4 * scenario.n)
-    panels = figure.subplots(scenario.n, 1, sharex=True, squeeze=False)[:, 0]
+    figure, panels = _style.panels(7.2, 0.6 + 1.4 * scenario.n, scenario.n)
     names = plants.component_names(scenario.plant)
     start = {"color": _style.colour(0), "clip_on": False, "zorder": 5, "label": "start"}
     for i, (axes, name) in enumerate(zip(panels, names, strict=True)):
@@ -241,7 +251,7 @@ def tube(scenario: Scenario, *, duration: float = 20.0) -> Figure:
 @_style.figure_function
 def joint(runs: Runs, joint: int | str = 0, *, zoom: float | None = None) -> Figure:
     """Position of one joint between its bounds, and its error e1 between -k_l and k_u: the paper's
-    figures 1 and 2.
+    figures 1 and 2.  A single Axes, `ax=`, shows the position.
 
     Args:
       runs: one run, or a dict of runs by name.
@@ -259,9 +269,11 @@ def joint(runs: Runs, joint: int | str = 0, *, zoom: float | None = None) -> Fig
     scenario = curves[0].run.scenario
     quantities = [quantity_of(scenario, field, joint) for field in ("q", "e1")]
     rows = [PanelRow(quantity, joint, quantity.label) for quantity in quantities]
-    title = (
-        f"{quantities[0].name.capitalize()} and tracking error of {curves[0].joint_label(joint)}"
-    )
+    signals = f"{quantities[0].name.capitalize()} and tracking error"
+    if _style.count_of_given_panels() == 1:
+        rows = rows[:1]
+        signals = quantities[0].name.capitalize()
+    title = f"{signals} of {curves[0].joint_label(joint)}"
     return _rows_with_zoom(title, curves, rows, zoom, 2.1)
 
 
@@ -556,8 +568,7 @@ def _portrait(
     if curves[0].run.n < 2:
         expected = "runs of at least two joints"
         raise checks.fail("runs", "runs of one joint", expected, "A phase portrait has two axes.")
-    figure = _style.new_figure(4.6, 4.9)
-    axes = figure.subplots()
+    figure, (axes,) = _style.panels(4.6, 4.9)
     draw_phase_portrait(axes, curves, joints)
     if names is not None:
         units = [quantity_of(curves[0].run.scenario, "q", joint).unit for joint in joints]
@@ -589,8 +600,7 @@ def velocity_portrait(runs: Runs, joint: int | str = 0) -> Figure:
     """
     curves = curves_of(runs)
     joint = check_joint(curves, joint)
-    figure = _style.new_figure(4.9, 4.6)
-    axes = figure.subplots()
+    figure, (axes,) = _style.panels(4.9, 4.6)
     for curve in distinct(curves, BOX, [joint]):
         _draw_box(axes, curve, joint)
     for curve in distinct(curves, ["q_d", "dq_d"], [joint]):

@@ -4,6 +4,7 @@ estimate and Lyapunov function.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -214,5 +215,5 @@ def _regions(figure: Figure, where: SubplotSpec, curve: Curve, window: Window) -
     axes.axhline(0.0, color=_style.failure(), linewidth=1.0)
     _style.time_axis(axes, window)
     axes.set_ylabel(quantity.label)
-    for line in draw_paths(figure, grid[1], [curve]).get_lines():
+    for line in draw_paths(partial(figure.add_subplot, grid[1]), [curve]).get_lines():
         line.set_label("_")

@@ -43,8 +43,8 @@ def guaranteed_tube(found: Proof, *, runs: int = RUNS) -> Figure:
     count = checks.positive_integer("runs", runs, least=0, most=1000)
     tube = found.tube
     names = plants.component_names(found.scenario.plant)
-    figure = _style.new_figure(WIDTH, 0.9 + 1.9 * len(names))
-    panels = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
+    height = 0.9 + 1.9 * len(names)
+    figure, panels = _style.panels(WIDTH, height, len(names))
     shown = found.adversarial_runs(count) if count else []
     for i, axes in enumerate(panels):
         for side, text in ((tube.lower_bound, "bounds"), (tube.upper_bound, "_")):

@@ -5,7 +5,7 @@ and successful runs, and metrics against the drawn parameters.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -53,6 +53,9 @@ def _is_failed(study: Study) -> np.ndarray:
 
 
 def _grid(count: int, height: float) -> tuple[Figure, list[Axes]]:
+    given = _style.given_panels(count)
+    if given is not None:
+        return cast(Figure, given[0].figure), given
     sizes = _style.row_sizes(count, COLUMNS)
     figure = _style.new_figure(max(4.0, WIDTH * sizes[0] / COLUMNS), 0.8 + height * len(sizes))
     return figure, [axes for row in _style.panel_rows(figure, count, COLUMNS) for axes in row]
@@ -85,8 +88,8 @@ def bands(
       ValueError: not a Study, or invalid quantiles.
     """
     _check(study)
-    data = study.bands(quantiles, runs=runs, exclude_failed=exclude_failed)
     figure, panels = _grid(study.scenario.n, 2.4)
+    data = study.bands(quantiles, runs=runs, exclude_failed=exclude_failed)
     for joint, axes in enumerate(panels):
         _draw_bands(axes, data, joint, study)
     _style.set_heading(figure, [_bands_title(data)])
@@ -307,9 +310,9 @@ def study_overview(study: Study, *, runs: int = 512) -> Figure:
     _check(study)
     n = study.scenario.n
     drawn = statistics.scalar_samples(study.samples)
+    figure, panels = _grid(n + 1 + len(drawn), 2.3)
     data = study.bands(runs=runs)
     margins = statistics.worst_joint(study.metrics, "margin")
-    figure, panels = _grid(n + 1 + len(drawn), 2.3)
     for joint in range(n):
         _draw_bands(panels[joint], data, joint, study)
     _draw_histogram(panels[n], study, "margin", margins, 40)
@@ -342,8 +345,7 @@ def first_exit(found: FirstExit | Mapping[str, FirstExit]) -> Figure:
         raise checks.fail("found", found, "at least one FirstExit")
     for name, one in named.items():
         check_class(f"found[{name!r}]", one, FirstExit, "study.first_exit() returns one.")
-    figure = _style.new_figure(6.0, 3.8)
-    axes = figure.subplots()
+    figure, (axes,) = _style.panels(6.0, 3.8)
     for k, (name, one) in enumerate(named.items()):
         colour = _style.colour(k)
         label = escaped(name) or "share of runs"

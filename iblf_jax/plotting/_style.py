@@ -10,7 +10,7 @@ not registered with pyplot, so none stays open.
 
 `style="paper"` replaces this by what IEEE and Elsevier ask for: the width of a column or of two, a
 serif font of 8 pt, and no titles, which the caption of a paper has.  `figure_function` adds this
-choice, and that of a figure to draw into, to every public function.
+choice, and that of a figure or of panels to draw into, to every public function.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from contextvars import ContextVar
 from typing import Any, TypeVar, cast
 
 import matplotlib
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backend_bases import RendererBase
 from matplotlib.colors import to_hex, to_rgb, to_rgba
@@ -154,27 +155,30 @@ is the same everywhere; text of an SVG stays text."""
 
 _PAPER: ContextVar[Paper | None] = ContextVar("paper", default=None)
 """The style of the paper in which figures are made now."""
-_GIVEN: ContextVar[Figure | SubFigure | None] = ContextVar("figure", default=None)
-"""The figure of the user that the next figure is drawn into."""
+_GIVEN: ContextVar[Figure | SubFigure | list[Axes] | None] = ContextVar("figure", default=None)
+"""The figure, or the panels, of the user that the next figure is drawn into."""
 
 
 def figure_function(function: F) -> F:
-    """Decorator of a public function that returns a figure: adds the arguments style and figure.
+    """Decorator of a public function that returns a figure: adds the arguments style, figure and
+    ax.
 
     style: "paper" or a `Paper` for print; "screen" (the default) otherwise.
     figure: a matplotlib Figure or SubFigure to draw into, which is returned.
+    ax: a matplotlib Axes, or one for each panel, to draw into, which is returned.
     """
 
     @functools.wraps(function)
-    def styled_function(*args: Any, style: Any = "screen", figure: Any = None, **options: Any):
+    def styled_function(
+        *args: Any, style: Any = "screen", figure: Any = None, ax: Any = None, **options: Any
+    ):
         paper = _checked_style(style)
-        if figure is not None and not isinstance(figure, Figure | SubFigure):
-            remedy = "Such as plt.figure() or one of figure.subfigures(1, 2)."
-            raise checks.fail("figure", figure, "a matplotlib Figure or SubFigure", remedy)
-        tokens = _PAPER.set(paper), _GIVEN.set(figure)
+        given = _checked_place(figure, ax)
+        tokens = _PAPER.set(paper), _GIVEN.set(given)
         try:
             with styled():
-                return function(*args, **options)
+                made = function(*args, **options)
+            return made if ax is None else ax
         finally:
             _PAPER.reset(tokens[0])
             _GIVEN.reset(tokens[1])
@@ -184,6 +188,7 @@ def figure_function(function: F) -> F:
     added = [
         inspect.Parameter("style", keyword, default="screen", annotation="str | Paper"),
         inspect.Parameter("figure", keyword, default=None, annotation="Figure | SubFigure | None"),
+        inspect.Parameter("ax", keyword, default=None, annotation="Axes | Sequence[Axes] | None"),
     ]
     parameters = [*signature.parameters.values(), *added]
     styled_function.__signature__ = signature.replace(  # type: ignore[attr-defined]
@@ -199,6 +204,22 @@ def _checked_style(style: object) -> Paper | None:
     if style == "paper":
         return Paper()
     return None
+
+
+def _checked_place(figure: Any, ax: Any) -> Figure | SubFigure | list[Axes] | None:
+    """What the user gives to draw into."""
+    if ax is None:
+        if figure is not None and not isinstance(figure, Figure | SubFigure):
+            remedy = "Such as plt.figure() or one of figure.subfigures(1, 2)."
+            raise checks.fail("figure", figure, "a matplotlib Figure or SubFigure", remedy)
+        return figure
+    if figure is not None:
+        raise checks.fail("figure, ax", "both", "one of them", "Panels belong to their figure.")
+    panels = list(np.ravel(ax))
+    if not panels or not all(isinstance(axes, Axes) for axes in panels):
+        remedy = "Such as the second value of plt.subplots()."
+        raise checks.fail("ax", ax, "a matplotlib Axes, or one for each panel", remedy)
+    return panels
 
 
 @contextmanager
@@ -329,6 +350,10 @@ def new_figure(width: float, height: float) -> Any:
         has a width of its own.
     """
     given = _GIVEN.get()
+    if isinstance(given, list):
+        expected = "figure= in its place, because this figure arranges panels of several kinds"
+        remedy = "Such as plt.figure() or one of figure.subfigures(1, 2)."
+        raise checks.fail("ax", given[0], expected, remedy)
     if given is not None:
         parent: Any = given if isinstance(given, Figure) else given.figure
         if parent.get_layout_engine() is None:
@@ -343,6 +368,49 @@ def new_figure(width: float, height: float) -> Any:
     return StyledFigure(figsize=(width * growth, height * growth), layout="constrained")
 
 
+def count_of_given_panels() -> int:
+    """Number of the panels that the user has given as `ax=`."""
+    given = _GIVEN.get()
+    return len(given) if isinstance(given, list) else 0
+
+
+def given_panels(count: int, projection: str = "rectilinear") -> list[Axes] | None:
+    """The panels that the user has given as `ax=`, if any.
+
+    Args:
+      count: how many the figure needs.
+      projection: matplotlib's name of their projection.
+    """
+    given = _GIVEN.get()
+    if not isinstance(given, list):
+        return None
+    if len(given) != count:
+        remedy = f"Such as plt.subplots({count})[1]."
+        raise checks.fail("ax", f"{len(given)} Axes", f"{count}, one for each panel", remedy)
+    for axes in given:
+        if axes.name != projection:
+            remedy = f'Such as figure.add_subplot(projection="{projection}").'
+            raise checks.fail("ax", axes.name, f"an Axes with projection {projection!r}", remedy)
+    return given
+
+
+def panels(
+    width: float, height: float, rows: int = 1, projection: str = "rectilinear"
+) -> tuple[Any, list[Axes]]:
+    """A figure of panels one below the other, or the user's panels and their figure.
+
+    Args:
+      width, height: size as of `new_figure`.
+      rows: number of panels.
+      projection: matplotlib's name of their projection.
+    """
+    given = given_panels(rows, projection)
+    if given is not None:
+        return given[0].figure, given
+    figure, kind = new_figure(width, height), {"projection": projection}
+    return figure, list(figure.subplots(rows, sharex=True, squeeze=False, subplot_kw=kind)[:, 0])
+
+
 def in_paper() -> bool:
     """Whether the figure that is made now is one of a paper: its caption has what titles say."""
     return _PAPER.get() is not None
@@ -354,9 +422,10 @@ def is_narrow() -> bool:
     return paper is not None and paper.columns == 1
 
 
-def width_of(figure: Figure | SubFigure) -> float:
+def width_of(part: Figure | SubFigure | Axes) -> float:
     """The width of a figure, or of a part of one [in]."""
-    return float(figure.bbox.width / figure.dpi)
+    root: Any = part.figure
+    return float(part.bbox.width / root.dpi)
 
 
 # --- colours
@@ -507,16 +576,21 @@ def set_title(
 
 def set_heading(figure: Figure, lines: Sequence[str], **options: Any) -> None:
     """Sets the title of a figure from its lines; lines that are too long are broken.  In a paper
-    the caption says it.
+    the caption says it, and over the user's panels it is the title of the first one.
     """
     if in_paper():
+        return
+    given = _GIVEN.get()
+    if isinstance(given, list):
+        room = int(12 * width_of(given[0]) * 9.0 / size(9.0))
+        given[0].set_title("\n".join(textwrap.fill(line, room) for line in lines), **options)
         return
     room = int(12 * width_of(figure) * 9.0 / size(9.0))
     figure.suptitle("\n".join(textwrap.fill(line, room) for line in lines), **options)
 
 
 def legend_below(figure: Figure, columns: int = 5, of: Sequence[Axes] | None = None) -> None:
-    """Puts one legend under a figure, with each label once.
+    """Puts one legend under a figure, with each label once; into the first of the user's panels.
 
     Args:
       figure: the figure.
@@ -524,10 +598,16 @@ def legend_below(figure: Figure, columns: int = 5, of: Sequence[Axes] | None = N
       of: panels whose labels it shows; all panels if not given.
     """
     entries: dict[str, Any] = {}
+    given = _GIVEN.get()
+    if isinstance(given, list):
+        of = given
     for axes in of or figure.axes:
         for handle, text in zip(*axes.get_legend_handles_labels(), strict=True):
             entries.setdefault(text, handle)
     if not entries:
+        return
+    if isinstance(given, list):
+        given[0].legend(entries.values(), entries.keys())
         return
     characters = 4.5 + 0.56 * max(map(len, entries))  # line and label, in units of the text size
     room = int(width_of(figure) * 72 / (size(8.5) * characters))

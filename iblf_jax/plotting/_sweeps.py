@@ -104,8 +104,11 @@ def heat_map(
     width = _style.WIDTH
     if len(metrics) > 1:
         width = 5.2 * len(metrics)
-    figure = _style.new_figure(width, 4.2)
-    panels = figure.subplots(1, len(metrics), squeeze=False)[0]
+    panels = _style.given_panels(len(metrics))
+    if panels is None:
+        figure = _style.new_figure(width, 4.2)
+        panels = list(figure.subplots(1, len(metrics), squeeze=False)[0])
+    figure = panels[0].figure
     for axes, name in zip(panels, metrics, strict=True):
         _draw_heat_map(figure, axes, data, name, x, y, at)
     return figure
@@ -187,8 +190,7 @@ def parallel(data: xarray.Dataset, metric: str = "margin") -> Figure:
     low, high = raw.min(0), raw.max(0)
     width = np.where(high > low, high - low, 1.0)
     scaled = (raw - low) / width
-    figure = _style.new_figure(max(_style.WIDTH, 1.6 * len(columns)), 4.2)
-    axes = figure.subplots()
+    figure, (axes,) = _style.panels(max(_style.WIDTH, 1.6 * len(columns)), 4.2)
     norm = matplotlib.colors.Normalize(low[-1], low[-1] + width[-1])
     mapper = matplotlib.cm.ScalarMappable(norm, _style.colour_map(COLOURS))
     for line, y in sorted(zip(scaled, raw[:, -1], strict=True), key=lambda pair: pair[1]):

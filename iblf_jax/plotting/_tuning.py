@@ -320,8 +320,7 @@ def paths(
     logarithmic = bool(np.all(all_gains > 0))
     grid = [_axis(x, points, logarithmic=logarithmic) for x in all_gains.T]
     loss, excess = result.on_slice(names[0], names[1], *grid)
-    figure = _style.new_figure(0.8 * _style.WIDTH, 4.4)
-    axes = figure.subplots()
+    figure, (axes,) = _style.panels(0.8 * _style.WIDTH, 4.4)
     _draw_contours(axes, grid[0], grid[1], loss, 0.7, 14)
     violation = np.where(np.isfinite(excess), excess, 1.0)
     if np.any(violation > 0):
@@ -378,8 +377,7 @@ def pareto(front: results.ParetoFront) -> Figure:
     Source: design of this package.
     """
     check_class("front", front, results.ParetoFront, "ij.pareto returns one.")
-    figure = _style.new_figure(0.7 * _style.WIDTH, 3.6)
-    axes = figure.subplots()
+    figure, (axes,) = _style.panels(0.7 * _style.WIDTH, 3.6)
     dots: dict[str, Any] = {"linestyle": "none", "marker": ".", "markersize": 3}
     axes.plot(*front.tried.T, color=_style.bound(), label="trials", **dots)
     axes.plot(*front.objectives.T, marker="o", markersize=4, label="front", **_style.series(0))

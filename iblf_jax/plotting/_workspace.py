@@ -7,14 +7,13 @@ and spheres as nets; regions of other classes are not drawn.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.gridspec import SubplotSpec
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from iblf_jax.core import checks
@@ -194,15 +193,26 @@ def workspace(runs: Runs) -> Figure:
         together.
     """
     curves = curves_of(runs)
-    figure = _style.new_figure(4.9, 4.9)
-    draw_paths(figure, figure.add_gridspec(1, 1)[0], curves)
+
+    def add_panel(projection: str) -> Axes:
+        return _style.panels(4.9, 4.9, projection=projection)[1][0]
+
+    figure = draw_paths(add_panel, curves).figure
     _style.set_title(figure, "Paths and boundaries", curves)
     _style.legend_below(figure, 3)
     return figure
 
 
-def draw_paths(figure: Figure, where: SubplotSpec, curves: Sequence[Curve]) -> Any:
-    """Draws the paths of the runs and the boundaries of the first run; returns the panel."""
+def draw_paths(add_panel: Callable[..., Any], curves: Sequence[Curve]) -> Any:
+    """Draws the paths of the runs and the boundaries of the first run.
+
+    Args:
+      add_panel: adds a panel with a projection.
+      curves: the runs.
+
+    Returns:
+      The panel.
+    """
     first = curves[0]
     plant = first.run.scenario.loop.plant
     robot: Any = plant.robot  # regions need one
@@ -215,7 +225,7 @@ def draw_paths(figure: Figure, where: SubplotSpec, curves: Sequence[Curve]) -> A
     if any(x.shape[-1] != d for x in actual):
         came = "arms in the plane and in space"
         raise checks.fail("runs", came, "arms of one kind", "Draw them one by one.")
-    axes: Any = figure.add_subplot(where, projection="3d" if d == 3 else None)
+    axes = add_panel(projection="3d" if d == 3 else "rectilinear")
     points = np.concatenate([x.reshape(-1, d) for x in (desired, *actual)])
     limits = set_limits(axes, points, regions)
     draw_boundaries(axes, robot, regions, limits)

@@ -95,7 +95,7 @@ def monte_carlo(
     if is_empty and not (isinstance(scenario, Scenario) and has_noise(scenario)):
         remedy = "Without any all runs are the same: use ij.simulate."
         raise checks.fail("perturbations", perturbations, "at least one perturbation", remedy)
-    prepared = prepare(scenario, perturbations, options, metrics)
+    prepared = prepare(scenario, perturbations, options, metrics, in_memory=True)
     checks.fits_memory("runs", options.runs, case_bytes(prepared))
     with bar(progress, options.runs) as shown:
         results = run_all_cases(prepared, executor, shown.update)

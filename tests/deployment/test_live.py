@@ -11,9 +11,10 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from refused import assert_refused
 
 import iblf_jax as ij
-from iblf_jax.deployment import live
+from iblf_jax.deployment import build, live
 from iblf_jax.deployment.loop_program import shape_of
 from iblf_jax.kernels import ToolchainError
 from iblf_jax.world import plants
@@ -225,7 +226,12 @@ def test_a_notebook_shows_it_in_a_frame_and_without_a_compiler_its_figure(
         raise ToolchainError("ziglang is not installed")
 
     monkeypatch.setattr(live, "export", missing)
+    assert_refused("not installed", ij.explore, ij.presets.zhang_yan_2024(), error=ToolchainError)
+    monkeypatch.setattr(live, "has_ziglang", lambda: False)
     without = ij.explore(ij.presets.zhang_yan_2024())
     saved = without.save(tmp_path / "live.html").read_text(encoding="utf-8")
     for shown in (without._repr_html_(), saved):
         assert "ziglang is not installed" in shown and "data:image/png" in shown
+    monkeypatch.setattr(build, "TIMEOUT", 0.01)
+    slow = ["sleep", "9"]
+    assert_refused("sleep took more than 0.01 s", build.build, slow, tmp_path, error=ToolchainError)

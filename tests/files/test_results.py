@@ -257,6 +257,11 @@ def test_a_saved_result_comes_back(cls, tmp_path):
         if hasattr(cls, "plot") and not getattr(again, "is_batch", False):
             figure = Figure()
             assert again.plot(figure=figure) is figure and figure.axes
+            panels = Figure().subplots(len(figure.axes), squeeze=False)
+            if name in ("FirstExit", "ParetoFront", "Proof"):
+                assert again.plot(ax=panels) is panels
+            elif name != "Study":  # Its overview is a table of panels, as its other figures are.
+                assert_refused("expected figure= in its place", again.plot, ax=panels)
 
 
 @pytest.mark.slow

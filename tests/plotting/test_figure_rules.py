@@ -206,12 +206,14 @@ OF_RESULTS = {
 """The methods `plot` of results, which `test_results` calls with a figure."""
 ELSEWHERE = {"adaptation", "paths", "region_margins"}
 """The tests of adaptive laws, of searches and of regions call them with a figure."""
+OF_SEVERAL_KINDS = {"overview", "comparison", "failure_probability", "identification", "tuning"}
+"""Figures that refuse `ax=`; the test below and `test_results` call them."""
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(OF_RUNS | OF_STUDIES))
 def test_a_figure_is_drawn_into_the_users_figure_and_returned(name, short_run, study):
-    """Into a Figure, and into a SubFigure that leaves the other half alone."""
+    """Into a Figure, a SubFigure that leaves the other half alone, and panels of the user."""
     subject = short_run if name in OF_RUNS else study.scenario if name == "tube" else study
     draw = partial(getattr(plotting, name), cases.table() if name in OF_SWEEPS else subject)
     left, right = Figure(figsize=(12.0, 9.0)).subfigures(1, 2)
@@ -219,16 +221,28 @@ def test_a_figure_is_drawn_into_the_users_figure_and_returned(name, short_run, s
     assert left.axes and not right.axes
     alone = Figure()
     assert draw(figure=alone) is alone and alone.axes
+    panels = Figure().subplots(20)
+    if name in OF_SEVERAL_KINDS:
+        assert_refused("expected figure= in its place", draw, ax=panels)
+        return
+    with pytest.raises(ValueError, match="ax: got '20 Axes'") as refusal:
+        draw(ax=panels)
+    chosen = panels[: int(re.search(r"expected (\d+)", str(refusal.value))[1])]
+    assert draw(ax=chosen) is chosen
+    assert all(axes.has_data() for axes in chosen)
+    assert not any(axes.has_data() for axes in panels[len(chosen) :])
 
 
 def test_every_figure_function_takes_a_style_and_a_figure_and_is_called_with_one():
     assert set(PUBLIC) == OF_RUNS | OF_STUDIES | OF_RESULTS | ELSEWHERE
     for name in PUBLIC:
         parameters = inspect.signature(getattr(plotting, name)).parameters
-        assert {"style", "figure"} <= set(parameters), name
+        assert {"style", "figure", "ax"} <= set(parameters), name
     for options, message in (
         ({"style": "print"}, "style: got 'print'"),
         ({"figure": 3}, "figure: got 3, expected a matplotlib Figure"),
+        ({"ax": 3}, "ax: got 3, expected a matplotlib Axes"),
+        ({"ax": Figure().subplots(), "figure": Figure()}, "figure, ax: got 'both'"),
     ):
         assert_refused(message, plotting.positions, made_up(chain(1)), **options)
     assert_refused("publisher: got 'acm'", plotting.Paper, "acm")

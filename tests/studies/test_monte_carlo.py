@@ -22,7 +22,7 @@ import iblf_jax as ij
 from iblf_jax.certificates import counterexample
 from iblf_jax.core.status import Status
 from iblf_jax.engine import execute, sizes
-from iblf_jax.studies import execution, statistics, time_step
+from iblf_jax.studies import execution, statistics, study_setup, time_step
 from iblf_jax.studies.distributions import is_interval
 from iblf_jax.studies.draws import targets_of
 
@@ -285,6 +285,11 @@ TENTH = ij.factor(ij.uniform(0.9, 1.1))
 )
 def test_what_cannot_be_drawn_is_refused(call, message):
     assert_refused(message, call)
+
+
+def test_too_many_runs_are_refused_before_anything_is_compiled(monkeypatch):
+    monkeypatch.setattr(study_setup, "compile_batch", None)
+    assert_refused("runs: got 4294967296, .* GiB", refused({"plant.mass": TENTH}, runs=2**32))
 
 
 INTERRUPTED = """
