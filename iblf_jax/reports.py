@@ -348,6 +348,8 @@ def _other(result: Any) -> Shown:
     if has_members(result, "plot"):
         figures[FIGURES.get(name, "Figure")] = result.plot
     scenario = getattr(result, "scenario", None)
+    if not isinstance(scenario, Scenario):  # that of a front is a method: one for each point
+        scenario = None
     return Shown(name, _described(result), found, figures, scenario, on_card=len(found))
 
 

@@ -41,6 +41,7 @@ from proof_cases import pendulum, within
 from stored_results import FOLDER, stored
 
 import iblf_jax as ij
+from iblf_jax import reports
 from iblf_jax.core.status import Status
 from iblf_jax.engine import diagnosis
 from iblf_jax.files.scenario import scenario_to_toml
@@ -254,6 +255,16 @@ OF_PAIRS = (
 OF_RUNS = (ij.plotting.overview, ij.plotting.velocity_portrait, ij.plotting.workspace)
 
 
+def page_of(result: Any) -> Iterator[str]:
+    """The report of a result without its figures, its scenario and its last line."""
+    page = reports._page(reports.shown(result)._replace(figures={}), None)
+    body = re.split("<body>|<h2>As a file|<footer>", page)[1]
+    yield from re.split(r"(?=<(?:tr|h2|li|p)\b)", body.replace(LEFT, "<td left>"))
+
+
+LEFT = '<td style="text-align:left">'
+
+
 def of_file(name: str) -> Iterator[str]:
     result = stored(name)
     yield from printed(result)
@@ -261,6 +272,7 @@ def of_file(name: str) -> Iterator[str]:
         yield from drawn(figure)
     if hasattr(result, "to_dict"):
         yield from arrays("dict", result.to_dict())
+    yield from page_of(result)
 
 
 FLOWS |= {
