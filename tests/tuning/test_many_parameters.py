@@ -148,7 +148,6 @@ def test_a_mini_batch_finds_the_optimum_of_all_runs_and_values_compare_all_of_th
     [
         (lambda: Adam(batch=13), "12"),
         (lambda: Adam(batch=4, resample=True), "resample"),
-        (lambda: Adam(batch=0), "batch"),
         (lambda: Optax("lion"), "optax.GradientTransformation"),
         (lambda: Optax(optax.lbfgs()), "LBFGS"),
         (lambda: Optax(optax.add_noise(0.1, 0.5, key=1)), "random key"),
