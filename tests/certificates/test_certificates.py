@@ -297,21 +297,6 @@ def test_lambda_max_over_the_box_of_many_joints():
     assert extremes.lambda_min <= np.linalg.eigvalsh(jax.vmap(arm.mass_matrix)(some)).min()
 
 
-CALM = {"disturbance.acceleration_amplitude": 0.0, "disturbance.velocity_amplitude": 0.0}
-
-
-@pytest.mark.slow
-def test_corrected_holds_without_a_disturbance(corrected_run):
-    """V2 falls to what rounding leaves of it, and the envelope is followed down to there."""
-    scenario = ij.with_parameters(corrected_run.scenario, CALM | {"initial.dq": [3.0, 1.0]})
-    certificate = certify(scenario, ij.simulate(scenario, **PAPER))
-    assert certificate.holds, certificate
-    assert certificate.numbers["case"] == 1 and certificate["e2"].equation == "(3.23)"
-    assert certificate["envelope, case 1"].verdict == "holds"
-    assert certificate.numbers["V2_end"] < 1e-12
-    assert certificate["envelope, case 1"].tolerance < 1e-4
-
-
 LIGHT = {"controller.K2": [0.3, 0.1], "observer.kf": [0.4, 0.9], "controller.weight": [0.5, 0.05]}
 
 

@@ -227,7 +227,6 @@ def end_by(delay):
 
 test_refusals_name_the_field_and_the_remedy = refused(
     (lambda: ij.actuators.DeadZone(lower=0.1, upper=0.2), "DeadZone.lower"),
-    (lambda: ij.actuators.Delay(0.01, history=0), "Delay.history"),
     (lambda: with_actuator(IDEAL, ij.actuators.Delay(0.01)), "a Delay as the first part only"),
     (lambda: ij.with_parts(DELAYED, sampling=ij.Sampling(period=1e-3)), "Sampling"),
     (lambda: ij.vector_field(DELAYED), "past states"),

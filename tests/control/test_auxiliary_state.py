@@ -64,47 +64,28 @@ def test_the_vector_field_of_an_arm_is_that_of_the_independent_program(rng):
         np.testing.assert_allclose(sample.V, signals["V"], rtol=1e-12)
 
 
-@pytest.fixture(scope="module")
-def coupled():
-    """A chain of order 3 with coupled gains and bounds of all levels, under a tight limit."""
-    scenario = chain_cases.scenario("coupled")
-    law = controllers.Saturated(scenario.controller, limit=0.5, auxiliary=K)
-    return canonical(ij.with_parts(scenario, controller=law))
-
-
-def random_points(case, rng, count):
-    """States of a chain, estimates, and auxiliary states, by which the last level is moved."""
-    nothing = [0.0] * case.order
-    for t, x, _, _ in chains.random_states(case, (0.0,) * case.order, nothing, count=count):
-        aux = 0.1 * rng.normal(size=case.n)
-        x = [*x[:-1], [a + b for a, b in zip(x[-1], aux, strict=True)]]
-        yield t, x, aux
-
-
 @pytest.mark.slow
-def test_the_input_of_a_chain_is_that_of_the_independent_program(coupled, rng):
-    case = chains.CASES["coupled"]
-    field = jax.jit(evaluate)
+def test_the_input_of_a_chain_is_that_of_the_independent_program_and_V_has_its_rate(rng):
+    """Of order 3 with coupled gains and bounds of all levels; the auxiliary state moves the last
+    level."""
+    case, chain = chains.CASES["coupled"], chain_cases.scenario("coupled")
+    law = controllers.Saturated(chain.controller, limit=0.5, auxiliary=K)
+    coupled = ij.with_parts(chain, controller=law)
+    field, terms = jax.jit(evaluate), jax.jit(terms_at)
+    states = chains.random_states(case, (0.0,) * case.order, [0.0] * case.order, count=20)
     nothing = [[0.0] * case.n] * case.order
-    for t, x, aux in random_points(case, rng, 20):
-        limit, k = rng.uniform(0.1, 20), rng.uniform(1, 30)
+    for t, x, _, _ in states:
+        aux, limit, k = 0.1 * rng.normal(size=case.n), rng.uniform(0.1, 20), rng.uniform(1, 30)
+        x = [*x[:-1], [a + b for a, b in zip(x[-1], aux, strict=True)]]
         scenario = with_numbers(coupled, limit, k)
-        state = LoopState(np.asarray(x), AuxiliaryState((), aux), ())
-        rate, sample = field(scenario, t, jax.tree.map(jnp.asarray, state))
+        state = jax.tree.map(jnp.asarray, LoopState(np.asarray(x), AuxiliaryState((), aux), ()))
+        rate, sample = field(scenario, t, state)
         _, applied, aux_rate, control = other.limited_chain(case, limit, k, t, x, nothing, aux)
         np.testing.assert_allclose(sample.tau, applied, rtol=1e-12, atol=1e-12)
         found, size = rate.controller.auxiliary, np.max(np.abs(aux_rate))
         np.testing.assert_allclose(found, aux_rate, rtol=1e-11, atol=1e-12 * size)
         np.testing.assert_allclose(sample.V, control.V, rtol=1e-11)
-
-
-@pytest.mark.slow
-def test_the_rate_of_V_of_a_chain_with_bounds_of_every_level(coupled, rng):
-    terms = jax.jit(terms_at)
-    case = chains.CASES["coupled"]
-    for t, x, aux in random_points(case, rng, 10):
-        state = LoopState(np.asarray(x), AuxiliaryState((), aux), ())
-        proof = terms(coupled, jnp.asarray(t), jax.tree.map(jnp.asarray, state))
+        proof = terms(scenario, jnp.asarray(t), state)
         claim = proof.claims["levels"]
         assert not proof.excluded
         left = proof.dV + claim.dissipation - claim.disturbance_gain

@@ -192,8 +192,6 @@ def of_order_six():
 
 
 test_refusals = refused(
-    (lambda: decays.FiniteTime(k_a=1.0, a=-0.2), r"FiniteTime\.a"),
-    (lambda: decays.FiniteTime(k_a=1.0, delta=0.0), r"FiniteTime\.delta"),
     (lambda: under((decays.Exponential(),) * 3), "2 decays, one a level"),
     (lambda: under(barriers.Log()), r"Backstepping\.decays\[0\]"),
     (of_order_six, "5 continuous derivatives"),

@@ -151,9 +151,7 @@ def run_between(lower, upper):
 
 NOT_BETWEEN = r"SurfaceBarrier\.surface: .*expected lower < 0 < upper at t = 0"
 test_refusals_name_what_is_expected = refused(
-    (lambda: ij.presets.zhang_yan_2024(law="nonsense"), "mapping"),
     (lambda: controllers.Saturated(PD, limit=1.0, edge="soft"), "hard"),
-    (lambda: controllers.Saturated(PD, limit=0.0), "> 0"),
     (lambda: controllers.Saturated(3.0, limit=1.0), r"Saturated\.law"),
     (lambda: ij.observers.ExtendedState(), "bandwidth"),
     (lambda: ij.observers.ExtendedState(l1=1.0), "bandwidth"),

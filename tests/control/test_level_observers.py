@@ -140,7 +140,6 @@ def of_states(**fields):
 
 
 test_fields_that_do_not_fit_are_refused = refused(
-    (lambda: ij.observers.LevelObserver(gain=-1.0), "gain"),
     (lambda: ij.observers.LevelObserver(gain=1.0, start="off"), "start"),
     (lambda: of_states(measured=(2, 3)), "measured"),
     (lambda: of_states(measured=(1, 1)), "measured"),

@@ -39,6 +39,14 @@ def test_the_voltage_is_that_of_the_steady_current():
         np.testing.assert_allclose(command.input, expected, rtol=1e-14)
 
 
+def test_paths_reach_the_law_and_the_drive():
+    scenario = on(DRIVE, WithDrive(PD, drive=DRIVE))
+    values = {"controller.Kp": 30.0, "controller.drive.resistance": 2.0}
+    changed = ij.with_parameters(scenario, values)
+    np.testing.assert_array_equal(changed.controller.law.Kp, [30.0, 30.0])
+    np.testing.assert_array_equal(changed.controller.drive.resistance, [2.0, 2.0])
+
+
 @pytest.mark.slow
 def test_an_observer_receives_the_torque():
     """Its estimate contains the torque that the current lacks; tau is recorded as the voltage."""

@@ -8,7 +8,7 @@ import study_cases as cases
 from drawing import drawn, lines_of
 from refused import assert_refused
 
-from iblf_jax import plotting
+from iblf_jax import Status, plotting
 
 
 @pytest.fixture(scope="module")
@@ -32,6 +32,17 @@ def test_the_overview_of_a_study_its_quantiles_and_histograms_of_every_run(study
     figure = drawn(plotting.histograms(study, ["margin", "first_violation_time"]))
     counted = sum(patch.get_height() for patch in figure.axes[0].patches)
     assert counted == len(study) and "runs without a value" in figure.axes[1].get_title()
+
+
+@pytest.mark.slow
+def test_heat_maps_show_shares_and_medians(table):
+    figure = drawn(plotting.heat_map(table, ["violated", "margin"]))
+    maps = [axes for axes in figure.axes if axes.images and not axes.get_label()]
+    shares, margins = (axes.images[0].get_array() for axes in maps)
+    violated = (table.status & int(Status.BOUND_VIOLATED)) != 0
+    np.testing.assert_array_equal(shares, violated.mean("run").T)
+    np.testing.assert_array_equal(margins, table.margin.min("joint").median("run").T)
+    assert maps[1].get_xlabel() == "controller.K2 [N m s/rad]"
 
 
 def test_bad_figures_are_refused(study, table):

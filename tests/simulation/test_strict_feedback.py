@@ -49,6 +49,8 @@ def test_a_flexible_joint_starts_at_the_equilibrium_of_its_springs():
     gravity = np.asarray(scenario.plant.robot.gravity(jnp.asarray(other.ARM_START)))
     np.testing.assert_allclose(run.x[0, 2], other.ARM_START + gravity / other.STIFFNESS)
     np.testing.assert_allclose(run.x[0, 3], [0.1, 0.0])
+    field = ij.vector_field(scenario)
+    assert "x[2, 0]" in field.names and field.unpack(field.start).x.shape == (4, 2)
 
 
 def test_bounds_have_one_entry_for_each_level():

@@ -37,12 +37,10 @@ def test_effort_text_and_table_are_those_of_the_runs(comparison):
         np.testing.assert_allclose(after, before * comparison.factors[name], rtol=1e-12)
     text = repr(comparison)
     for words in (
-        *("twice the logarithmic", "Equal gains favour the integral form", "that of integral"),
-        *("RMS torque above gravity", "k1 = 2, K2 = 20 (integral, log)", "Kp = 60, Kd = 20 (pd)"),
+        *("Equal gains favour the integral form", "that of integral", "Kp = 60, Kd = 20 (pd)"),
     ):
         assert words in text
-    html = comparison._repr_html_()
-    assert html.count("<table>") == 2 and "twice the logarithmic" in html
+    assert comparison._repr_html_().count("<table>") == 2
     runs = comparison.rollouts
     for names in (["pd"], ["integral", "pd"]):
         without = dataclasses.replace(comparison, rollouts={name: runs[name] for name in names})

@@ -38,13 +38,6 @@ def results(study):
     return cases.named(study) | {"mode": study.fastest_mode}
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("chunk", [1, 300])
-def test_chunk_changes_nothing(study, chunk):
-    other = cases.study(executor=ij.studies.LocalExecutor(chunk=chunk))
-    assert cases.same(results(study), results(other))
-
-
 @pytest.mark.parametrize("runs", [1, 257])
 def test_number_of_runs_changes_no_run(study, runs):
     fewer = results(cases.study(runs=runs))
@@ -276,7 +269,6 @@ TENTH = ij.factor(ij.uniform(0.9, 1.1))
         (refused(sampler="halton"), "sobol"),
         (refused(runs=100, sampler="sobol"), "128"),
         (refused(runs=10, replicates=2), "replicates"),
-        (refused(duration=0.0105), "duration"),
         (lambda: ij.uniform(1.0, 1.0), "expected"),
         (lambda: ij.log_uniform(-1.0, 1.0), "expected"),
         (lambda: ij.choice([1.0, 2.0], weights=[1.0]), "expected"),

@@ -175,7 +175,6 @@ MASS = {"plant.mass": ij.factor(ij.uniform(0.9, 1.1))}
         (MASS, {"runs": 99, "estimator": "importance"}, ">= 100|100"),
         (MASS, {"confidence": 1.0}, "confidence"),
         (MASS, {"limit": np.nan}, "limit"),
-        (MASS, {"method": "leapfrog"}, "method: got 'leapfrog'"),
         (MASS, {"margin": "regions"}, "region_margin|regions"),
         ({}, {}, "at least one perturbation"),
         ({"plant.mass": 3.0}, {}, r"ij\.factor\(\.\.\.\)"),

@@ -77,6 +77,20 @@ def test_208_numbers_have_the_gradient_of_central_differences_and_are_tuned():
     assert np.ptp(np.asarray(best.scenario.controller.K / scheduled.controller.K)) > 0.1
 
 
+@pytest.mark.slow
+def test_both_modes_have_the_same_gradient_of_a_sampled_loop_with_noise_and_a_requirement(paper):
+    sensor = ij.sensors.Encoder(noise=1e-4, velocity=ij.sensors.Measured(noise=1e-3))
+    scenario = ij.with_parts(paper, sensor=sensor, sampling=ij.Sampling(2e-3))
+    gains, wanted = ["controller.K2", "controller.k1"], goal() + objectives.peak_torque_below(5.0)
+    options = {"duration": 0.1, "dt": 1e-3, "method": "euler", "perturbations": DRAWS, "runs": 3}
+    problem = TuningProblem.build(scenario, gains, wanted, **options).for_solver(LBFGS())
+    candidates = problem.candidates(problem.box.z[None])
+    reverse = evaluation.reverse_derivatives(problem, candidates)
+    forward = evaluation.forward_derivatives(problem, candidates)
+    np.testing.assert_allclose(reverse.gradient, forward.gradient, rtol=1e-10)
+    np.testing.assert_allclose(reverse.value.loss, forward.value.loss, rtol=1e-12)
+
+
 class Bowls:
     """An evaluator of the mean of |z - c_b|^2 over runs b, as `tuning.evaluation.Evaluator`."""
 
@@ -148,7 +162,6 @@ def test_a_mini_batch_finds_the_optimum_of_all_runs_and_values_compare_all_of_th
     [
         (lambda: Adam(batch=13), "12"),
         (lambda: Adam(batch=4, resample=True), "resample"),
-        (lambda: Adam(batch=0), "batch"),
         (lambda: Optax("lion"), "optax.GradientTransformation"),
         (lambda: Optax(optax.lbfgs()), "LBFGS"),
         (lambda: Optax(optax.add_noise(0.1, 0.5, key=1)), "random key"),

@@ -26,7 +26,7 @@ from iblf_jax.simulation.scenario import canonical
 from iblf_jax.tuning import LBFGS, SQP, Adam, _tune, evaluation
 from iblf_jax.tuning.checkpoints import load_checkpoint, save_checkpoint
 from iblf_jax.tuning.conflicts import conflicts_in_words
-from iblf_jax.tuning.evaluation import Derivatives, Value
+from iblf_jax.tuning.evaluation import Derivatives, Evaluator, Value
 from iblf_jax.tuning.parameters import Box, layout, squash, unsquash
 from iblf_jax.tuning.problem import TuningProblem
 from iblf_jax.tuning.quantities import Peak, Quantities, TimeIntegral
@@ -649,6 +649,20 @@ def test_the_report_has_warnings_about_the_tuned_gains_and_intervals_on_fresh_ru
     assert change.low < change.after - change.before < change.high < 0
     assert "significant" in str(report) and "NOT" not in str(report.changes[0])
     assert_refused("fresh", robust.check, seed=robust.setup.seed)
+
+
+@pytest.mark.slow
+def test_common_random_numbers(paper):
+    """The same draws for every start and every step; other seeds give others."""
+
+    def losses(seed):
+        options = SHORT | {"perturbations": DRAWS, "runs": 4, "seed": seed}
+        built = TuningProblem.build(paper, GAINS, objectives.tracking(scale=1.0), **options)
+        candidates = built.candidates(np.stack([built.box.z] * 2))
+        return Evaluator(built, candidates, "forward", built.search_space(60))(candidates.z)
+
+    one, again, other = (losses(seed).value.loss for seed in (0, 0, 1))
+    assert one[0] == one[1] == again[0] != other[0]
 
 
 @dataclasses.dataclass(frozen=True)

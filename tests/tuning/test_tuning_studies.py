@@ -180,6 +180,8 @@ def test_the_path_of_a_tuning_across_what_is_allowed(paper):
     assert "at the end of their range: controller.k1" in figure.get_suptitle().replace("\n", " ")
     panels = {axes.get_ylabel(): axes for axes in figure.axes}
     runs = [ij.simulate(scenario, **SHORT) for scenario in (paper, best.scenario)]
+    peaks = (", ".join(f"{x:.5g}" for x in run.metrics.peak_torque.tolist()) for run in runs)
+    assert f"peak torque, joint by joint: {' -> '.join(peaks)} N m" in str(best.report)
     signed = [tau[np.argmax(np.abs(tau))] for run in runs for tau in np.asarray(run.tau).T]
     shown = [text.get_text() for text in panels["peak torque [N m]"].texts]
     assert shown == [f"{x:.3g}".replace("-", "\N{MINUS SIGN}") for x in signed]

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from iblf_jax.robots import PlanarChain, TwoLink, energy_gradient, inverse_dynamics, momentum
+from iblf_jax.robots import PlanarChain, TwoLink
 
 import iblf_jax as ij
 from iblf_jax.core.linalg import solve_spd
@@ -50,37 +50,6 @@ def test_kinetic_and_potential_energy_from_positions(rng):
     assert 0.5 * v @ np.asarray(robot.mass_matrix(q)) @ v == pytest.approx(kinetic, rel=1e-8)
     assert float(robot.potential(q)) == pytest.approx(9.81 * masses @ centres(q).imag, rel=1e-12)
     np.testing.assert_allclose(robot.tip(q), [centres(q)[-1].real, centres(q)[-1].imag], atol=1e-12)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("n", [1, 5])
-def test_sums_along_a_chain_are_the_products_of_its_matrices(n, rng):
-    """H_ij = A_ij cos(phi_i - phi_j) of the absolute angles, with the lever arms of all masses."""
-    links = random_links(n, rng)
-    robot = PlanarChain(**links)
-    q, v, u, a = rng.uniform(-3, 3, (4, n))
-    arms = np.tril(np.ones((n + 1, n)), -1) * links["length"]
-    arms += np.eye(n + 1, n) * links["centre"]
-    masses = np.append(links["mass"], links["payload"])
-    A = arms.T @ (masses[:, None] * arms)
-    S, phi = np.tril(np.ones((n, n))), np.cumsum(q)
-    between = phi[:, None] - phi
-    M = S.T @ (A * np.cos(between) + np.diag(links["inertia"])) @ S
-    Cu = S.T @ (A * np.sin(between)) @ (np.cumsum(v) * np.cumsum(u))
-    Cv = S.T @ (A * np.sin(between)) @ np.cumsum(v) ** 2
-    G = 9.81 * S.T @ (arms.T @ masses * np.cos(phi))
-    slope = -S.T @ (np.cumsum(v) * ((A * np.sin(between)) @ np.cumsum(v)))
-    scale = np.max(np.abs(M)) * 9 * n
-    for found, expected in (
-        (robot.mass_matrix(q), M),
-        (robot.coriolis(q, v, u), Cu),
-        (robot.gravity(q), G),
-        (momentum(robot, q, v), M @ v),
-        (energy_gradient(robot, q, v), slope),
-        (inverse_dynamics(robot, q, v, u, a), Cu + G + M @ a),
-        (inverse_dynamics(robot, q, v, v, a), Cv + G + M @ a),
-    ):
-        np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-14 * scale)
 
 
 @pytest.mark.parametrize("n", [2, 7])

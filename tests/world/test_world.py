@@ -6,12 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from iblf_jax.bounds import tube_at
 from independent import Loop
 from scipy.interpolate import make_interp_spline
 
 import iblf_jax as ij
-from iblf_jax import bounds, disturbances, references
+from iblf_jax import disturbances, references
 from iblf_jax.simulation import closed_loop
 
 TWO_LINK = ij.presets.customary_two_link()
@@ -98,41 +97,6 @@ def test_the_heading_on_an_ellipse_is_along_its_tangent():
     turn = 2.0 * np.pi / 0.4
     grown = ellipse.position(1.0 + turn)[2] - ellipse.position(1.0)[2]
     assert grown == pytest.approx(2.0 * np.pi)
-
-
-@pytest.mark.parametrize(
-    "sides",
-    [
-        (bounds.Constant(0.1), bounds.Sinusoid(0.95, 0.05, 2.0, [0.0, 1.0])),
-        (bounds.Sinusoid(0.2, 0.14, 1.0, [1.57, 0.0]), bounds.Constant([0.9, 1.0])),
-        (bounds.Funnel(-0.5, -0.1, 1.5), bounds.Funnel(0.4, [0.1, 0.2], 0.7)),
-    ],
-    ids=["constant-sinusoid", "sinusoid-constant", "funnel"],
-)
-def test_tube_rates_against_finite_differences(sides):
-    reference = references.Sinusoid([0.5, 0.5], 0.1, 1.3, [0.0, 1.0])
-    at = jax.jit(lambda t: tube_at(reference, bounds.Bounds(*sides), t))
-    h = 1e-6
-    for t in (0.0, 0.8, 7.1):
-        tube, ahead, behind = at(t), at(t + h), at(t - h)
-        for value in ("q_d", "dq_d", "lower", "upper", "k_l", "k_u"):
-            difference = (getattr(ahead, value) - getattr(behind, value)) / (2 * h)
-            rate = getattr(tube, "ddq_d" if value == "dq_d" else f"d{value}")
-            np.testing.assert_allclose(rate, difference, atol=1e-8)
-        np.testing.assert_allclose(tube.xi(tube.upper), 1.0, rtol=1e-12)
-        np.testing.assert_allclose(tube.xi(tube.lower), -1.0, rtol=1e-12)
-        np.testing.assert_allclose(tube.xi(tube.q_d), 0.0)
-
-
-def test_the_tube_has_the_acceleration_of_its_reference():
-    sides = bounds.Bounds(lower=bounds.Funnel(-0.5, -0.1, 1.5), upper=bounds.Constant(3.0))
-    quintic = references.Quintic([0.1, 0.5], [0.9, -0.2], 2.5)
-    for reference in (quintic, references.WaypointSpline(TIMES, POINTS)):
-        acceleration = derivatives(reference.position, 2)
-        tube = jax.jit(lambda t, reference=reference: tube_at(reference, sides, t))
-        for t in (0.3, 1.7, 2.4):
-            expected = acceleration(t)[2]
-            np.testing.assert_allclose(tube(t).ddq_d, expected, rtol=1e-12, atol=1e-12)
 
 
 def test_a_reference_needs_two_derivatives_and_no_third():
