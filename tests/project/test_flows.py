@@ -35,7 +35,7 @@ import jax
 import numpy as np
 import pytest
 from compared_texts import same_row, same_text
-from made_up_runs import chain, made_up
+from made_up_runs import Arm3D, chain, made_up
 from matplotlib.colors import to_rgba_array
 from proof_cases import pendulum, within
 from stored_results import FOLDER, stored
@@ -221,6 +221,23 @@ def of_derivatives() -> Iterator[str]:
         return (run.e1**2).sum() + run.metrics["rmse"].sum()
 
     yield from arrays("gradient", jax.grad(loss)(np.array([3.0])))
+
+
+def of_figures() -> Iterator[str]:
+    """Those that no result has of its own, of runs in the plane and in space."""
+    yield from drawn(ij.plotting.tube(loop(), duration=3.0))
+    run = made_up(chain(2), duration=0.5)
+    for figure in ij.plotting.paper_figures({"a": run, "b": run}, note="made up").values():
+        yield from drawn(figure)
+    for robot in (chain(2), Arm3D(3)):
+        run = made_up(robot, duration=0.5)
+        point = run.scenario.loop.plant.robot.skeleton(run.q[0])[-1]
+        ball = ij.regions.Sphere(centre=point + 0.1, radius=0.15, keep="outside")
+        wall = ij.regions.HalfSpace(normal=1.0 + 0.0 * point, offset=float(point.sum()) + 0.1)
+        holder = dataclasses.replace(run.scenario, regions=(ball, wall))
+        near = dataclasses.replace(run, scenario=holder, region_margin=run.q[:, :2])
+        yield from drawn(ij.plotting.workspace(near))
+    yield from drawn(ij.plotting.region_margins(near))
 
 
 FLOWS: dict[str, Callable[[], Iterator[str]]] = {
