@@ -355,7 +355,7 @@ def tuning(problem: TuningProblem, z: np.ndarray, seed: int, effort: Effort) -> 
     seconds = time.process_time() - began
     outcome = _tune._outcome(search, stopped)
     violation, objective = search.state.incumbent_key
-    fine = problem.at_half_the_step().at_half_the_step().at_half_the_step()
+    fine = problem.at_half_the_step.at_half_the_step.at_half_the_step
     at_fine = float(evaluation.values(fine, outcome.z[None]).objective[0])
     is_resolved = abs(at_fine - objective) <= LARGEST_CHANGE * abs(objective)
     return {

@@ -32,7 +32,7 @@ from iblf_jax.core import devices
 from iblf_jax.core.disk_cache import keeps_programs
 from iblf_jax.core.kept_programs import COMPILE_EVENT, KeptProgram
 from iblf_jax.core.thread_options import current_options, process_options
-from iblf_jax.kernels import without_garbage_collection
+from iblf_jax.kernels import is_tracing, without_garbage_collection
 
 MAPS, MAX_MAPS = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
 MAX_MAP_FRACTION = 0.6
@@ -50,8 +50,6 @@ if jax.__version_info__ < (0, 11):
     SHORTEST_TO_COMPILE["xla_cpu_use_fusion_emitters"] = False
     # The code in one part, of up to 32: a quarter less of the time.
     SHORTEST_TO_COMPILE["xla_cpu_parallel_codegen_split_count"] = 1
-ZERO = np.zeros((), np.float32)
-"""Put on a device, it is a tracer while JAX traces the code into a program."""
 MAX_PROGRAMS = 512
 """Programs that are kept.  `simulate` uses five for a scenario, a study two, `certify` twelve."""
 
@@ -184,20 +182,17 @@ class StructuredFunction:
             options = None
         # A program from the disk is one for the only device.
         kept = kept and keeps_programs() and devices.is_alone()
-        if (options is not None or kept) and any(
-            isinstance(x, jax.core.Tracer) for x in (jax.device_put(ZERO), *leaves)
-        ):
-            options, kept = None, False
+        if options is not None or kept:
+            kinds = set(map(type, leaves))
+            if is_tracing() or any(issubclass(kind, jax.core.Tracer) for kind in kinds):
+                options, kept = None, False
         shapes = tuple([getattr(x, "shape", ()) for x in leaves])
         # The options are a part of the key: two programs may be made of one function.
         of_compiler = tuple((options or {}).items())
         key = (self._function, of_compiler, tuple(static), structure, shapes)
         if not kept:
             return self._programs.get(key, partial(self._copy, options))
-        # An array states its type itself, in a tenth of the time of `jax.typeof`.
-        typed = [x if isinstance(x, jax.Array) else jax.typeof(x) for x in leaves]
-        types = tuple([(x.dtype, x.weak_type) for x in typed])  # type: ignore[attr-defined]
-        parts = (*key, types)
+        parts = (*key, tuple(map(_type_of, leaves)))
         # A program of JAX knows itself what else it was traced for.
         now = (*current_options().values(), *process_options().values())
         return self._programs.get(
@@ -222,6 +217,18 @@ class StructuredFunction:
             static_argnames=self._static_argnames or None,
             compiler_options=options,
         )
+
+
+def _type_of(leaf: Any) -> tuple[np.dtype, bool]:
+    """The type of the numbers of a leaf, and whether it is weak: those of `jax.typeof`, which takes
+    ten times as long for an array.
+    """
+    if isinstance(leaf, jax.Array):
+        return leaf.dtype, leaf.weak_type  # type: ignore[attr-defined]
+    if type(leaf) is np.ndarray:
+        return jax.dtypes.canonicalize_dtype(leaf.dtype), False
+    found: Any = jax.typeof(leaf)
+    return found.dtype, found.weak_type
 
 
 PROGRAMS = Programs(MAX_PROGRAMS)

@@ -98,6 +98,7 @@ from iblf_jax.kernels.packed import pack as pack
 from iblf_jax.kernels.packed import unpack as unpack
 from iblf_jax.kernels.packed import unpacked_records as unpacked_records
 from iblf_jax.kernels.passes import written_out as written_out
+from iblf_jax.kernels.primitives import is_tracing as is_tracing
 from iblf_jax.kernels.primitives import is_zero as is_zero
 from iblf_jax.kernels.primitives import new_primitive as new_primitive
 from iblf_jax.kernels.primitives import without_symbol as without_symbol

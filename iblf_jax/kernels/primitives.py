@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
@@ -51,6 +52,17 @@ def new_primitive(
     if transpose is not None:
         ad.primitive_transposes[primitive] = transpose
     return primitive
+
+
+_probe = Primitive("probe")
+_probe.def_impl(lambda: None)
+_probe.def_abstract_eval(lambda: jax.core.ShapedArray((), np.bool_))
+mlir.register_lowering(_probe, mlir.lower_fun(lambda: jnp.zeros((), bool), multiple_results=False))
+
+
+def is_tracing() -> bool:
+    """Whether JAX traces the code that calls this into a program."""
+    return _probe.bind() is not None
 
 
 def with_axis_first(operands: Sequence[jax.Array], axes: Sequence[int | None]) -> list[jax.Array]:

@@ -451,7 +451,7 @@ def _polished(outcome: Outcome, mode: str) -> list[Outcome]:
     )
     if not worst.is_broken:
         return []
-    found = _continued(outcome, problem.at_half_the_step(), mode, POLISH_STEPS)
+    found = _continued(outcome, problem.at_half_the_step, mode, POLISH_STEPS)
     if found is None:
         return []
     summary = (

@@ -186,7 +186,7 @@ def _derivatives_of_start(
 
 def value(problem: TuningProblem, candidates: Candidate) -> Value:
     """The problem at the coordinates of each start, (S, ...)."""
-    return _values(problem.at_any_step(), candidates, problem.rollouts(candidates))
+    return _values(problem.at_any_step, candidates, problem.rollouts(candidates))
 
 
 def values(
@@ -207,12 +207,12 @@ def objective_at_quarter_step(problem: TuningProblem, z: np.ndarray) -> np.ndarr
     """The objective at a quarter of the time step at points z, (S, p); NaN where a run is invalid
     or its estimated error too large even there, (S,).
     """
-    fine = problem.at_half_the_step().at_half_the_step()
+    fine = problem.at_half_the_step.at_half_the_step
 
     def of_rows(rows: np.ndarray) -> np.ndarray:
         candidates = fine.candidates(z[rows])
         found = fine.rollouts(candidates, assessed=True)
-        each = _values(fine.at_any_step(), candidates, found)
+        each = _values(fine.at_any_step, candidates, found)
         is_inaccurate = _by_start(has_flag(np.asarray(found.status), Status.INACCURATE), candidates)
         is_usable = np.asarray(each.valid) & ~np.any(is_inaccurate, axis=1)
         return np.where(is_usable, each.objective, np.nan)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, NamedTuple, cast
 
 import jax
@@ -34,8 +34,9 @@ from iblf_jax.tuning.objectives import (
 )
 from iblf_jax.tuning.options import TuningRunOptions
 from iblf_jax.tuning.parameters import Block, Box, Tunable, layout, values_at
+from iblf_jax.tuning.quantities import Quantities
 from iblf_jax.tuning.ranges import sampled_too_slowly
-from iblf_jax.tuning.rollouts import Rollouts, draw_run, piece_counts, rollouts
+from iblf_jax.tuning.rollouts import Rollouts, draw_run, fold_of, piece_counts, rollouts
 from iblf_jax.tuning.runs import NUMBERS_A_RUN
 from iblf_jax.tuning.solvers import Constraints, SearchSpace, Solver
 
@@ -172,6 +173,9 @@ class TuningProblem:
         """The problem as a solver needs it."""
         return dataclasses.replace(self, requirements_in_loss=not solver.handles_requirements)
 
+    # A problem and its arrays do not change, so it keeps what every value of a search needs.
+
+    @cached_property
     def at_half_the_step(self) -> TuningProblem:
         """The problem with half the time step."""
         half = 0.5 * float(self.options.dt)
@@ -182,11 +186,19 @@ class TuningProblem:
             request=self.request._replace(steps=2 * self.request.steps),
         )
 
+    @cached_property
     def at_any_step(self) -> TuningProblem:
         """The problem without its number of steps, for functions that do not read it: they are then
         compiled once for all time steps.
         """
         return dataclasses.replace(self, request=self.request._replace(steps=0))
+
+    @cached_property
+    def fold(self) -> tuple[Quantities, ...]:
+        """The quantities of its runs and the margin; read it outside of `jit`, as it would keep
+        the tracers of a program.
+        """
+        return fold_of(self.objective, self.dt.dtype, self.request.steps * self.dt)
 
     # -------------------------------------------------------------------------------- properties
 
@@ -253,9 +265,9 @@ class TuningProblem:
         """All runs of all starts, without derivatives, (S * B, ...); with the error of each run if
         they are `RunRequest.assessed`.
         """
-        varied = _leaves_of_runs(self.at_any_step(), candidates)
+        varied = _leaves_of_runs(self.at_any_step, candidates)
         request = self.request._replace(assessed=assessed)
-        return rollouts(self.scenario, varied, self.objective, self.dt, request=request)
+        return rollouts(self.scenario, varied, self.fold, self.dt, request=request)
 
     def points_together(self, points: int) -> int:
         """How many of some points are evaluated without derivatives in one batch.

@@ -116,7 +116,7 @@ class Rollouts(NamedTuple):
 def rollouts(
     scenario: Scenario,
     varied: dict[str, jax.Array],
-    objective: Objective,
+    fold: tuple[Quantities, ...],
     dt: jax.Array,
     *,
     request: RunRequest,
@@ -126,10 +126,9 @@ def rollouts(
     Args:
       scenario, varied, dt, request: as `run_batch_in_parts`; errors and radii are NaN where the
         request is not `assessed`.
-      objective: complete.
+      fold: `fold_of` the objective.
     """
-    folds = (*fold_of(objective, dt.dtype, request.steps * dt), Torque())
-    outcome = run_batch_in_parts(scenario, varied, folds, dt, request)
+    outcome = run_batch_in_parts(scenario, varied, (*fold, Torque()), dt, request)
     smooth, exact, peak_torque = (
         outcome.metrics[name] for name in ("tuning_smooth", "tuning_exact", "peak_torque")
     )

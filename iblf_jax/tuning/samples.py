@@ -19,7 +19,7 @@ from iblf_jax.studies.study import VIOLATED
 from iblf_jax.studies.time_step import warn_of_step
 from iblf_jax.tuning.objectives import Objective
 from iblf_jax.tuning.options import TuningRunOptions
-from iblf_jax.tuning.rollouts import Rollouts, draw_runs, rollouts
+from iblf_jax.tuning.rollouts import Rollouts, draw_runs, fold_of, rollouts
 from iblf_jax.tuning.runs import in_groups
 
 
@@ -116,6 +116,7 @@ def sample_runs(request: SampleRequest, scenarios: Sequence[Scenario]) -> list[S
     backend = request.options.backend
     of_run = RunRequest.of(scenario, steps=steps, method=method, backend=backend)
     objective, step = jax.tree.map(lambda x: jnp.asarray(x, dtype), (request.objective, request.dt))
+    fold = fold_of(objective, dtype, steps * step)
     points = {
         path: np.stack([np.asarray(paths.get(s, path), dtype) for s in scenarios])
         for path in request.tuned
@@ -128,7 +129,7 @@ def sample_runs(request: SampleRequest, scenarios: Sequence[Scenario]) -> list[S
         varied, admissible = draw_runs(
             cases, own, index[rows], targets=targets, nominal=request.nominal
         )
-        return rollouts(scenario, varied, objective, step, request=of_run), admissible
+        return rollouts(scenario, varied, fold, step, request=of_run), admissible
 
     batch = report_runs_per_batch(len(owner) * steps, request.batch)
     found, admissible = in_groups(run, len(owner), batch)
