@@ -52,7 +52,7 @@ class Comparison(NamedTuple):
     ours: Conditions
     others: dict[str, Conditions]
     """Other software -> the conditions that choose its row."""
-    beside: dict[str, str] = {}  # noqa: RUF012 - a constant
+    beside: dict[str, Callable[[float], str]] = {}  # noqa: RUF012 - a constant
     """Column -> words for its value, which the row states as well, because the number alone would
     mislead."""
 
@@ -60,7 +60,23 @@ class Comparison(NamedTuple):
 ENVIRONMENT = ("commit", "iblf_jax", "jax", "python", "processor", "cores", "peers")
 """What all shown results must have in common, of `machine` in a result."""
 ERROR = "largest error [rad]"
-OF_ERRORS = "largest error {:.1e} rad"
+
+
+def words(value: float) -> str:
+    """A number with two digits."""
+    rounded = float(f"{value:.2g}")
+    if rounded < 1e6:
+        return f"{rounded:,.10g}"
+    return f"{rounded / 1e6:,.10g} million"
+
+
+def error_in_words(error: float) -> str:
+    """The largest error of a row [rad]."""
+    if error < 1e-6:
+        return f"largest error {words(1e9 * error)} nrad"
+    return f"largest error {words(1e6 * error)} \N{MICRO SIGN}rad"
+
+
 LOOP = {"loop": "paper", "type": "float64", "runs": 4096}
 ON_GPU = {"loop": "paper", "type": "float32", "runs": 65536}
 ARM_ON_GPU = {"loop": "iiwa14", "type": "float32", "runs": 65536}
@@ -88,7 +104,7 @@ COMPARISONS = (
         "less",
         {"row": "native, user's call, 0.5 ms"},
         {"SciPy LSODA, relative tolerance 1e-6": {"row": "LSODA, compiled field"}},
-        {ERROR: OF_ERRORS},
+        {ERROR: error_in_words},
     ),
     Comparison(
         "65,536 closed loops of the paper's arm, H200",
@@ -132,7 +148,7 @@ COMPARISONS = (
             "SLSQP with exact derivatives": {"search": "SLSQP, exact slopes"},
             "CMA-ES": {"search": "CMA-ES"},
         },
-        {"rollouts to 0.5 %": "{:.0f} rollouts to 0.5 % above the best"},
+        {"rollouts to 0.5 %": "{:.0f} rollouts to 0.5 % above the best".format},
     ),
     Comparison(
         "failure probability of 1e-6, 50 variables, by subset simulation",
@@ -142,7 +158,7 @@ COMPARISONS = (
         "less",
         RARE | {"estimator": "subset"},
         {"OpenTURNS": RARE | {"estimator": "OpenTURNS, subset"}},
-        {"covered": "{:.0%} of the 95 % intervals are right"},
+        {"covered": "{:.0%} of the 95 % intervals are right".format},
     ),
 )
 
@@ -163,23 +179,14 @@ def value_of(comparison: Comparison, conditions: Conditions, column: str = "") -
     return float(found[0][column or comparison.column])
 
 
-def words(value: float) -> str:
-    """A number with two digits."""
-    rounded = float(f"{value:.2g}")
-    if rounded < 1e4:
-        return f"{rounded:,.10g}"
-    mantissa, exponent = f"{rounded:.1e}".split("e")
-    return f"{mantissa}e{int(exponent)}"
-
-
 def beside(comparison: Comparison, conditions: Conditions) -> str:
     """The further values of a row, in words."""
     values = [
-        text.format(value_of(comparison, conditions, column))
-        for column, text in comparison.beside.items()
+        in_words(value_of(comparison, conditions, column))
+        for column, in_words in comparison.beside.items()
     ]
     if not values:
-        values = [OF_ERRORS.format(error) for error in errors_of(comparison.benchmark, conditions)]
+        values = [error_in_words(error) for error in errors_of(comparison.benchmark, conditions)]
     return "".join(f", {value}" for value in values)
 
 

@@ -51,17 +51,21 @@ if TYPE_CHECKING:
 CARD_DPI, PAGE_DPI = 60, 110
 """Dots per inch of a figure, in a notebook and on a page."""
 
-STYLE = """body { font: 16px/1.5 system-ui, sans-serif; color: #222;
-  max-width: 60rem; margin: 2rem auto; padding: 0 1rem; }
+STYLE = """:root { color-scheme: light dark;
+  --line: color-mix(in srgb, currentcolor 14%, transparent);
+  --faint: color-mix(in srgb, currentcolor 5%, transparent); }
+body { font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem; }
 h1 { font-size: 1.6rem; }
-h2 { font-size: 1.2rem; margin-top: 2rem; border-bottom: 1px solid #ddd; }
+h2 { font-size: 1.2rem; margin-top: 2rem; border-bottom: 1px solid var(--line); }
 table { border-collapse: collapse; font-size: 0.85rem; }
-td, th { padding: 0.15rem 0.6rem; border-bottom: 1px solid #eee; text-align: left; }
+td, th { padding: 0.15rem 0.6rem; border-bottom: 1px solid var(--line); text-align: left; }
 img { max-width: 100%; }
+@media (prefers-color-scheme: dark) { img { filter: invert(0.93) hue-rotate(180deg); } }
 ul.words { padding-left: 1.2rem; overflow-wrap: anywhere; }
-pre { background: #f6f6f6; padding: 0.8rem; overflow-x: auto; font-size: 0.8rem; }
+pre { background: var(--faint); padding: 0.8rem; overflow-x: auto; font-size: 0.8rem; }
 .wide { overflow-x: auto; }
-footer { margin-top: 3rem; color: #777; font-size: 0.8rem; }"""
+footer { margin-top: 3rem; opacity: 0.65; font-size: 0.8rem; }"""
+"""The design of all reports, which are light or dark as the browser asks for."""
 
 
 class Shown(NamedTuple):

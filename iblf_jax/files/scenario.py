@@ -85,6 +85,14 @@ RUN = ("duration", "dt", "method", "record_every")
 WEIGHTS = ".weights.npz"
 """Ending of the file with the arrays of modules, in place of that of the scenario file."""
 DTYPES = ("float64", "float32", "float16", "bfloat16")
+COMMANDS = {
+    "study": "montecarlo",
+    "sweep": "sweep",
+    "failure": "failure",
+    "tune": "tune",
+    "identify": "identify",
+}
+"""Table of a file that is no scenario file -> the command that reads it."""
 
 
 class ScenarioFile(NamedTuple):
@@ -325,6 +333,11 @@ def from_dict(
     """
     try:
         others = set(other_tables)
+        for table, command in COMMANDS.items():
+            if table in data and table not in others:
+                remedy = f"The command `iblf-jax {command}` reads files with it."
+                expected = "none in a file of this kind"
+                raise checks.fail(table, checks.Words("a table"), expected, remedy)
         data = {key: x for key, x in as_table(data, "file").items() if key not in others}
         if "scenario" in data:
             data, folder = _with_scenario_read(data, folder)

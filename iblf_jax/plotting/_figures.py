@@ -232,7 +232,12 @@ def tube(scenario: Scenario, *, duration: float = 20.0) -> Figure:
     tube = jax.vmap(scenario.context.tube)(jnp.asarray(t, scenario.initial.q.dtype))
     figure, panels = _style.panels(7.2, 0.6 + 1.4 * scenario.n, scenario.n)
     names = plants.component_names(scenario.plant)
-    start = {"color": _style.colour(0), "clip_on": False, "zorder": 5, "label": "start"}
+    start: dict[str, Any] = {
+        "color": _style.colour(0),
+        "clip_on": False,
+        "zorder": 5,
+        "label": "start",
+    }
     for i, (axes, name) in enumerate(zip(panels, names, strict=True)):
         lower, upper = tube.lower[:, i], tube.upper[:, i]
         axes.fill_between(t, lower, upper, color=_style.tube(), linewidth=0, zorder=0)

@@ -106,9 +106,8 @@ def heat_map(
         width = 5.2 * len(metrics)
     panels = _style.given_panels(len(metrics))
     if panels is None:
-        figure = _style.new_figure(width, 4.2)
-        panels = list(figure.subplots(1, len(metrics), squeeze=False)[0])
-    figure = panels[0].figure
+        panels = list(_style.new_figure(width, 4.2).subplots(1, len(metrics), squeeze=False)[0])
+    figure: Any = panels[0].figure
     for axes, name in zip(panels, metrics, strict=True):
         _draw_heat_map(figure, axes, data, name, x, y, at)
     return figure

@@ -829,7 +829,7 @@ def as_folds(
     owner: dict[str, str] = {name: "every run" for name, _ in ACCURACY_UNITS}
     for i, fold in enumerate(metrics):
         field = f"metrics[{i}]"
-        checks.conforms(field, fold, Fold, "iblf_jax.metrics has them.")
+        checks.conforms(field, fold, Fold, _class_with(fold))
         if scenario is not None:
             fit_joints(fold, scenario.n, field)
             check_needs(field, fold, scenario)
@@ -863,6 +863,14 @@ def metric_units(folds: Sequence[Fold], scenario: Scenario) -> tuple[tuple[str, 
     symbols = symbols_of(scenario)
     each = (*pairs, *ACCURACY_UNITS)
     return tuple((name, as_text(resolved(unit, symbols))) for name, unit in each)
+
+
+def _class_with(name: object) -> str:
+    """The remedy for something in place of a fold, such as the name of a result."""
+    for cls in Fold.__subclasses__():
+        if name in getattr(cls, "units", ()):
+            return f"ij.metrics.{cls.__name__}() returns it."
+    return "Such as ij.metrics.Margin(); ij.metrics.standard() returns the usual ones."
 
 
 def standard() -> tuple[Fold, ...]:

@@ -351,9 +351,28 @@ def _resolved(scenario: Scenario, path: str, full: str) -> tuple[list[str | int]
         return resolve(scenario, _with_joint_number(scenario, full))
     except LookupError:
         known = [p.path for p in parameters(scenario)]
-        remedy = checks.nearest(full_path(path), known) or "ij.parameters(scenario) lists them."
+        remedy = (
+            _known_joints(scenario, full)
+            or checks.nearest(full_path(path), known)
+            or "ij.parameters(scenario) lists them."
+        )
         expected = "the path of a leaf of this scenario"
         raise checks.fail("path", path, expected, remedy) from None
+
+
+def _known_joints(scenario: Scenario, full: str) -> str:
+    """The remedy for a path whose last index would be the name of a joint, if there were one."""
+    try:
+        *_, field, last = parse(full)
+        before = full.removesuffix(f"[{last}]").removesuffix(f"[{json.dumps(last)}]")
+        value = resolve(scenario, before)[1]
+    except (LookupError, ValueError, AttributeError):
+        return ""
+    names = component_names(scenario.plant)
+    if not isinstance(last, RowName) or jnp.shape(value) != (len(names),):
+        return ""
+    entries = ", ".join(f"{field}[{i}] ({name})" for i, name in enumerate(names))
+    return f"There are {entries}."
 
 
 def _with_joint_number(scenario: Scenario, full: str) -> str:

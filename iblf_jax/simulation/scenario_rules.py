@@ -566,7 +566,7 @@ def _crossed(s: Start | BoundedLevel, bounds: Bounds | None, limits: Limits) -> 
     for i, (low, high) in enumerate(zip(*limits, strict=True)):
         if not low < high:
             remedy = _funnel_remedy(bounds) or "Exchange or widen them."
-            return Found((low, high), {"component": s.components[i], "remedy": remedy})
+            return Found(np.array([low, high]), {"component": s.components[i], "remedy": remedy})
     return None
 
 

@@ -504,9 +504,6 @@ class Passive:
         e, de = q - tube.q_d, dq - tube.dq_d
         return e, de, de + self.slope * e, tube.ddq_d - self.slope * de
 
-    def init(self, q, dq, context):
-        return ()
-
     def command(self, t, q, dq, f_hat, context, state):
         _, _, r, dv = self.errors(t, q, dq, context)
         model, no = context.model, jnp.zeros(q.shape, bool)
@@ -632,9 +629,6 @@ class PassiveOfLevels(ij.controllers.Law):
     """`Passive` as a law of x, with d_tilde in x' in the place of f_tilde."""
 
     law: Passive
-
-    def init(self, x, context):
-        return ()
 
     def command(self, t, x, d_hat, context, state):
         return self.law.command(t, x[0], x[1], d_hat, context, state)

@@ -338,9 +338,6 @@ class TwoLevels:
     uses_observer: ClassVar[bool] = False
     includes_e2: ClassVar[bool] = True
 
-    def init(self, x, context):
-        return ()
-
     def command(self, t, x, d_hat, context, state):
         zero = jnp.zeros_like(x[0])
         no = zero > 1.0

@@ -63,9 +63,6 @@ def test_smooth_limit():
 class _Fixed:
     tau: jax.Array = ij.leaf("N m", shape="any")
 
-    def init(self, q, dq, context):
-        return ()
-
     def command(self, t, q, dq, f_hat, context, state):
         never = jnp.zeros(q.shape, bool)
         return controllers.Command(self.tau, jnp.zeros_like(q), jnp.zeros_like(q), never, never), ()

@@ -220,9 +220,6 @@ class PowerOfE2:
     c: jax.Array = ij.leaf("N m", sign="positive")
     a: jax.Array = ij.leaf("1", sign="positive", default=0.6)
 
-    def init(self, q, dq, context):
-        return ()
-
     def command(self, t, q, dq, f_hat, context, state):
         tube, model = context.tube(t), context.model
         alpha = tube.dq_d - 2.0 * (q - tube.q_d)

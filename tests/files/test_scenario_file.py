@@ -282,6 +282,7 @@ WRONG_TEXTS = [
     (f'{PRESET}[arguments]\nlw = "log"', r"arguments\.lw: .*Did you mean law"),
     (f'{PRESET}[arguments]\np = "2"', r"arguments\.p: got '2', expected a whole number"),
     (f'{PRESET}[argument]\nlaw = "log"', r"argument: got an unknown key, .*arguments"),
+    (f"{PRESET}[study]\nruns = 9", "study: got a table, .*`iblf-jax montecarlo` reads"),
     ("\x00", "not a TOML file"),
     ("", "robot: got nothing"),
     ("a = " + "[" * 100_000, "not a TOML file"),

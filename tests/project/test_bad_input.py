@@ -208,6 +208,7 @@ VALUES = {
     "path | controller.K2": with_value("controller.K3"),
     "path | parameters(scenario)": with_value("engine.power"),
     "path | plant.mass": with_value("plant.mass[2]"),
+    "path | K2[0] (joint 0), K2[1] (joint 1)": with_value("controller.K2[elbow]"),
     "names joined by dots": with_value("plant.mass[0:1]"),
     "path: got 'plant.__class__'": with_value("plant.__class__"),
     "path: got 'controller.variant'": with_value("controller.variant"),
@@ -353,6 +354,7 @@ OF_ONE = {
     "sensitivity points": ((2**30,), "at most", "GiB"),
     "Design points": ((2**31,), "GiB"),
     "simulate metrics": (([ij.metrics.Settling(tolerance=[0.1] * 3)],), "[0].tolerance", "2"),
+    "sweep metrics": ((["rmse"],), "[0]: got 'rmse'", "ij.metrics.Tracking() returns it"),
     "tune objective": (
         (None, [], "rmse", "x", 3, {}, ij.objectives.tracking),
         "ij.objectives.tracking() + 0.1 * ij.objectives.effort()",

@@ -72,9 +72,6 @@ class Given:
     v: ij.Leaf
     z: ij.Leaf
 
-    def init(self, q, dq, context):
-        return ()
-
     def command(self, t, q, dq, f_hat, context, state):
         never = jnp.zeros_like(self.v, bool)
         return controllers.Command(self.v, q, q, never, never)._replace(input_slope=self.z), ()

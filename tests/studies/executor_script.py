@@ -33,9 +33,6 @@ class Spring:
     stiffness: ij.Leaf = ij.leaf("N m/rad", sign="positive")
     damping: ij.Leaf = ij.leaf("N m s/rad", sign="positive")
 
-    def init(self, q, dq, context):
-        return ()
-
     def command(self, t, q, dq, f_hat, context, state):
         """The torque; the commanded velocity is the reference's."""
         tube, no = context.tube(t), jnp.zeros(q.shape, bool)

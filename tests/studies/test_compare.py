@@ -141,9 +141,6 @@ class Bang:
 
     size: object = ij.leaf("N m", default=0.1)
 
-    def init(self, q, dq, context):
-        return ()
-
     def command(self, t, q, dq, f_hat, context, state):
         tube = context.tube(t)
         never = jnp.zeros(q.shape, bool)

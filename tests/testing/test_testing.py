@@ -31,9 +31,6 @@ class PlainLaw:
 
     gain: jax.Array
 
-    def init(self, q, dq, context):
-        return ()
-
     def command(self, t, q, dq, f_hat, context, state):
         tube = context.tube(t)
         spring, damper = self.gain * (q - tube.q_d), 0.2 * self.gain * (dq - tube.dq_d)
@@ -277,7 +274,7 @@ QUICK = {
     },
     ("law", instance): {
         "JAX does not know its class | iblf_jax.component": {"kind": object},
-        "command(t, q, dq, f_hat, context, state) is missing | init(q, dq": {"kind": Nothing},
+        "command(t, q, dq, f_hat, context, state) is missing": {"kind": Nothing},
     },
     ("robot", instance): {
         "it is a class": {"kind": lambda: TWO_LINK},
@@ -537,9 +534,6 @@ class WrongShape:
 
     k: ij.Leaf = ij.leaf("1/s", default=1.0)
     receives_x = True
-
-    def init(self, x, context):
-        return ()
 
     def command(self, t, x, d_hat, context, state):
         inside = jnp.zeros(x.shape[1:], bool)

@@ -34,9 +34,6 @@ class GainSchedule:
     K: ij.Leaf = ij.leaf("N m/rad", sign="positive", shape="any")
     D: ij.Leaf = ij.leaf("N m s/rad", sign="positive", shape="any")
 
-    def init(self, q, dq, context):
-        return ()
-
     def command(self, t, q, dq, f_hat, context, state):
         place = jnp.clip(t / DURATION, 0.0, 1.0) * (KNOTS - 1)
         weights = jnp.maximum(0.0, 1.0 - jnp.abs(place - np.arange(float(KNOTS))))

@@ -30,7 +30,6 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.core.families import Part, attribute
-from iblf_jax.core.pytree import Leaf
 from iblf_jax.world.bounds import Tube
 
 GUARD = 1e-3
@@ -69,11 +68,21 @@ class Barrier(Part):
     def slope(self, tube: Tube, q: jax.Array) -> jax.Array:
         """The slope s = dV1/dq of each joint, (n,)."""
 
-    @abc.abstractmethod
     def virtual_velocity(
         self, tube: Tube, q: jax.Array, k1: jax.Array, o: jax.Array | None
     ) -> jax.Array:
-        """The virtual velocity alpha of each joint [rad/s] for the gains k1 [1/s], o [1/s^2]."""
+        """The virtual velocity alpha of each joint [rad/s] for the gains k1 [1/s], o [1/s^2]; that
+        of the paper, under which every V1 decreases that is a function of xi,
+
+            alpha = q_d' - (k1 + kappa) e1                                                     (3.5)
+            kappa = sqrt((k_u'/k_u)^2 + (k_l'/k_l)^2 + o).                  (3.7), root restored
+
+        With the root, kappa + k'/k >= 0 on both sides for every o > 0, which is what the proof
+        needs.
+        """
+        motion = (tube.dk_u / tube.k_u) ** 2 + (tube.dk_l / tube.k_l) ** 2
+        kappa = jnp.sqrt(motion + checks.given(o))
+        return tube.dq_d - (k1 + kappa) * (q - tube.q_d)
 
     def decay_rate(self, k1: jax.Array) -> jax.Array | None:
         """The claim of step one: rate_i [1/s] with V1_i' <= -rate_i V1_i where e2 = 0 and no guard
@@ -236,15 +245,3 @@ def xi_bound_from_errors(barrier: Barrier, V: jax.Array, tube: Tube) -> jax.Arra
     e_u: Any = barrier.error_at(V, tube, jnp.asarray(True))
     e_l: Any = barrier.error_at(V, tube, jnp.asarray(False))
     return jnp.maximum(e_u / tube.k_u, -e_l / tube.k_l)
-
-
-def paper_virtual_velocity(tube: Tube, q: jax.Array, k1: jax.Array, o: Leaf) -> jax.Array:
-    """The virtual velocity alpha = q_d' - (k1 + kappa(t)) e1, (n,) [rad/s], with the margin   (3.5)
-
-        kappa = sqrt((k_u'/k_u)^2 + (k_l'/k_l)^2 + o).                      (3.7), root restored
-
-    With the root, kappa + k'/k >= 0 on both sides for every o > 0, which is what the proof needs.
-    The integral and the logarithmic barrier share it.
-    """
-    kappa = jnp.sqrt((tube.dk_u / tube.k_u) ** 2 + (tube.dk_l / tube.k_l) ** 2 + o)
-    return tube.dq_d - (k1 + kappa) * (q - tube.q_d)

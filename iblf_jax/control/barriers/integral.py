@@ -12,7 +12,6 @@ from iblf_jax.control.barriers._base import (
     Barrier,
     check_guard,
     guarded_error,
-    paper_virtual_velocity,
     side_width,
 )
 from iblf_jax.core.pytree import component, static
@@ -59,12 +58,6 @@ class Integral(Barrier):
         """(k^2 - e1^2)/2, (n,) [rad^2]."""
         e, _, k, _ = guarded_error(tube, q, self.guard)
         return 0.5 * (k**2 - e**2)
-
-    def virtual_velocity(
-        self, tube: Tube, q: jax.Array, k1: jax.Array, o: jax.Array | None
-    ) -> jax.Array:
-        """alpha, (n,) [rad/s].    (3.5)"""
-        return paper_virtual_velocity(tube, q, k1, o)
 
     def decay_rate(self, k1: jax.Array) -> jax.Array:
         """2 k1: V1' <= -2 k1 xi^2/(1 - xi^2) <= -2 k1 V1 at e2 = 0, (n,) [1/s].    (3.9), (3.19)"""

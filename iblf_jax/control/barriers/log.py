@@ -10,7 +10,6 @@ from iblf_jax.control.barriers._base import (
     Barrier,
     check_guard,
     guarded_error,
-    paper_virtual_velocity,
     side_width,
 )
 from iblf_jax.core import checks
@@ -72,12 +71,6 @@ class Log(Barrier):
         """
         e, _, k, _ = guarded_error(tube, q, self.guard)
         return k**2 - e**2 if self.p == 1 else None
-
-    def virtual_velocity(
-        self, tube: Tube, q: jax.Array, k1: jax.Array, o: jax.Array | None
-    ) -> jax.Array:
-        """alpha, (n,) [rad/s]."""
-        return paper_virtual_velocity(tube, q, k1, o)
 
     def decay_rate(self, k1: jax.Array) -> jax.Array:
         """2 p k1: V1' <= -k1 xi^(2p)/(1 - xi^(2p)) <= -2 p k1 V1 at e2 = 0, (n,) [1/s]."""

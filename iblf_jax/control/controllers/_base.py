@@ -230,9 +230,9 @@ class Law(TrackingLaw):
 
     receives_x: ClassVar[bool] = True
 
-    @abc.abstractmethod
     def init(self, x: jax.Array, context: LawContext) -> State:
         """State at the start of a run, given x, (r, n), there; `()` for most laws."""
+        return ()
 
     @abc.abstractmethod
     def command(
@@ -302,9 +302,9 @@ class RobotLaw(TrackingLaw):
     receives_x: ClassVar[bool] = False
     needs_robot = True
 
-    @abc.abstractmethod
     def init(self, q: jax.Array, dq: jax.Array, context: LawContext) -> State:
         """State at the start of a run, given q [rad] and dq [rad/s] there; `()` for most laws."""
+        return ()
 
     @abc.abstractmethod
     def command(
@@ -543,11 +543,6 @@ def check_law(name: str, law: object, remedy: str) -> None:
     field = wrapped_field(law)
     if field:
         check_law(f"{name}.{field}", vars(law)[field], remedy)
-
-
-def no_state(law: object, q: jax.Array, dq: jax.Array, context: LawContext) -> tuple[()]:
-    """`init` of a law without a state."""
-    return ()
 
 
 def layers_with_states(law: TrackingLaw, state: State) -> Iterator[tuple[Any, Any]]:

@@ -41,7 +41,7 @@ import numpy as np
 
 from iblf_jax.control.barriers import Barrier, Integral
 from iblf_jax.control.barriers._base import guard_is_active
-from iblf_jax.control.controllers._base import Command, LawContext, RobotLaw, decay_of, no_state
+from iblf_jax.control.controllers._base import Command, LawContext, RobotLaw, decay_of
 from iblf_jax.control.decays import Decay
 from iblf_jax.control.decays._base import (
     energy_gain,
@@ -110,7 +110,6 @@ class Backstepping(RobotLaw):
     takes_shift: ClassVar[bool] = True
     leaf_units = weight_units
     symbols_of_part = symbols_of_energy
-    init = no_state
 
     def check(self) -> None:
         """Raises ValueError for an unknown variant or a matrix that is no gain; completes `o` (0.1,

@@ -11,7 +11,7 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.controllers._base import Command, LawContext, RobotLaw, no_state
+from iblf_jax.control.controllers._base import Command, LawContext, RobotLaw
 from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.world.robots import inverse_dynamics
 
@@ -32,8 +32,6 @@ class ComputedTorque(RobotLaw):
     Kp: Leaf = leaf("1/s^2", sign="positive")
     Kd: Leaf = leaf("1/s", sign="positive")
     gains: ClassVar[tuple[str, ...]] = ("Kp", "Kd")
-
-    init = no_state
 
     def command(
         self,

@@ -7,7 +7,7 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.controllers._base import Command, LawContext, RobotLaw, no_state
+from iblf_jax.control.controllers._base import Command, LawContext, RobotLaw
 from iblf_jax.core.pytree import Leaf, component, leaf
 
 
@@ -29,8 +29,6 @@ class PDGravity(RobotLaw):
     Kp: Leaf = leaf("N m/rad", sign="positive")
     Kd: Leaf = leaf("N m s/rad", sign="positive")
     gains: ClassVar[tuple[str, ...]] = ("Kp", "Kd")
-
-    init = no_state
 
     def command(
         self,

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 
 from iblf_jax.control.barriers import Barrier, PrescribedPerformance
 from iblf_jax.control.barriers._base import guard_is_active
-from iblf_jax.control.controllers._base import Command, LawContext, RobotLaw, no_state
+from iblf_jax.control.controllers._base import Command, LawContext, RobotLaw
 from iblf_jax.control.controllers.backstepping import check_barrier
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf
@@ -56,7 +56,6 @@ class SurfaceBarrier(RobotLaw):
     gains: ClassVar[tuple[str, ...]] = ("K",)
     uses_observer: ClassVar[bool] = False
     includes_e2: ClassVar[bool] = True
-    init = no_state
 
     def check(self) -> None:
         """Raises ValueError for something that is no barrier, or no bounds."""

@@ -33,7 +33,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.control.controllers._base import Command, LawContext, LyapunovLaw, no_state
+from iblf_jax.control.controllers._base import Command, LawContext, LyapunovLaw
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.world.bounds import Tube
@@ -71,7 +71,6 @@ class TerminalSlidingMode(LyapunovLaw):
     smoothing: Leaf = leaf("rad/s", sign="positive", default=0.01)
     gains: ClassVar[tuple[str, ...]] = ("beta", "K")
     includes_e2: ClassVar[bool] = True
-    init = no_state
 
     def check(self) -> None:
         """Raises ValueError for an exponent that is not between 1 and 2."""
