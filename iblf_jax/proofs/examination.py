@@ -90,6 +90,8 @@ class Operations(NamedTuple):
     cases: frozenset[str]
     unknown: frozenset[str]
     """Those that are in no list."""
+    inputs_of_kinks: frozenset[frozenset[int]]
+    """Of each kink the positions of the inputs on which its place depends."""
     inputs: frozenset[int]
     """Positions of the inputs on which an output depends."""
     digest: str
@@ -188,6 +190,7 @@ def operations(
       varying: positions of the inputs that vary; all if not given.
     """
     found: dict[str, set[str]] = {"kinks": set(), "cases": set(), "unknown": set()}
+    inputs_of_kinks: set[frozenset] = set()
 
     def rule(eqn: core.JaxprEqn, operands: list[frozenset]) -> list[frozenset]:
         seen: frozenset = frozenset().union(*operands)
@@ -201,6 +204,8 @@ def operations(
         kind = _kind(eqn, operands) if seen else None
         if kind is not None:
             found[kind].add(eqn.primitive.name)
+        if kind == "kinks":
+            inputs_of_kinks.add(seen)
         return [seen] * len(eqn.outvars)
 
     def constant(value: object) -> frozenset:
@@ -211,7 +216,12 @@ def operations(
     values = [frozenset({i} & numbers) for i in range(len(inputs))]
     outputs = interpreted(jaxpr, values, rule, constant)
     sets = {kind: frozenset(names) for kind, names in found.items()}
-    return Operations(**sets, inputs=frozenset().union(*outputs), digest=digest_of(jaxpr))
+    return Operations(
+        **sets,
+        inputs_of_kinks=frozenset(inputs_of_kinks),
+        inputs=frozenset().union(*outputs),
+        digest=digest_of(jaxpr),
+    )
 
 
 def _kind(eqn: Any, operands: list[frozenset]) -> str | None:
@@ -263,13 +273,18 @@ def check_operations(
     varying: Iterable[int] | None = None,
     *,
     kinks: bool,
+    parameters: Iterable[int] = (),
 ) -> Operations:
     """The operations of a function that may not jump, and whose derivative is that of JAX.
+
+    Where the place of a kink depends on a parameter, the derivative by time or state jumps with the
+    parameter, so that the mean value theorem says nothing of its difference.
 
     Args:
       name: of the part, for the message.
       function, inputs, varying: as `operations`.
       kinks: whether the derivative may jump.
+      parameters: positions of the inputs that are uncertain parameters, which move no kink.
 
     Raises:
       ValueError: an operation that is not admitted.
@@ -283,6 +298,13 @@ def check_operations(
     if found.kinks and not kinks:
         got = f"operations whose derivative jumps ({', '.join(sorted(found.kinks))})"
         raise checks.fail(f"prove: {name}", checks.Words(got), "a smooth function", ADVICE)
+    uncertain = frozenset(parameters)
+    if any(x & uncertain and x - uncertain for x in found.inputs_of_kinks):
+        listed = ", ".join(sorted(found.kinks))
+        got = f"operations whose derivative jumps where a parameter says ({listed})"
+        expected = "kinks at the same states for all uncertain parameters"
+        remedy = "Where the parameter is a factor, write it in front: p * jnp.abs(x)."
+        raise checks.fail(f"prove: {name}", checks.Words(got), expected, remedy)
     return found
 
 

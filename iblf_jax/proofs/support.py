@@ -255,9 +255,15 @@ def operations_of_plant(
     def of_numbers(*x: jax.Array) -> Any:
         return function(*x[:count], *jax.tree.unflatten(structure, x[count:]))
 
-    varying = [*range(count), *(count + leaf for leaf in uncertain.places.varying_leaves)]
-    name = "scenario.plant and disturbance"
-    return check_operations(name, of_numbers, [*inputs, *leaves], varying, kinks=kinks)
+    uncertain_leaves = [count + leaf for leaf in uncertain.places.varying_leaves]
+    return check_operations(
+        "scenario.plant and disturbance",
+        of_numbers,
+        [*inputs, *leaves],
+        [*range(count), *uncertain_leaves],
+        kinks=kinks,
+        parameters=uncertain_leaves,
+    )
 
 
 def infinite_unless_defined(rate: jax.Array, values: jax.Array) -> jax.Array:

@@ -112,6 +112,11 @@ def with_threshold(t, x, size):
     return jnp.where(size > 1.0, 1.0, -1.0) * jnp.sin(x[0])
 
 
+def with_moved_kink(t, x, size):
+    """The rate of the load jumps with the parameter: at 20 of 3000 points a bound was below V'."""
+    return jnp.clip(x[1], -size, size)
+
+
 @component
 class Ramp:
     """A position whose acceleration jumps at 1 s."""
@@ -122,11 +127,12 @@ class Ramp:
         return 0.5 + 0.05 * jnp.maximum(t - 1.0, 0.0)[None] ** 2
 
 
-def test_plants_with_time_or_cases_and_a_reference_whose_acceleration_jumps_are_refused():
+def test_plants_with_time_cases_or_moved_kinks_and_a_reference_that_jumps_are_refused():
     for load, words, duration in (
         (aging, "does not depend on the time", None),
         (aging, "does not depend on the time", 2.0),
         (with_threshold, "select a case", None),
+        (with_moved_kink, "jumps where a parameter says", None),
     ):
         plant = Loaded(1.0, load)
         with pytest.raises(ValueError, match=words):
