@@ -127,15 +127,6 @@ def test_error_at_is_the_error_at_which_the_barrier_has_a_value(name):
     np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 
-def test_the_guard_is_exact_inside_and_tangent_beyond():
-    inside, edge, beyond = 0.98 * 0.5, 0.99 * 0.5, 0.7
-    tube, e = simple_tube(0.3, 0.5, n=4), jnp.array([inside, edge, beyond, 100.0])
-    slope, value = (f(tube, e) for f in (Integral(guard=0.01).slope, Integral(guard=0.01).value))
-    np.testing.assert_allclose(slope[0], 2 * inside / (0.25 - inside**2), rtol=1e-13)
-    np.testing.assert_allclose(slope[2:], slope[1], rtol=1e-6)
-    assert value[2] - value[1] == pytest.approx(slope[1] * (beyond - edge))
-
-
 def test_the_guarded_error_on_both_sides():
     """e = min(|e1|, (1 - guard) k) sign(e1) and the rest beyond, with the width and the rate of the
     side that e1 is on; without a guard it is e1 up to the bound."""

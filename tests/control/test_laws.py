@@ -194,14 +194,3 @@ def test_the_weight_is_a_leaf_that_multiplies_slope_and_value_of_the_barrier(nam
     found = {p.path: p for p in ij.parameters(scenario)}["controller.weight"]
     assert (found.shape, found.unit) == ((2,), "N m/rad" if "mapping" in name else "N m rad")
     assert_refused(r"weight.*> 0", ij.with_parameters, scenario, {"controller.weight": [1.0, 0.0]})
-
-
-def test_files_without_a_weight_have_the_papers_and_others_keep_theirs(tmp_path):
-    file = tmp_path / "scenario.toml"
-    ij.save_scenario(weighted("backstepping", WEIGHT), file)
-    np.testing.assert_array_equal(ij.load_scenario(file).controller.weight, WEIGHT)
-    lines = file.read_text().splitlines()
-    old = [line for line in lines if not line.startswith("weight")]
-    assert old != lines
-    file.write_text("\n".join(old))
-    np.testing.assert_array_equal(ij.load_scenario(file).controller.weight, [1.0, 1.0])

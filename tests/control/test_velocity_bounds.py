@@ -9,7 +9,6 @@ from refused import refused
 
 import iblf_jax as ij
 from iblf_jax import bounds
-from iblf_jax.files.scenario import scenario_to_toml
 from iblf_jax.simulation import metrics
 
 SHORT = {"duration": 1.0, "dt": 1e-3}
@@ -57,17 +56,6 @@ def test_a_funnel_of_velocities_follows_the_reference():
     dq_d, r = context.tube(t).dq_d, np.exp(-1.4)
     np.testing.assert_allclose(fast, dq_d + 1.3 * r + 0.2, rtol=1e-12)
     np.testing.assert_allclose(slow, dq_d - 0.8 * r - 0.2, rtol=1e-12)
-
-
-def test_files_hold_them_and_say_their_unit():
-    scenario = paper()
-    assert "offset = [-1.6, -1.4]  # rad/s" in scenario_to_toml(scenario)
-    assert "[[bounds]]" in scenario_to_toml(scenario)
-    assert "[[bounds]]" not in scenario_to_toml(paper(None))
-    units = {p.path: p.unit for p in ij.parameters(scenario)}
-    assert units["bounds[1].lower.offset"] == "rad/s"
-    assert units["bounds[1].lower.phase"] == units["bounds[0].lower.offset"] == "rad"
-    assert ij.simulation.paths.unit_at(scenario, "bounds[1].upper.amplitude[0]") == "rad/s"
 
 
 def test_limits_of_a_robot():

@@ -104,6 +104,17 @@ def test_values_and_gradients_are_finite_wherever_a_run_starts_and_when_it_runs_
 
 
 @pytest.mark.slow
+def test_a_failing_run_leaves_the_others_bit_identical(batch):
+    calm = batch(jnp.asarray([20.0, 20.0, 12.0]), jnp.asarray([0.8, 0.8, 0.7]))
+    for K2, q in ((1e6, 0.8), (20.0, 5.0), (20.0, np.nan), (np.inf, 0.8)):
+        troubled = batch(jnp.asarray([20.0, K2, 12.0]), jnp.asarray([0.8, q, 0.7]))
+        assert int(troubled.status[1]) & (Status.NOT_FINITE | Status.BOUND_VIOLATED)
+        for i in (0, 2):
+            assert int(troubled.status[i]) == 0
+            assert jax.tree.all(jax.tree.map(np.array_equal, calm[i], troubled[i]))
+
+
+@pytest.mark.slow
 def test_jit_and_vmap_give_what_simulate_gives(paper, short_run, batch):
     runs = batch(jnp.asarray([20.0, 12.0, 30.0]), jnp.full(3, 0.8))
     assert runs.is_batch and len(runs) == 3 and runs.q.shape == (3, 501, 2)
@@ -272,6 +283,13 @@ def test_another_length_compiles_the_steps_alone(paper):
     assert [new - old for new, old in zip(after, before, strict=True)] == [0, 1, 0]
     again = ij.simulate(paper, **SHORT, backend="native")
     np.testing.assert_array_equal(longer.q[:150], again.q[:450:3])
+
+
+@pytest.mark.slow
+def test_the_same_run_twice_is_bit_identical(paper, short_run):
+    again = ij.simulate(paper, **SHORT)
+    for name in ("q", "tau", "V"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(short_run, name))
 
 
 def test_no_warning_on_a_good_run(paper):

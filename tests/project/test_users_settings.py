@@ -20,7 +20,7 @@ AGAIN = {
         "simulation/test_paper.py::test_both_laws_at_one_millisecond[integral-printed]",
         "simulation/test_paper.py::test_what_the_paper_shows",
     ],
-    "shapes": ["engine/test_loops.py::test_every_loop_makes_the_same_run[euler-None]"],
+    "shapes": ["engine/test_loops.py::test_every_loop_makes_the_same_run"],
     "runs": [
         "core/test_transforms.py::test_a_failing_run_leaves_the_others_bit_identical",
         "core/test_transforms.py::test_the_same_run_twice_is_bit_identical",

@@ -107,18 +107,6 @@ def test_paths_of_earlier_versions_lead_to_the_bounds_of_levels():
 
 
 @pytest.mark.slow
-def test_a_disturbance_of_the_first_level_of_a_robot():
-    """q' = x_2 + d_1, which no torque can compensate at once."""
-    drift = ij.disturbances.Levels((ij.disturbances.Sinusoids(amplitude=0.05, frequency=2.0),))
-    preset = ij.with_parts(ij.presets.zhang_yan_2024(), disturbance=drift)
-    run = ij.simulate(preset, duration=1.0, dt=1e-3)
-    rate = np.gradient(np.asarray(run.q), 1e-3, axis=0, edge_order=2)
-    expected = np.asarray(run.dq) + 0.05 * np.sin(2.0 * np.asarray(run.t))[:, None]
-    # behind the transient of the start, which differences do not resolve
-    np.testing.assert_allclose(rate[300:-2], expected[300:-2], atol=1e-5)
-
-
-@pytest.mark.slow
 def test_a_rigid_law_on_stiff_joints_tends_to_the_robot_with_motors():
     """With first order in 1/K, with the inertia of the motors in the model."""
     paper = ij.presets.zhang_yan_2024(variant="corrected")

@@ -38,6 +38,13 @@ def results(study):
     return cases.named(study) | {"mode": study.fastest_mode}
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("chunk", [1, 300])
+def test_chunk_changes_nothing(study, chunk):
+    other = cases.study(executor=ij.studies.LocalExecutor(chunk=chunk))
+    assert cases.same(results(study), results(other))
+
+
 @pytest.mark.parametrize("runs", [1, 257])
 def test_number_of_runs_changes_no_run(study, runs):
     fewer = results(cases.study(runs=runs))

@@ -123,15 +123,6 @@ test_what_does_not_fit_is_refused = refused(
 )
 
 
-@pytest.mark.slow
-def test_a_drift_of_strict_feedback_form_is_accepted():
-    plant = with_drift(lambda x: jnp.cos(x[0]), lambda x: x[0] * x[1], lambda x: x[0] * x[1] * x[2])
-    dependence = plants.dependence_on_levels(plant, jnp.zeros(()), jnp.asarray([[0.3], [1.0], [2]]))
-    np.testing.assert_array_equal(np.asarray(dependence.drift) > 0, np.tri(3, dtype=bool))
-    np.testing.assert_array_equal(dependence.gain, 0.0)
-    made(plant)
-
-
 def test_a_robot_as_a_plant_picks_up_its_load_when_the_robot_does():
     load = ij.robots.Payload(mass=2.0, start=1.0, rise=0.1)
     arm = dataclasses.replace(ij.presets.ur5().plant, carried=load)
