@@ -92,9 +92,9 @@ CASES = {
     ),
     "fuzzy system": (
         lambda: undisturbed(
-            controllers.AdaptiveRBF(2.0, 20.0, nodes=5, Gamma=30.0, normalised=True)
+            controllers.AdaptiveRBF(2.0, 20.0, nodes=5, Gamma=30.0, normalised=True, width=1.5)
         ),
-        partial(network_program, independent.Fuzzy, ()),
+        partial(network_program, independent.Fuzzy, ("width",)),
         ("controller.Gamma", "controller.sigma", "plant.mass", "controller.K2"),
     ),
     "hidden layer": (
@@ -211,13 +211,19 @@ def test_the_rate_of_the_lyapunov_function_is_what_is_claimed(make, paths, rng):
     assert np.all(np.abs(excess[exact]) <= 1e-12 * found.size[exact])
 
 
-def test_a_fuzzy_system_is_a_mean_of_its_rules_far_from_all_of_them():
+def test_a_fuzzy_system_is_a_mean_of_its_rules_far_from_all_of_them(rng):
     law = controllers.AdaptiveRBF(k1=2.0, K2=20.0, nodes=8, normalised=True, width=0.01)
     far = jnp.full(2, 40.0)
     for kind in (jnp.float32, jnp.float64):
         small = jax.tree.map(lambda x, kind=kind: x.astype(kind), law)
         S = small.basis(*[far.astype(kind)] * 4)
         assert float(jnp.sum(S)) == pytest.approx(1.0, rel=1e-6)
+    at = q, *others = rng.normal(size=(4, 2))
+    z = np.concatenate([(q - 0.5) / 0.5, *others]) / ([1.0] * 6 + [3.0] * 2)
+    fired = np.exp(-np.sum((z - independent.sobol(8, 8)) ** 2, axis=1) / 1.5**2)
+    for normalised, expected in ((True, fired / np.sum(fired)), (False, fired)):
+        near = dataclasses.replace(law, width=1.5, normalised=normalised)
+        np.testing.assert_allclose(near.basis(*at), expected, rtol=1e-12)
 
 
 SETTLING = dataclasses.replace(PAPER.controller, decays=ij.decays.FiniteTime(k_a=1.0))

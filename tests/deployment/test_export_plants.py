@@ -19,9 +19,9 @@ from iblf_jax.sensors import Direct, Encoder, FilteredDifference, Levels
 
 import iblf_jax as ij
 from iblf_jax.deployment import control_law, export
-from iblf_jax.deployment.control_law import FLAGS, bounds_at, inputs_at_start
+from iblf_jax.deployment.control_law import FLAGS, SampleInputs, bounds_at, inputs_at_start
 from iblf_jax.deployment.signal_units import one_unit, per_time
-from iblf_jax.deployment.write_c import C_TYPES, fill_template
+from iblf_jax.deployment.write_c import C_TYPES, fill_template, vectors_of
 from iblf_jax.simulation.closed_loop import initial_state
 from iblf_jax.simulation.scenario import canonical
 
@@ -95,6 +95,17 @@ def test_units_of_inputs_and_outputs_and_the_input_at_the_start():
     in_transit = initial_state(scenario).sampled.commands
     np.testing.assert_array_equal(in_transit, [balance] * len(in_transit))
     np.testing.assert_array_equal(balance, drive.steady_input(scenario.initial.q))
+
+
+def test_reference_data_have_every_level_and_derivative():
+    rows = np.arange(3 * 7 * 2.0).reshape(3, 7, 2)
+    names = SampleInputs._fields[1:]
+    columns = {name: rows[:, i] for i, name in enumerate(names)}
+    columns |= {name: columns[name][:, None] for name in ("higher", "further_d")}
+    inputs = SampleInputs(np.arange(3.0), **columns)
+    found = vectors_of(SampleInputs(*(x[0] for x in inputs)), inputs, np.zeros((3, 2)))
+    np.testing.assert_array_equal(np.array(found.first), rows[0])
+    np.testing.assert_array_equal(np.stack([found.q, found.dq, *found.further], 1), rows)
 
 
 def test_mujoco_refuses_what_is_no_robot_and_process_noise():

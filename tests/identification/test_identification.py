@@ -32,6 +32,7 @@ from iblf_jax.identification import statistics
 from iblf_jax.identification.assessment import missing_terms_of_fit
 from iblf_jax.identification.coordinates import coordinates, to_x, to_z, with_widths
 from iblf_jax.identification.log import read
+from iblf_jax.identification.missing_terms import missing_terms
 from iblf_jax.identification.regression import _alternative_readings
 from iblf_jax.identification.replay import inverse_dynamics
 from iblf_jax.identification.shooting import ShootingProblem, windows
@@ -343,6 +344,27 @@ def test_what_was_left_out_is_named(viscous, coulomb, known, kind, sizes, scenar
     for one in found.findings:
         np.testing.assert_allclose(one.size, sizes[one.joint], rtol=0.25)
         assert one.error < 0.2 * abs(one.size) and one.gain > 0.3
+
+
+def test_terms_that_a_regression_lacks_are_found_with_the_bias_that_they_cause(rng):
+    t = np.arange(0.0, 40.0, 0.01)
+    q = np.stack([np.sin(1.3 * t) + 0.5 * np.sin(3.1 * t), 0.7 * np.cos(2.2 * t) + 0.1 * t], axis=1)
+    dq = np.gradient(q, 0.01, axis=0)
+    ddq = np.gradient(dq, 0.01, axis=0)
+    friction = np.stack([0.3 * np.tanh(dq[:, 0] / 0.05), 0.5 * q[:, 1] ** 0], axis=1)
+    tau = 2.0 * ddq + friction + 0.01 * rng.normal(size=q.shape)
+    motion = SmoothedMotion(t, q, dq, ddq, tau, np.zeros_like(q), np.zeros(2), dq)
+    # The columns of an inertia and of a viscous friction of both joints.
+    by_x, fitted = np.stack([ddq, dq], axis=-1), np.array([True, True, False])
+    found = missing_terms(motion, 2.0 * ddq, by_x, 0.0, fitted)
+    sizes = {(one.joint, one.kind): one.size for one in found.findings}
+    assert sizes == {
+        (0, "sign"): pytest.approx(0.3, rel=0.05),
+        (1, "constant"): pytest.approx(0.5, rel=0.05),
+    }
+    expected = np.linalg.lstsq(by_x.reshape(-1, 2), friction.ravel(), rcond=None)[0]
+    np.testing.assert_allclose(found.bias, expected, rtol=0.1, atol=0.02)
+    assert all(0.5 < one.gain <= 1.0 and one.error < 0.1 * one.size for one in found.findings)
 
 
 def scaled(name, factor):

@@ -212,6 +212,12 @@ def of_messages() -> Iterator[str]:
             except ValueError as error:
                 yield str(error)
         yield from (str(x.message) for x in shown)
+    comparison = stored("Comparison_0")
+    flagged = {
+        name: dataclasses.replace(run, status=np.int32(Status.BOUND_VIOLATED))
+        for name, run in comparison.rollouts.items()
+    }
+    yield str(dataclasses.replace(comparison, rollouts=flagged).failed)
 
 
 def of_derivatives() -> Iterator[str]:

@@ -4,10 +4,10 @@ import jax
 import loops_of_plants
 import numpy as np
 import pytest
+from proof_cases import pendulum
 from refused import assert_refused
 
 import iblf_jax as ij
-from iblf_jax.simulation.levels import start_levels
 from iblf_jax.simulation.paths import get
 from iblf_jax.simulation.scenario import canonical
 from iblf_jax.tuning import evaluation, ranges
@@ -127,8 +127,22 @@ def test_period_and_delay_are_within_what_loop_and_queue_allow(lab):
     assert_refused(r"Sampling.queue: got 0.*queue=1", ends, at_once, "sampling.delay")
 
 
+def test_ranges_of_bounds_contain_the_start():
+    bounds = tuple(ij.Bounds(ij.bounds.Constant(-x), ij.bounds.Constant(x)) for x in (1.5, 5.0))
+    start = ij.Initial(q=[0.8], dq=[0.6])
+    loop = canonical(pendulum(bounds=bounds, initial=start))
+    paths = [f"bounds[1].{side}.value" for side in ("upper", "upper", "lower")]
+    paths[1] += "[0]"
+    low = ranges.default_lows(loop, dict.fromkeys(paths[:2], np.array([5.0])), DT, "rk4")
+    high = ranges.default_highs(loop, {paths[2]: np.array([-5.0])}, DT, "rk4")
+    for path, expected in zip(paths, (5.0, 5.0, -5.0), strict=True):
+        value, reason = (low | high)[path]
+        np.testing.assert_allclose(value, 0.6 + ranges.LEAST_SHARE * (expected - 0.6))
+        assert reason == ranges.BY_LEVEL
+
+
 @pytest.mark.slow
-def test_ranges_of_a_plant_keep_the_step_and_those_of_bounds_contain_the_start():
+def test_ranges_of_a_plant_keep_the_step_and_a_start_outside_of_its_bounds_is_refused():
     flexible = canonical(loops_of_plants.flexible_joint())
     stiffness, inertia = "model.stiffness", "plant.motor_inertia"
     low, high, (below, above) = ends(flexible, stiffness)
@@ -142,14 +156,7 @@ def test_ranges_of_a_plant_keep_the_step_and_those_of_bounds_contain_the_start()
     assert conditions.violated({inertia: 0.95 * low}) == ranges.BY_STEP
     assert ends(flexible, "plant.robot.mass")[2] == (ranges.BY_SIGN, ranges.UNLIMITED)
     drive = canonical(loops_of_plants.electric_drive())
-    current = start_levels(drive)[2]
-    low, _, reasons = ends(drive, "bounds[2].upper.value")
-    assert reasons == (ranges.BY_LEVEL, ranges.UNLIMITED)
-    np.testing.assert_allclose(low, current + ranges.LEAST_SHARE * (60.0 - current))
-    np.testing.assert_allclose(ends(drive, "bounds[2].upper.value[1]")[0], low[1:])
-    _, high, reasons = ends(drive, "bounds[1].lower.value")
-    assert reasons == (ranges.UNLIMITED, ranges.BY_LEVEL)
-    np.testing.assert_allclose(high, -4.0 * ranges.LEAST_SHARE)
+    low = ends(drive, "bounds[2].upper.value")[0]
     # A start outside its bounds is refused.
     narrow = ij.with_parameters(drive, {"bounds[2].upper.value": low})
     assert float(ij.simulate(narrow, **SHORT).x[0, 2, 0]) < low[0]
