@@ -99,8 +99,7 @@ def made_up(plant, *, duration=4.0, dt=0.01, shift=0.0, status=0):
         "disturbance_estimate": f * (1 - np.exp(-5 * t[:, None])),
         "V": np.exp(-2 * t),
     }
-    arrays = {name: jnp.asarray(x) for name, x in arrays.items()}
-    arrays |= {"fastest_mode": jnp.asarray(10.0), "dt": jnp.asarray(dt)}
+    arrays = jax.device_put(arrays | {"fastest_mode": np.array(10.0), "dt": np.array(dt)})
     others = {"controller_state": (), "observer_state": (), "status": jnp.int32(status)}
     others |= {"metrics": ij.Metrics({}, ()), "method": "rk4"}
     return ij.Rollout(scenario=Holder(plant), **others, **arrays)
@@ -113,6 +112,6 @@ def runaway(plant, at=150):
     frozen = np.minimum(np.arange(run.t.size), at)
     arrays = {}
     for name in ("q", "dq", "e1", "e2", "tau", "xi", "disturbance", "disturbance_estimate"):
-        arrays[name] = jnp.asarray((np.asarray(getattr(run, name)) + 1e-4 * growth)[frozen])
+        arrays[name] = jax.device_put((np.asarray(getattr(run, name)) + 1e-4 * growth)[frozen])
     arrays["tau"] = arrays["tau"].at[at:].set(jnp.nan)
     return with_signals(run, **arrays)

@@ -28,7 +28,7 @@ import numpy as np
 
 from iblf_jax.core import former_names
 from iblf_jax.core.attributes import has_members, missing_members
-from iblf_jax.core.devices import default_devices, platform
+from iblf_jax.core.devices import default_devices, on_device, platform
 from iblf_jax.core.families import adopt, required_members
 
 F = TypeVar("F", bound=Callable)
@@ -352,9 +352,7 @@ def as_floats(name: str, value: object) -> jax.Array:
 
 
 def _as_array(value: object) -> jax.Array:
-    """The array of a value.  `jnp.asarray` compiles a program for every new shape, 20 ms each, so
-    numbers of the host are put on the device as they are.
-    """
+    """The array of a value."""
     if isinstance(value, list | tuple):
         is_on_host = all(isinstance(x, int | float) for x in jax.tree.leaves(value))
     else:
@@ -366,8 +364,7 @@ def _as_array(value: object) -> jax.Array:
         host = host.astype(jnp.result_type(float))
     if isinstance(value, float):
         host = value  # stays weakly typed
-    with jax.ensure_compile_time_eval():
-        return jax.device_put(host)
+    return on_device(host)
 
 
 SIGNS: dict[str | None, tuple[Callable[[np.ndarray], Any], str, str]] = {

@@ -42,6 +42,16 @@ def is_alone() -> bool:
     return is_single and jax.default_backend() == "cpu"
 
 
+def on_device(values: object) -> jax.Array:
+    """Numbers of the host as an array, also inside a trace.
+
+    `jnp.asarray` compiles a program for every new shape, 20 ms each.  JAX may share the memory of
+    the argument.
+    """
+    with jax.ensure_compile_time_eval():
+        return jax.device_put(values)  # type: ignore[no-any-return]
+
+
 def processors() -> int:
     """Number of processors that this process may run on."""
     if hasattr(os, "sched_getaffinity"):

@@ -24,6 +24,7 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.core.attributes import has_members
+from iblf_jax.core.devices import on_device
 from iblf_jax.core.exact_keys import exact_key
 
 NUMBERS = (jax.Array, np.ndarray, np.generic, float, int)
@@ -52,8 +53,7 @@ class ConstantArray(NamedTuple):
     def array(self) -> jax.Array:
         """The array."""
         values = np.frombuffer(self.data, np.dtype(self.dtype)).reshape(self.shape)
-        with jax.ensure_compile_time_eval():
-            return jax.device_put(values)
+        return on_device(values)
 
 
 @jax.tree_util.register_pytree_node_class

@@ -22,6 +22,7 @@ from iblf_jax.control.actuators import Ideal
 from iblf_jax.control.actuators.delay import WHOLE_TOLERANCE
 from iblf_jax.core import checks, notices
 from iblf_jax.core.attributes import attributes
+from iblf_jax.core.devices import on_device
 from iblf_jax.core.first_use import mujoco
 from iblf_jax.core.progress import announced
 from iblf_jax.core.status import Status
@@ -432,8 +433,9 @@ def rollout_of(
         status |= int(Status.NOT_FINITE)
     rows = motion.rows
     at = np.flatnonzero(rows.instant)[::record_every]
-    recorded = jax.tree.map(lambda x: x[at], samples)
-    states = jax.tree.map(lambda x: jnp.asarray(x[rows.sample[at]]), motion.states)
+    # On the host: JAX compiles programs for the index of each new shape.
+    recorded = jax.tree.map(lambda x: on_device(np.asarray(x)[at]), samples)
+    states = jax.tree.map(lambda x: on_device(x[rows.sample[at]]), motion.states)
     return Rollout(
         scenario=scenario,
         controller_state=states.controller,

@@ -54,6 +54,7 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.core.attributes import attributes
+from iblf_jax.core.devices import on_device
 from iblf_jax.core.pytree import field_values
 from iblf_jax.core.whole_files import written_whole
 from iblf_jax.engine import RunRequest
@@ -455,7 +456,7 @@ class _Reader:
             raise checks.fail(key, came, f"type {expected[0]} and shape {expected[1]}")
         if kind == "number":
             return array[()]
-        return jnp.asarray(array) if kind == "jax" else array
+        return on_device(array) if kind == "jax" else array
 
     def number(self, node: dict[str, Any], key: str) -> float:
         """A number that JSON cannot hold."""

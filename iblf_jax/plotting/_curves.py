@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import jax
@@ -418,7 +418,9 @@ def _checked(name: str, run: Any, argument: str) -> Curve:
     if run.is_batch:
         came = f"a batch of {len(run)} runs"
         raise checks.fail(argument, came, "one run", "Select a run: run[0].")
-    q, dq = np.asarray(run.q), np.asarray(run.dq)
+    # Of NumPy: JAX compiles programs for the index of each new shape.
+    run = replace(jax.tree.map(np.asarray, run), scenario=run.scenario)
+    q, dq = run.q, run.dq
     samples = len(q)
     if int(run.status) & Status.NOT_FINITE and len(q) > 1:
         # The run diverged: the samples before its state was frozen.

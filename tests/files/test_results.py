@@ -373,7 +373,10 @@ UNREADABLE = [
     (np.array([None]), ": got"),
     (np.zeros(2, [("a", float)]), r": got an array of type \[\('a'"),
     *(
-        ({"x": jnp.zeros(2, dtype)}, rf"\[x\]: got an array of type {dtype}")
+        (
+            {"x": jax.device_put(np.zeros(2, jnp.dtype(dtype)))},
+            rf"\[x\]: got an array of type {dtype}",
+        )
         for dtype in ("int4", "float8_e4m3fn", "float8_e5m2")
     ),
     *(

@@ -1,6 +1,7 @@
 """A class of a user, in any table of members, is saved and loaded by its name."""
 
 import dataclasses
+import functools
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -13,20 +14,27 @@ import iblf_jax as ij
 from iblf_jax.core.pytree import field_values
 from iblf_jax.files import components
 
-ARM = ij.with_parts(
-    ij.presets.zhang_yan_2024(),
-    controller=members.LAWS["backstepping_decays"],
-    regions=(members.REGIONS["half_space"],),
-    sampling=ij.Sampling(period=2e-3),
-    sensor=members.SENSORS["encoder_measured"],
-)
-CHAIN = ij.with_parts(
-    ij.presets.flexible_joint_two_link(),
-    sampling=ij.Sampling(period=2e-3),
-    sensor=ij.sensors.Levels((members.SENSORS["encoder_measured"], *[ij.sensors.Direct()] * 2)),
-    process_noise=members.PROCESS_NOISES["additive"],
-)
-MOORED = ij.with_parts(ij.presets.vessel(), plant=members.PLANTS["vessel_moored"])
+
+@functools.cache
+def scenarios() -> tuple[ij.Scenario, ...]:
+    sensor = members.SENSORS["encoder_measured"]
+    arm = ij.with_parts(
+        ij.presets.zhang_yan_2024(),
+        controller=members.LAWS["backstepping_decays"],
+        regions=(members.REGIONS["half_space"],),
+        sampling=ij.Sampling(period=2e-3),
+        sensor=sensor,
+    )
+    chain = ij.with_parts(
+        ij.presets.flexible_joint_two_link(),
+        sampling=ij.Sampling(period=2e-3),
+        sensor=ij.sensors.Levels((sensor, *[ij.sensors.Direct()] * 2)),
+        process_noise=members.PROCESS_NOISES["additive"],
+    )
+    moored = ij.with_parts(ij.presets.vessel(), plant=members.PLANTS["vessel_moored"])
+    return arm, chain, moored
+
+
 FAMILIES = {
     f"{protocol.__name__} {name}": (protocol, name)
     for protocol, family in components.FAMILIES.items()
@@ -63,7 +71,7 @@ def test_a_class_of_a_user_in_a_scenario_file(family, tmp_path, monkeypatch):
     found = components.FAMILIES[protocol].tables[table]
     scenario, member = next(
         (scenario, cls)
-        for scenario in (ARM, CHAIN, MOORED)
+        for scenario in scenarios()
         for cls in _classes(scenario)
         if cls in found.values()
     )

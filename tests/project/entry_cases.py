@@ -39,13 +39,14 @@ HELD = dataclasses.replace(WEAK, sampling=ij.Sampling(period=1e-3, observer="pol
 DRAWN = {"plant.mass": ij.factor(ij.uniform(0.9, 1.1))}
 INTERVAL = {"plant.mass": ij.factor(ij.interval(0.9, 1.1))}
 TRACKING = ij.objectives.tracking(scale=1.0)
-TUBE = ij.bounds.tube_at(WEAK.reference, WEAK.bounds[0], 0.1)
+TUBE = jax.jit(ij.bounds.tube_at)(WEAK.reference, WEAK.bounds[0], 0.1)
 RUNS = (
-    *("engine.simulate.run_one", "engine.explain.instructions"),
+    *("engine.simulate.run_one", "engine.explain.program_of"),
     *("studies.blocks._execute", "studies.blocks.traced"),
     *("tuning.problem.rollouts", "tuning.evaluation.Evaluator.__call__", "tuning.result._slice"),
     *("tuning._falsify._margins", "certificates._certify._certificate_of"),
     *("proofs._prove.problem_of", "plotting._style.new_figure"),
+    *("deployment.export._export_law", "deployment.export._export_loop"),
     *(
         f"testing.{checker}.shape_of"
         for checker in ("_contract", "laws", "metrics", "observers", "robots", "world")

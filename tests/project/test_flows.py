@@ -205,6 +205,12 @@ def of_messages() -> Iterator[str]:
     metrics = dataclasses.replace(run.metrics, values_by_name=values)
     for flag in sorted(set(Status) - {Status.FILTER_INFEASIBLE, Status.MODES_EXHAUSTED}):
         flagged = dataclasses.replace(run, metrics=metrics, status=np.int32(flag))
+        if flag in (Status.SAMPLING_TOO_SLOW, Status.STEP_TOO_LARGE):
+            # A smaller loop, of which a term is found.
+            law = ij.controllers.PDGravity(Kp=60.0, Kd=[20.0])
+            parts = {"observer": ij.observers.NoObserver(), "sampling": ij.Sampling(period=0.02)}
+            scenario = pendulum(controller=law, **parts)
+            flagged = dataclasses.replace(flagged, scenario=scenario, x=run.x[:, :2])
         with warnings.catch_warnings(record=True) as shown:
             warnings.simplefilter("always")
             try:
