@@ -14,8 +14,9 @@ The best known objective is that of BEST_KNOWN and of all tunings, and with `--r
 long search from the scenario's own gains: so many points without derivatives, and REFERENCE_STARTS
 starts that are taken nearly to their ends.
 
-FILE has all tunings besides the table, and is written after each of them.  If it is one of the same
-commit, the problems with as many tunings in it are not measured again.
+FILE has all tunings besides the table, each with its commit, and is written after each of them.
+The problems with as many tunings of the same commit in it are not measured again; those of other
+commits stay in it until their problem is.
 
 With `--peers` each problem is tuned once by `tune` from its own gains, and then by other methods
 for as many seconds of a processor, all with programs at hand and with the compiled batches of this
@@ -276,8 +277,8 @@ BEST_KNOWN = {
     "two links with drives, order 3 (8)": 1.4855,
     "chain of four, settling (12)": 1.5381,
     "two links, smooth step, tan (6)": 0.8941,
-    "flexible joints, smooth step, order 4 (10)": 1.0615,
-    "dynamic surface, motor, sampled (6)": 1.0785,
+    "flexible joints, smooth step, order 4 (10)": 1.0613,
+    "dynamic surface, motor, sampled (6)": 1.0771,
     "radial basis functions (6)": 1.1042,
     "terminal sliding mode (6)": 1.4995,
     "two links, worst tenth of 16 runs (4)": 1.1662,
@@ -286,6 +287,8 @@ BEST_KNOWN = {
 }
 """The best objective of all tunings and long searches in the lab notes (README.md), of gains that
 the time step resolves."""
+WORKING_TREE = "working tree"
+"""In place of the commit of a tree with changes, whose tunings are measured again."""
 Tuning = dict[str, Any]
 """What `tuning` returns, with the problem, the commit and the seed; a long search has the seed
 None."""
@@ -418,13 +421,16 @@ def row(name: str, commit: str, found: list[Tuning], best: float) -> list[Any]:
 
 
 def tunings_in(file: str | None) -> list[Tuning]:
-    """The tunings in a file of results of the present commit; none if there is no such file."""
+    """The tunings in a file of results; none if there is no such file."""
     if file is None or not Path(file).exists():
         return []
-    results = json.loads(Path(file).read_text())
+    return json.loads(Path(file).read_text())["tunings"]
+
+
+def present_commit() -> str:
+    """The commit of the working tree, or WORKING_TREE if it has changes."""
     here = commit()
-    is_same = results["machine"]["commit"] == here and "uncommitted" not in here
-    return results["tunings"] if is_same else []
+    return here[:8] if len(here.split()) == 1 else WORKING_TREE
 
 
 class TimeUpError(Exception):
@@ -585,14 +591,20 @@ def main() -> None:
         report_peers(names, args.json)
         return
     count = 2 if args.quick else args.count
-    commits = [args.after] if args.before is None else [args.before, args.after]
+    trees = [args.after] if args.before is None else [args.before, args.after]
     title = "Random starts"
     found = tunings_in(args.json)
-    for name, tree_of in itertools.product(names, commits):
-        label = {"problem": name, "commit": tree_of or "working tree"}
-        if sum(x | label == x for x in found) == count + (args.reference > 0):
+    commits = [tree_of or present_commit() for tree_of in trees]
+    for name, (tree_of, of_tree) in itertools.product(names, zip(trees, commits, strict=True)):
+        label = {"problem": name, "commit": of_tree}
+        is_complete = sum(x | label == x for x in found) == count + (args.reference > 0)
+        if is_complete and of_tree != WORKING_TREE:
             continue
-        found = [x for x in found if x | label != x]
+        found = [
+            x
+            for x in found
+            if x["problem"] != name or (x["commit"] in commits and x["commit"] != of_tree)
+        ]
         with checked_out(tree_of) as tree:
             for x in measured(tree, name, count, args.seed, args.reference):
                 found.append(label | x)

@@ -112,7 +112,7 @@ def tune(
     differ continue after five and ten steps, and the better third of these after fifteen and every
     five further ones.  This takes about 400 evaluations with derivatives, and more if the search
     finds no gains that keep the requirements, if it does not converge, or if only one start came
-    within 0.5 % of the best objective.  Starts whose objective changes by more than 0.5 % at a
+    within 0.5 % of the best objective.  Gains whose objective changes by more than 0.5 % at a
     quarter of the time step do not count.
 
     The requirements of the result are evaluated again at half the time step.  If one of them is
