@@ -281,7 +281,7 @@ class StyledFigure(Figure):
 
     def draw(self, renderer: RendererBase) -> None:
         """Draws the figure in the style of its creation."""
-        with matplotlib.rc_context(self._style_of_creation):
+        with matplotlib.rc_context(self._style_of_creation), ticks_updated_once(self):
             if not self._fitted:
                 self._fitted = True
                 self._fit_labels(renderer)
@@ -340,6 +340,48 @@ class StyledFigure(Figure):
         picture = io.BytesIO()
         self.savefig(picture, format="png", dpi=120)
         return picture.getvalue()
+
+
+TICKS = ("_update_ticks", "_get_ticklabel_bboxes")
+"""Methods of an axis of matplotlib that update its ticks, and measure their labels."""
+
+
+@contextmanager
+def ticks_updated_once(figure: Figure) -> Iterator[None]:
+    """Context manager in which the ticks of an axis are updated and measured once for limits and
+    place of its panel.
+
+    A layout does so four to eight times between two changes, which takes most of its time.  Nothing
+    else that ticks depend on, such as locators and fonts, changes while a figure is drawn.
+    """
+    panels = [axes for axes in figure.axes if axes.name == "rectilinear"]
+    both: list[Any] = [axis for axes in panels for axis in (axes.xaxis, axes.yaxis)]
+    replaced = [(axis, name) for axis in both for name in TICKS if hasattr(axis, name)]
+    for axis, name in replaced:
+        setattr(axis, name, _called_once(axis, getattr(axis, name)))
+    try:
+        yield
+    finally:
+        for axis, name in replaced:
+            delattr(axis, name)
+
+
+def _called_once(axis: Any, method: Callable[..., Any]) -> Callable[..., Any]:
+    """A method of an axis that is called again only if its arguments, the limits or the place of
+    the panel have changed.
+    """
+    last: Any = None
+    found: Any = None
+
+    def called(*args: Any) -> Any:
+        nonlocal last, found
+        now = (*args, *axis.get_view_interval(), *axis.axes.bbox.bounds)
+        if now != last:
+            found = method(*args)
+            last = now
+        return found
+
+    return called
 
 
 def new_figure(width: float, height: float) -> Any:

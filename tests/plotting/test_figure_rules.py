@@ -103,6 +103,22 @@ def test_an_axis_shows_all_values_and_squeezes_none(x, name):
         np.testing.assert_allclose(scale.inverse(scale.forward(x)), x, rtol=1e-9)
 
 
+def test_ticks_that_are_updated_once_follow_the_limits_and_change_no_pixel(monkeypatch):
+    def pictures():
+        figure = _style.new_figure(6.0, 2.5)
+        left, right = figure.subplots(1, 2)
+        left.plot([0.0, 1.0], [1e-3, 3e4])
+        left.set_ylabel("a label that is longer than its panel")
+        right.semilogy([0.0, 1.0], [1e-3, 3e4])
+        first = figure._repr_png_()
+        left.set(xlim=(-9.0, 7e3), ylim=(0.1, 0.2))
+        return first, figure._repr_png_()
+
+    kept = pictures()
+    monkeypatch.setattr(_style, "TICKS", ())
+    assert pictures() == kept
+
+
 @pytest.fixture(scope="module")
 def study():
     return cases.study(64)
