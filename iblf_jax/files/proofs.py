@@ -35,15 +35,20 @@ def proof_to_xarray(proof: Proof) -> xarray.Dataset:
     data["xi"] = (("time", "joint"), tube.xi, {"units": "1"})
     data["range"] = (("path", "end"), np.array(list(proof.ranges.values())).reshape(-1, 2), {})
     data["largest_rate"] = (("weight",), np.array(list(proof.rates.values())), {})
+    of_torque = {"units": signal_unit(proof.scenario, "tau")}
     if proof.torque is not None:
         ends = np.stack([proof.torque.lowest, proof.torque.highest], axis=1)
-        data["torque"] = (("joint", "end"), ends, {"units": signal_unit(proof.scenario, "tau")})
+        data["torque"] = (("joint", "end"), ends, of_torque)
+    start = proof.start
+    if start is not None:
+        data["start_torque"] = (("joint",), start.torque, of_torque)
     attributes = {
         "verdict": str(proof.verdict),
         "statement": proof.sentence(),
         "assumptions": " ".join(proof.assumptions),
         **{name: getattr(proof, name) for name in ("level", "weight", "duration", "boxes")},
         **{name: getattr(proof, name) for name in ("done", "seconds")},
+        **({} if start is None else {"start_level": start.level}),
     }
     coordinates = {
         "time": ("time", tube.t, {"units": "s"}),

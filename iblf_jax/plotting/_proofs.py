@@ -46,6 +46,7 @@ def guaranteed_tube(found: Proof, *, runs: int = RUNS) -> Figure:
     height = 0.9 + 1.9 * len(names)
     figure, panels = _style.panels(WIDTH, height, len(names))
     shown = found.adversarial_runs(count) if count else []
+    starts = "level" if found.start is None else f"{found.start.level:.4g}"
     for i, axes in enumerate(panels):
         for side, text in ((tube.lower_bound, "bounds"), (tube.upper_bound, "_")):
             axes.plot(tube.t, side[:, i], color=_style.bound(), linewidth=1.0, label=text)
@@ -53,7 +54,7 @@ def guaranteed_tube(found: Proof, *, runs: int = RUNS) -> Figure:
         axes.fill_between(tube.t, tube.lower[:, i], tube.upper[:, i], label="level set", **style)
         axes.plot(tube.t, tube.reference[:, i], label="reference", **_style.reference())
         for number, run in enumerate(shown):
-            label = "runs from V = level" if number == 0 else "_"
+            label = f"runs from V = {starts}" if number == 0 else "_"
             t, q = thinned(np.asarray(run.t), np.asarray(run.q)[:, i])
             axes.plot(t, q, color=_style.colour(0), linewidth=0.7, alpha=0.8, label=label)
         if found.violation is not None:
@@ -70,6 +71,8 @@ def guaranteed_tube(found: Proof, *, runs: int = RUNS) -> Figure:
 
 def _heading(found: Proof) -> str:
     level = f"$V_w \\leq$ {found.level:.4g}"
+    if found.start is not None:
+        level += f" from $V_w \\leq$ {found.start.level:.4g}"
     ranges = [f"{path} {low:.4g} to {high:.4g}" for path, (low, high) in found.ranges.items()]
     if len(ranges) > RANGES:
         ranges = [f"{len(ranges)} uncertain parameters"]

@@ -78,9 +78,9 @@ HELD_TORQUE = (
 )
 DELAYED_TORQUE = (
     "Law and observer read {readings} at the same instant every {period:g} s; their torque arrives"
-    " at most {delay:g} s later, by a delay that may differ from sample to sample, and is held"
-    ' until the next one arrives; the observer makes a step of the kind "{observer}" with it from'
-    " its sample on."
+    " at most {delay:g} s later, at all joints at once and by a delay that may differ from sample"
+    " to sample, and is held until the next one arrives; the observer makes a step of the kind"
+    ' "{observer}" with it from its sample on.'
 )
 STARTS_AT_SAMPLE = (
     "A run starts at a sample, so that each torque is one that the law commanded inside the set."

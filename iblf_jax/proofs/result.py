@@ -413,8 +413,12 @@ class Proof(Result):
         lines += self._about_torque()
         if self.verdict == Verdict.NOT_PROVED and self.point is not None:
             tried = len(self.growth_points)
+            order = ""
+            if self.scenario.sampling is not None:
+                order = ", to first order in the period,"
             lines.append(
-                f"For each of the {tried} weights tried, V_w' > 0 at a point of the level set."
+                f"For each of the {tried} weights tried, V_w' > 0{order} at a point of the level"
+                " set."
             )
             lines.append(f"  {self.point!r}")
             lines.append("This refutes the Lyapunov function, not the bounds.")
@@ -487,7 +491,8 @@ class Proof(Result):
             largest = zip(names, found.largest, strict=True)
             # rounded up
             texts = (f"{name} {math.ceil(size * 1e3) / 1e3:.6g}" for name, size in largest)
-            lines.append(f"Guaranteed on the whole set [N m]: |tau| <= {', '.join(texts)}.")
+            where = "on the whole set" if self.start is None else "from the first command on"
+            lines.append(f"Guaranteed {where} [N m]: |tau| <= {', '.join(texts)}.")
         if limits is None:
             return lines
         if self.has_active_limits:

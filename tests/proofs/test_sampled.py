@@ -829,6 +829,8 @@ def test_a_pendulum_with_delays_is_proved_and_no_run_leaves_the_set():
     text = repr(found)
     assert "with delays up to 0.00025 s is not left by runs from {V_w <= 0." in text
     assert "Starts are those at which the torque before the first command differs" in text
+    assert "Guaranteed from the first command on [N m]: |tau| <=" in text
+    assert found.to_xarray().start_torque == found.start.torque
     loop, generator = own_loop(POLES, 100.0, links=SampledPendulum), np.random.default_rng(8)
     state, factor = loop.starts(400, found.start.level, 6)
     active = loop.sample(state)[0]
