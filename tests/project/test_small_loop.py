@@ -106,7 +106,7 @@ def test_mujoco_ends_where_the_run_does():
     model = mujoco.MjSpec.from_string(MUJOCO)
     there = ij.cosimulate(LOOP, model, duration=0.05, period=PERIOD, dt=PERIOD / 5)
     sampled = ij.with_parts(LOOP, sampling=ij.Sampling(period=PERIOD))
-    here = ij.simulate(sampled, duration=0.05, dt=PERIOD / 5, metrics=())
+    here = ij.simulate(sampled, duration=0.05, dt=PERIOD / 5)
     for name in ("q", "dq", "tau"):
         np.testing.assert_allclose(getattr(there, name)[-1], getattr(here, name)[-1], rtol=1e-6)
 
