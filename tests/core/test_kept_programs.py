@@ -40,7 +40,7 @@ def printed(cases, value, functions):
 """
 RUN = """
 run = lambda scenario: digest(ij.simulate(scenario, duration=0.05, dt=1e-3))
-printed([paper], run, {"_initial_values", "_initialize", "_all_steps", "_finalized"})
+printed([paper], run, {"_initial_values", "_initialize", "_all_steps", "_finalize"})
 """
 RADII = """
 from iblf_jax.engine.period import radius_at
@@ -114,7 +114,7 @@ def damage(folder):
 
 @pytest.mark.slow
 def test_a_second_process_traces_nothing_and_a_damaged_entry_is_made_again(tmp_path):
-    everything = ["_all_steps", "_finalized", "_initial_values", "_initialize"]
+    everything = ["_all_steps", "_finalize", "_initial_values", "_initialize"]
     digest, traced = printed(RUN, tmp_path)
     assert traced == [everything]
     assert printed(RUN, tmp_path) == (digest, [[]])
