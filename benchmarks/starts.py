@@ -269,6 +269,7 @@ BEST_KNOWN = {
     "chain of three, mapping, funnels (9)": 1.1136,
     "computed torque, motor, sampled (6)": 1.4193,
     "pendulum with drive, order 3 (4)": 1.0429,
+    "flexible joints, order 4 (10)": 1.3510,
     "adaptive network (6)": 1.1158,
     "far start (6)": 1.2791,
     "velocity bounds (6)": 1.6570,
