@@ -2,6 +2,7 @@
 that many tests share."""
 
 import ctypes
+import functools
 import gc
 import os
 import runpy
@@ -35,6 +36,7 @@ import hypothesis
 import jax
 import numpy as np
 import pytest
+from jax._src.interpreters import mlir
 
 sys.path.insert(0, str(ROOT / "tests"))
 # A shell that starts the tests in the background has them ignore Ctrl-C, and so the programs that
@@ -42,6 +44,9 @@ sys.path.insert(0, str(ROOT / "tests"))
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 jax.config.update("jax_enable_x64", True)
+# A new context for each program is a fifth of the processor time of a program of one operation, of
+# which the tests have thousands.
+mlir.make_ir_context = functools.cache(mlir.make_ir_context)
 
 hypothesis.settings.register_profile(
     "default", deadline=None, max_examples=100, derandomize=bool(os.environ.get("CI"))
