@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any, NamedTuple, NoReturn, TypeVar
 
@@ -290,6 +290,15 @@ def largest(x: ArrayLike) -> float:
     return float(np.max(np.abs(x), initial=0))
 
 
+def at_each(function: Callable[..., T], *rows: Iterable[Any]) -> T:
+    """The results of a compiled function at several points, as NumPy arrays with a leading axis.
+
+    To call a program for each point costs less than to trace and to compile one for all points.
+    """
+    found = [function(*point) for point in zip(*rows, strict=True)]
+    return jax.tree.map(lambda *values: np.stack(values), *found)
+
+
 def check_function(
     findings: Findings,
     outputs: Callable,
@@ -389,9 +398,10 @@ def _slopes(function: Callable, point: Any, along: Along) -> tuple[dict[str, jax
     def floats(p):
         return {k: v for k, v in function(p).items() if is_float(v)}
 
-    forward = jax.jvp(floats, (point,), (along.direction,))[1]
-    (pulled,) = jax.vjp(floats, point)[1](along.weights)
-    return forward, _dot(pulled, along.direction)
+    # Both are of one linear function, so that JAX differentiates once.
+    linear = jax.linearize(floats, point)[1]
+    (pulled,) = jax.linear_transpose(linear, point)(along.weights)
+    return linear(along.direction), _dot(pulled, along.direction)
 
 
 def _dot(a: Any, b: Any) -> Any:
@@ -411,7 +421,7 @@ def _same_slopes(findings, function, values, point, along, slopes, rtol) -> None
     for name, slope in forward.items():
         difference = (np.asarray(ahead[name]) - np.asarray(behind[name])) / (2 * STEP)
         scale = max(1.0, largest(difference), largest(values[name]))
-        off = largest(slope - difference)
+        off = largest(np.asarray(slope) - difference)
         problem = f"the derivative of {name} differs from its finite difference by {off:.2g}"
         findings.require(off <= rtol * scale, problem, remedy)
     total = sum(float(np.vdot(weight, forward[k])) for k, weight in along.weights.items())
@@ -427,9 +437,9 @@ def _same_slopes(findings, function, values, point, along, slopes, rtol) -> None
 def _same_batch(findings, single, batch) -> None:
     """Requires that a batch of points gives the results of single evaluations."""
     for name, rows in batch.items():
-        for batched, one in zip(rows, single, strict=True):
+        for batched, one in zip(np.asarray(rows, float), single, strict=True):
             expected = np.asarray(one[name], float)
-            off = largest(np.asarray(batched, float) - expected)
+            off = largest(batched - expected)
             problem = f"{name} differs by {off:.2g} between vmap and one run"
             findings.require(off <= 1e-9 * max(1.0, largest(expected)), problem)
 

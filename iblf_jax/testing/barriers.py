@@ -15,6 +15,7 @@ from iblf_jax.control.barriers import Barrier
 from iblf_jax.control.controllers import LawContext
 from iblf_jax.testing._contract import (
     Findings,
+    at_each,
     call_has_shape,
     check_function,
     has_shape,
@@ -54,6 +55,8 @@ FUNCTIONS = {
 }
 """The functions of a barrier, and what messages call them."""
 TIMES = (0.0, 1.0, 2.5, 4.0)
+APART = (0.3, -0.2)
+"""Values of xi of the joints where it is tested that none of them acts on another."""
 
 
 def check_barrier(barrier: object, *, n: int | None = None) -> None:
@@ -100,23 +103,21 @@ def check_barrier(barrier: object, *, n: int | None = None) -> None:
             return {FUNCTIONS[name]: function(*args) for name, function in functions.items()}
 
         check_function(findings, outputs, fitted, arguments[1:])
-
-        def of_q(q):
-            return {name: function(fitted, tube, q, k1, o) for name, function in functions.items()}
-
-        jacobians = jax.jit(jax.jacfwd(of_q))(q)
-        for name, J in jacobians.items():
-            findings.require(
-                np.all(np.diag(np.diag(J)) == J),
-                f"{name} mixes joints",
-                "The law needs a barrier that acts on every joint separately",
-            )
-        times = jnp.asarray(TIMES)
-        numbers = _numbers(functions, fitted, context, times, k1, o)
-        for i in range(len(times)):
-            _at_every_xi(findings, {name: x[i] for name, x in numbers.items()}, fitted.guard)
-        _claims(findings, fitted, context, times, k1, numbers)
-        _grows_without_bound(findings, fitted, context, times, k1, o)
+        numbers_at = _numbers_at(functions, fitted, context, k1, o)
+        for i, direction in enumerate(np.eye(joints)):
+            numbers = numbers_at(TIMES[1], np.resize(APART, joints), direction)
+            for name in functions:
+                findings.require(
+                    np.all(np.delete(numbers[f"d{name}"], i) == 0.0),
+                    f"{name} mixes joints",
+                    "The law needs a barrier that acts on every joint separately",
+                )
+        for t in TIMES:
+            rows = [np.full(joints, x) for x in XI]
+            numbers = at_each(lambda xi, t=t: numbers_at(t, xi, np.ones(joints)), rows)
+            _at_every_xi(findings, numbers, fitted.guard)
+            _claims(findings, fitted, k1, numbers)
+        _grows_without_bound(findings, fitted, context)
 
 
 Functions = dict[str, Callable[..., jax.Array]]
@@ -133,39 +134,42 @@ def _functions() -> Functions:
     }
 
 
-def _numbers(
+def _numbers_at(
     functions: Functions,
     barrier: Barrier,
     context: LawContext,
-    times: jax.Array,
     k1: jax.Array,
     o: jax.Array | None,
-) -> dict[str, np.ndarray]:
-    """The functions of a barrier at every time and xi, their derivatives with respect to q in both
-    modes, and the rate of V1 along q' = alpha.
+) -> Callable[..., dict[str, Any]]:
+    """A compiled function of (t, xi, direction of q): the functions of a barrier, their derivatives
+    along the direction in both modes, the rate of V1 along q' = alpha, and what the barrier claims.
     """
 
-    def at(t, xi):
+    @jax.jit
+    def at(barrier, context, t, xi, direction):
         tube: Tube = context.tube(t)
         q = position_at(tube, xi)
-        ones = jnp.ones_like(q)
         found = {"xi": tube.xi(q)}
         for name, function in functions.items():
 
             def of_q(q, function=function):
                 return function(barrier, tube, q, k1, o)
 
-            found[name], found[f"d{name}"] = jax.jvp(of_q, (q,), (ones,))
-            found[f"r{name}"] = jax.vjp(of_q, q)[1](ones)[0]
+            found[name], linear = jax.linearize(of_q, q)
+            found[f"d{name}"] = linear(direction)
+            (found[f"r{name}"],) = jax.linear_transpose(linear, q)(direction)
         found["decay"] = jax.jvp(
             lambda t, q: functions["value"](barrier, context.tube(t), q, k1, o),
             (t, q),
             (jnp.ones_like(t), found["virtual_velocity"]),
         )[1]
-        return found
+        return found | {
+            "error": q - tube.q_d,
+            "ratio": barrier.error_over_slope(tube, q),
+            "bound": barrier.xi_bound(found["value"], tube),
+        }
 
-    of_times = jax.jit(jax.vmap(jax.vmap(at, (None, 0)), (0, None)))
-    return {name: np.asarray(x) for name, x in of_times(times, jnp.asarray(XI)).items()}
+    return lambda *arguments: at(barrier, context, *arguments)
 
 
 def _at_every_xi(findings: Findings, got: dict[str, np.ndarray], guard: float) -> None:
@@ -211,14 +215,7 @@ def _at_every_xi(findings: Findings, got: dict[str, np.ndarray], guard: float) -
     )
 
 
-def _grows_without_bound(
-    findings: Findings,
-    barrier: Any,
-    context: LawContext,
-    times: jax.Array,
-    k1: jax.Array,
-    o: jax.Array | None,
-) -> None:
+def _grows_without_bound(findings: Findings, barrier: Any, context: LawContext) -> None:
     """Requires that V1 of a barrier with a guard has no limit at the bound.
 
     V1 is evaluated at three distances from the bound, each a tenth of the one before. Where it has
@@ -233,13 +230,14 @@ def _grows_without_bound(
         return
     inside = 1.0 - nearest * np.array([100.0, 10.0, 1.0])
 
-    def value(t, xi):
+    @jax.jit
+    def value(sharp, context, t, xi):
         tube = context.tube(t)
         return sharp.value(tube, position_at(tube, xi))
 
-    of_times = jax.vmap(jax.vmap(value, (None, 0)), (0, None))
-    found = np.asarray(jax.jit(of_times)(times, jnp.asarray([*inside, *-inside])))
-    for V1 in found.reshape(len(times), 2, 3, -1):
+    for t in TIMES:
+        rows = at_each(lambda xi, t=t: value(sharp, context, t, xi), [*inside, *-inside])
+        V1 = rows.reshape(2, 3, -1)
         before, last = np.diff(V1, axis=1).swapaxes(0, 1)
         findings.require(
             np.all(last > LEAST_INCREMENT * before),
@@ -256,52 +254,35 @@ before: 1 for a logarithm, 0.32 for a square root, 0.1 for a function with a slo
 
 
 def _claims(
-    findings: Findings,
-    barrier: Barrier,
-    context: LawContext,
-    times: jax.Array,
-    k1: jax.Array,
-    numbers: dict[str, np.ndarray],
+    findings: Findings, barrier: Barrier, k1: jax.Array, numbers: dict[str, np.ndarray]
 ) -> None:
-    """Tests the claims of the barrier about V1, if it states any."""
+    """Tests the claims of the barrier about V1 at every xi, if it states any."""
     rate = barrier.decay_rate(k1)
     if rate is not None:
         has_shape(findings, "decay_rate(k1)", rate, k1.shape)
-
-    def claimed(t, xi, V1):
-        tube = context.tube(t)
-        q = position_at(tube, xi)
-        return q - tube.q_d, barrier.error_over_slope(tube, q), barrier.xi_bound(V1, tube)
-
-    of_times = jax.jit(jax.vmap(jax.vmap(claimed, (None, 0, 0))))
     xi, V1, slope, decay = (numbers[name] for name in ("xi", "value", "slope", "decay"))
-    inside = np.abs(xi) < min(1 - 2 * barrier.guard, 1.0)
-    error, ratio, bound = of_times(times, xi, V1)
-    for i in range(len(times)):
-        within = inside[i]
-        if rate is not None:
-            excess = float(np.max((decay[i] + np.asarray(rate) * V1[i])[within]))
-            findings.require(
-                excess <= 1e-9,
-                f"V1' + decay_rate V1 reaches {excess:.3g} along q' = alpha",
-                "Claim a smaller rate, or None",
-            )
-        if ratio is not None:
-            found = np.asarray(ratio[i])
-            off = np.abs(found * slope[i] - np.asarray(error[i]))[within]
-            remedy = "It is e1/s inside the bound, in a form without 0/0 at e1 = 0"
-            findings.require(
-                np.max(off) < 1e-9,
-                f"error_over_slope times the slope is not e1 (off by {np.max(off):.2g})",
-                remedy,
-            )
-            findings.require(
-                np.all(np.isfinite(found)), "error_over_slope is not finite somewhere", remedy
-            )
-        if bound is not None:
-            kept = (np.abs(xi[i]) <= np.asarray(bound[i]) * (1 + 1e-9) + 1e-12)[within]
-            findings.require(
-                np.all(kept),
-                "|xi| is beyond xi_bound(V1, tube)",
-                "It must hold wherever V1 <= V; return None for no claim",
-            )
+    error, ratio, bound = (numbers[name] for name in ("error", "ratio", "bound"))
+    within = np.abs(xi) < min(1 - 2 * barrier.guard, 1.0)
+    if rate is not None:
+        excess = float(np.max((decay + np.asarray(rate) * V1)[within]))
+        findings.require(
+            excess <= 1e-9,
+            f"V1' + decay_rate V1 reaches {excess:.3g} along q' = alpha",
+            "Claim a smaller rate, or None",
+        )
+    if ratio is not None:
+        off = np.max(np.abs(ratio * slope - error)[within])
+        remedy = "It is e1/s inside the bound, in a form without 0/0 at e1 = 0"
+        findings.require(
+            off < 1e-9, f"error_over_slope times the slope is not e1 (off by {off:.2g})", remedy
+        )
+        findings.require(
+            np.all(np.isfinite(ratio)), "error_over_slope is not finite somewhere", remedy
+        )
+    if bound is not None:
+        kept = (np.abs(xi) <= bound * (1 + 1e-9) + 1e-12)[within]
+        findings.require(
+            np.all(kept),
+            "|xi| is beyond xi_bound(V1, tube)",
+            "It must hold wherever V1 <= V; return None for no claim",
+        )

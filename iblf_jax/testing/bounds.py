@@ -16,13 +16,15 @@ from iblf_jax.control.controllers import Command
 from iblf_jax.control.controllers._base import law_of_x
 from iblf_jax.simulation.levels import has_speed_limits, levels_on_reference, start_levels
 from iblf_jax.simulation.scenario import Scenario
-from iblf_jax.testing._contract import Findings
+from iblf_jax.testing._contract import Findings, at_each
 from iblf_jax.world.bounds import Tube
 
 XI = (-40.0, -1.0, -0.9995, -0.5, 0.0, 0.5, 0.9995, 1.0, 40.0)
 """Values of xi at which a law is evaluated; a run may reach any of them."""
 NEAR, NEARER = 1e-4, 1e-10
 """Values of e2 at which the slope of the command is evaluated [rad/s]."""
+INNER = 0.3
+"""The xi at which that slope is evaluated."""
 GROWTH = 3.0
 """Largest allowed growth of the slope between these values."""
 TIME = 0.7
@@ -30,16 +32,21 @@ TIME = 0.7
 LABELS = ("the command", "its forward derivative", "its reverse derivative")
 
 
-class Points(NamedTuple):
-    """The results of a law at some points, one entry per point."""
+class Answer(NamedTuple):
+    """The results of a law at a point, or at several points along a leading axis."""
 
-    finite: dict[str, np.ndarray]
-    """By label, whether all numbers are finite, bool."""
-    inside: np.ndarray
+    values: tuple[jax.Array, jax.Array, jax.Array]
+    """Torque, alpha and V1."""
+    forward: Any
+    """Their derivatives along a direction."""
+    reverse: Any
+    """The derivatives of their sum by the law, the positions and the velocities."""
+    inside: Any
     """Whether positions, velocities and alpha are inside their bounds, bool."""
-    at_rest: np.ndarray
+    at_rest: Any
     """Whether e2 = 0 on some joint, bool."""
-    V1: np.ndarray
+    limits: Any
+    """The smallest and the largest velocity; () for a scenario without limits."""
 
 
 def position_at(tube: Tube, xi: jax.Array) -> jax.Array:
@@ -51,6 +58,14 @@ CommandOf = Callable[..., tuple[Command, Any]]
 """The command of a law, of (law, t, x, f_hat, context, state), as JAX has traced it."""
 
 
+AnswersAt = Callable[..., Answer]
+"""The results at some points, of (their xi, velocities, the direction of the derivatives)."""
+ALL = (1.0, 1.0)
+"""The direction in which the law, the positions and the velocities change."""
+VELOCITIES = (0.0, 1.0)
+"""The direction in which only the velocities change."""
+
+
 def check_at_the_bounds(findings: Findings, scenario: Scenario, command_of: CommandOf) -> bool:
     """Requires that torque, V1 and their derivatives in both modes are finite inside the bounds.
 
@@ -59,42 +74,65 @@ def check_at_the_bounds(findings: Findings, scenario: Scenario, command_of: Comm
     """
 
     @jax.jit
-    def command(scenario, law, q, dq):
-        """Torque, alpha and V1 without a disturbance; further levels are those on the reference."""
-        context, t, model = scenario.context, jnp.asarray(TIME), scenario.loop.model
-        state = law_of_x(law).init(start_levels(scenario)[: model.order], context)
-        x = jnp.stack([q, dq, *levels_on_reference(scenario, t)[2 : model.order]])
-        f_hat = jnp.zeros(model.estimate_shape, q.dtype)
-        found = command_of(law, t, x, f_hat, context, state)[0]
-        return found.tau, found.alpha, found.V1
+    def answer(scenario, xi, dq, along):
+        context, t, law = scenario.context, jnp.asarray(TIME), scenario.controller
+        model, tube = scenario.loop.model, context.tube(t)
+        _, rate, *others = levels_on_reference(scenario, t)
+        # Not a number stands for the velocity of the reference.
+        dq = jnp.where(jnp.isnan(dq), rate, dq)
 
-    infinite = _infinite_in_e2(findings, scenario, command)
-    everywhere = _swept(findings, scenario, command, "xi", infinite)
+        def functions(law, q, dq):
+            """Torque, alpha and V1 without a disturbance; further levels are on the reference."""
+            state = law_of_x(law).init(start_levels(scenario)[: model.order], context)
+            x = jnp.stack([q, dq, *others[: model.order - 2]])
+            f_hat = jnp.zeros(model.estimate_shape, q.dtype)
+            found = command_of(law, t, x, f_hat, context, state)[0]
+            return found.tau, found.alpha, found.V1
+
+        # One program for all points and both modes: JAX differentiates once.
+        point = (law, position_at(tube, xi), dq)
+        values, linear = jax.linearize(functions, *point)
+        rest, velocities = (jax.tree.map(jnp.ones_like, x) for x in (point[:2], dq))
+        forward = linear(*jax.tree.map(lambda x: along[0] * x, rest), along[1] * velocities)
+        ones = jax.tree.map(jnp.ones_like, values)
+        reverse = jax.linear_transpose(linear, *point)(ones)
+        limits: Any = context.speed_limits(t) if has_speed_limits(scenario) else ()
+        inside = jnp.abs(xi) < 1.0
+        for x in (dq, values[1]) if limits else ():
+            outside = (x <= limits[0]) | (x >= limits[1])
+            inside &= ~jnp.any(outside)
+        at_rest = jnp.any(jnp.abs(dq - values[1]) < 1e-12)
+        return Answer(values, forward, reverse, inside, at_rest, limits)
+
+    def answers(xis, dqs, along=ALL):
+        return at_each(lambda xi, dq: answer(scenario, xi, dq, np.array(along)), xis, dqs)
+
+    n, xi = scenario.n, np.array(XI)
+    along_positions = answers([*XI, INNER], np.full((len(XI) + 1, n), np.nan))
+    *_, inner_alpha = along_positions.values[1]
+    infinite = _infinite_in_e2(findings, answers, inner_alpha)
+    of_positions = jax.tree.map(lambda rows: rows[:-1], along_positions)
+    everywhere = _swept(findings, of_positions, "xi", infinite)
     if not has_speed_limits(scenario):
         return everywhere
-    of_velocity = _swept(findings, scenario, command, "xi of the velocity", infinite)
-    return of_velocity and everywhere
+    alpha = of_positions.values[1][XI.index(0.0)]
+    low, high = (rows[0] for rows in of_positions.limits)
+    dqs = alpha + xi[:, None] * np.where(xi[:, None] > 0, high - alpha, alpha - low)
+    at_velocities = answers(np.zeros(len(XI)), dqs)
+    return _swept(findings, at_velocities, "xi of the velocity", infinite) and everywhere
 
 
-AtPoint = Callable[..., tuple[jax.Array, jax.Array, jax.Array]]
-"""Torque, alpha and V1, of (scenario, law, q, dq)."""
+def _infinite_in_e2(findings: Findings, answers: AnswersAt, alpha: np.ndarray) -> bool:
+    """Whether the slope of the torque grows without limit as e2 approaches 0; a finding if so.
 
-
-def _infinite_in_e2(findings: Findings, scenario: Scenario, command: AtPoint) -> bool:
-    """Whether the slope of the torque grows without limit as e2 approaches 0; a finding if so."""
-
-    @jax.jit
-    def slope(scenario, e2):
-        law, tube = scenario.controller, scenario.context.tube(jnp.asarray(TIME))
-        q = tube.q_d + 0.3 * tube.k_u
-        dq = levels_on_reference(scenario, jnp.asarray(TIME))[1]
-        alpha = command(scenario, law, q, dq)[1]
-        one = jnp.ones_like(alpha)
-        return jax.jvp(lambda dq: command(scenario, law, q, dq)[0], (alpha + e2,), (one,))[1]
-
-    near, nearer = (
-        float(np.max(np.abs(slope(scenario, jnp.asarray(e2))))) for e2 in (NEAR, NEARER)
-    )
+    Args:
+      findings: receives the problem.
+      answers: the law at some points.
+      alpha: the virtual velocity at xi = INNER.
+    """
+    dqs = [alpha + NEAR, alpha + NEARER]
+    slopes = answers([INNER, INNER], dqs, VELOCITIES).forward[0]
+    near, nearer = np.max(np.abs(slopes), axis=1)
     if not np.isfinite(near) or nearer <= GROWTH * near + 1.0:
         return False
     findings.add(
@@ -106,21 +144,23 @@ def _infinite_in_e2(findings: Findings, scenario: Scenario, command: AtPoint) ->
     return True
 
 
-def _swept(
-    findings: Findings, scenario: Scenario, command: AtPoint, axis: str, infinite_in_e2: bool
-) -> bool:
+def _swept(findings: Findings, found: Answer, axis: str, infinite_in_e2: bool) -> bool:
     """Requires finite results inside the bounds along the positions ("xi") or the velocities.
 
     Returns:
       Whether the results are finite beyond the bounds, too.
     """
-    found, xi = _at_points(scenario, command, axis), np.asarray(XI)
-    beyond = np.zeros(xi.size, bool)
+    xi = np.asarray(XI)
+    beyond, V1 = np.zeros(xi.size, bool), found.values[2]
+    is_finite = {}
+    for label, tree in zip(LABELS, (found.values, found.forward, found.reverse), strict=True):
+        rows = [x.reshape(xi.size, -1) for x in jax.tree.leaves(tree)]
+        is_finite[label] = np.all([np.isfinite(x).all(axis=1) for x in rows], axis=0)
     remedy = (
         "Near the bound limit the slope (iblf_jax.barriers.guarded_error); a failed run must stay"
         " finite"
     )
-    for label, finite in found.finite.items():
+    for label, finite in is_finite.items():
         beyond |= ~finite & ~found.inside
         bad = ~finite & found.inside
         if label != LABELS[0] and infinite_in_e2:
@@ -138,7 +178,7 @@ def _swept(
             remedy,
         )
     findings.require(
-        np.all(found.V1[found.inside & found.finite[LABELS[0]]] >= 0),
+        np.all(V1[found.inside & is_finite[LABELS[0]]] >= 0),
         "V1 is negative somewhere",
         "V1 is a Lyapunov function; a law without one returns zeros",
     )
@@ -155,42 +195,3 @@ def _swept(
 
 def _listed(xi: np.ndarray) -> str:
     return ", ".join(f"{x:g}" for x in xi)
-
-
-def _at_points(scenario: Scenario, command: AtPoint, axis: str) -> Points:
-    """The law at all XI along an axis."""
-
-    @jax.jit
-    def answers(scenario, xis):
-        def at(xi):
-            law, context, t = scenario.controller, scenario.context, jnp.asarray(TIME)
-            tube = context.tube(t)
-            q, dq = levels_on_reference(scenario, t)[:2]
-            limits: Any = context.speed_limits(t) if has_speed_limits(scenario) else ()
-            if axis == "xi":
-                q = position_at(tube, xi)
-            else:
-                alpha = command(scenario, law, q, dq)[1]
-                dq = alpha + xi * jnp.where(xi > 0, limits[1] - alpha, alpha - limits[0])
-
-            def functions(law, q, dq):
-                return command(scenario, law, q, dq)
-
-            point = (law, q, dq)
-            values, forward = jax.jvp(functions, point, jax.tree.map(jnp.ones_like, point))
-            reverse = jax.vjp(functions, *point)[1](jax.tree.map(jnp.ones_like, values))
-            inside = jnp.abs(xi) < 1.0
-            for x in (dq, values[1]) if limits else ():
-                outside = (x <= limits[0]) | (x >= limits[1])
-                inside &= ~jnp.any(outside)
-            at_rest = jnp.any(jnp.abs(dq - values[1]) < 1e-12)
-            return (values, forward, reverse), inside, at_rest
-
-        return jax.vmap(at)(xis)
-
-    trees, inside, at_rest = answers(scenario, jnp.asarray(XI))
-    finite = {}
-    for label, tree in zip(LABELS, trees, strict=True):
-        rows = [np.asarray(x).reshape(len(XI), -1) for x in jax.tree.leaves(tree)]
-        finite[label] = np.all([np.isfinite(x).all(axis=1) for x in rows], axis=0)
-    return Points(finite, np.asarray(inside), np.asarray(at_rest), np.asarray(trees[0][2]))

@@ -136,7 +136,8 @@ def check_actuator(
         check_function(findings, outputs, fitted, (command, dq))
         tested = [command]
         if torques is None:
-            tested = [size * command / jnp.max(jnp.abs(command)) for size in SMALL_TORQUES]
+            shares = np.asarray(command) / np.max(np.abs(command))
+            tested = [jnp.asarray(size * shares) for size in SMALL_TORQUES]
         _starts_at_its_torque(findings, fitted.smooth, tested)
 
 

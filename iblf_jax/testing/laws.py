@@ -83,7 +83,7 @@ def check_law(
         except ValueError as error:
             findings.stop(f"a Scenario does not accept it ({error})")
         in_both_types(findings, _structure, base)
-        t = jnp.asarray(0.7)
+        t = jnp.asarray(0.7, float)
         tube = base.context.tube(t)
         model = base.loop.model
         _, dq, *others = levels_on_reference(base, t)
@@ -136,7 +136,7 @@ def _declarations(
     t, x, f_hat, context = arguments
     with_estimate = outputs((law, t, x, f_hat, context))
     without = outputs((law, t, x, jnp.zeros_like(f_hat), context))
-    changed = [name for name, x in with_estimate.items() if not jnp.array_equal(x, without[name])]
+    changed = [name for name, x in with_estimate.items() if not np.array_equal(x, without[name])]
     findings.require(
         not changed,
         f"uses_observer is False, but {', '.join(changed)} depends on f_hat",

@@ -124,7 +124,7 @@ def parts(samples: Sample) -> tuple[dict[str, jax.Array], dict[str, jax.Array]]:
 
 
 def _structure(findings: Findings, fold: Fold, samples: Sample) -> None:
-    first = jax.tree.map(lambda x: x[0], samples)
+    first = jax.tree.map(lambda x: np.asarray(x)[0], samples)
     acc = accumulates(findings, fold, first)
     result = shape_of(findings, "finish(acc)", fold.finish, acc)
     remedy = "It must be a dict from name to array"
@@ -150,8 +150,9 @@ def at_rest(findings: Findings, fold: Fold, samples: Sample) -> None:
         name: vars(samples)[name]
         for name in ("t", "dt", "step", "level_lower", "level_upper", "q_d")
     }
-    zeros = jax.tree.map(jnp.zeros_like, samples)
-    numbers, flags = parts(dataclasses.replace(zeros, x=zeros.x.at[:, 0].set(samples.q_d), **kept))
+    zeros = jax.tree.map(np.zeros_like, samples)
+    zeros.x[:, 0] = samples.q_d
+    numbers, flags = parts(dataclasses.replace(zeros, **kept))
 
     @jax.jit
     def both(fold, numbers):

@@ -105,7 +105,9 @@ def check_observer(
 
 def _slower(x: jax.Array) -> jax.Array:
     """Another state, for the start."""
-    return x.at[1].multiply(0.5)
+    scale = np.ones((len(x), 1), x.dtype)
+    scale[1] = 0.5
+    return x * scale
 
 
 def _structure(findings: Findings, observer, t, x, u, plant) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +18,7 @@ from iblf_jax.simulation.scenario import fit_joints
 from iblf_jax.testing._contract import (
     Findings,
     StoppedCheckError,
+    at_each,
     call_has_shape,
     check_function,
     examine,
@@ -65,20 +66,19 @@ def check_plant(plant: Plant, *, x: ArrayLike | None = None) -> None:
         except ValueError as error:
             findings.stop(str(error).removesuffix("."))
         plant = fit_joints(in_dtype(plant, "float64"), plant.n, "plant")
-        points = _points(plant, x)
+        points = np.asarray(_points(plant, x))
         t = jnp.asarray(0.7)
         method = traced_methods()
         in_both_types(findings, partial(_shapes, method=method), plant, t, points[0])
-        _structure(findings, method, plant, t, points)
-        rng = np.random.default_rng(2)
-        vectors = jnp.asarray(rng.normal(size=(2, plant.n)))
+        vectors = np.random.default_rng(2).normal(size=(2, plant.n))
+        at_state = jax.jit(partial(_at_state, method))
+        found = at_each(lambda x: at_state(plant, t, x, *vectors), points)
+        _structure(findings, plant, points, found)
         check_function(findings, partial(_functions, method), plant, (t, points[0]))
-        identities = partial(_identities, method)
-        found = jax.jit(jax.vmap(identities, in_axes=(None, None, 0, None, None)))
         # Optional members must agree with drift and gain.
-        for name, difference in found(plant, t, points, *vectors).items():
+        for name, difference in found.identities.items():
             problem, remedy = REMEDIES[name]
-            off = float(np.max(np.abs(np.asarray(difference))))
+            off = float(np.max(np.abs(difference)))
             findings.require(off <= TOLERANCE, f"{problem} (by {off:.2g})", remedy)
 
 
@@ -111,7 +111,7 @@ def _shapes(
     problem = f"gain(t, x) has shape {gain.shape}"
     remedy = f"It must be {(order, n, n)}, or {(order, n)} for diagonal gains"
     findings.require(gain.shape in ((order, n), (order, n, n)), problem, remedy)
-    v = x[0]
+    v = np.asarray(x)[0]
     optional: dict[str, tuple[tuple[jax.Array, ...], tuple[int, ...]]] = {
         "weights": ((x,), (order, n)),
         "steady_levels": ((v, v), (order - 2, n)),
@@ -144,32 +144,44 @@ def _own_by_level(plant: Plant) -> dict[str, Any]:
     return {name: own for name, (own, default) in pairs.items() if not is_default(own, default)}
 
 
-def _dependence(findings: Findings, plant: Plant, t: jax.Array, points: jax.Array) -> None:
-    """Requires rows of drift and gain that depend on no later level."""
-    of_points = jax.vmap(lambda x: plants.dependence_on_levels(plant, t, x))
-    try:
-        plants.check_dependence(type(plant).__name__, jax.jit(of_points)(points))
-    except ValueError as error:
-        findings.stop(str(error).removesuffix("."))
+class AtState(NamedTuple):
+    """What is tested of a plant at a state, or at several states along a leading axis."""
+
+    gain: Any
+    slopes: Any
+    """The derivatives of drift and gain along a straight line, in one vector."""
+    dependence: Any
+    """On which levels drift and gain depend; None for the model of a law with filters."""
+    identities: Numbers
+    """The differences between optional members and what follows from drift and gain."""
 
 
-def _structure(
-    findings: Findings, method: Method, plant: Plant, t: jax.Array, points: jax.Array
-) -> None:
+def _at_state(
+    method: Method, plant: Plant, t: jax.Array, x: jax.Array, v: jax.Array, s: jax.Array
+) -> AtState:
+    """What is tested at a state, all in one program."""
+    dependence = None
+    if not plant.needs_filters:
+        dependence = plants.dependence_on_levels(plant, t, x)
+    slopes = _derivatives_along(method, plant, t, x)
+    gain = method("gain")(plant, t, x)
+    return AtState(gain, slopes, dependence, _identities(method, plant, t, x, v, s))
+
+
+def _structure(findings: Findings, plant: Plant, points: np.ndarray, found: AtState) -> None:
     """Requires rows that depend on no later level, except for the model of a law with filters;
     invertible gains, and finite derivatives.
     """
-    if not plant.needs_filters:
-        _dependence(findings, plant, t, points)
-
-    def of_state(x):
-        return method("gain")(plant, t, x), _derivatives_along(method, plant, t, x)
-
-    gains, slopes = map(np.asarray, jax.jit(jax.vmap(of_state))(points))
+    if found.dependence is not None:
+        try:
+            plants.check_dependence(type(plant).__name__, found.dependence)
+        except ValueError as error:
+            findings.stop(str(error).removesuffix("."))
+    gains = found.gain
     finite = np.isfinite(gains).reshape(*gains.shape[:2], -1).all(axis=-1)
     if not finite.all():
         point, row = np.argwhere(~finite)[0]
-        state = np.array2string(np.asarray(points[point]).ravel(), precision=4, threshold=8)
+        state = np.array2string(points[point].ravel(), precision=4, threshold=8)
         problem = f"row {row} of gain(t, x) is not finite at x = {state}"
         findings.stop(problem, f"Look at roots and divisions. {PART}")
     for i in range(plant.order):
@@ -183,7 +195,7 @@ def _structure(
     findings.stop_if_any()
     problem = f"a derivative of order up to {plant.order - 1} of drift or gain is not finite"
     remedy = f"Laws differentiate them that often: look at roots, norms and divisions. {PART}"
-    findings.require(np.isfinite(slopes).all(), problem, remedy)
+    findings.require(np.isfinite(found.slopes).all(), problem, remedy)
 
 
 def _derivatives_along(method: Method, plant: Plant, t: jax.Array, x: jax.Array) -> jax.Array:

@@ -61,7 +61,7 @@ def _values(findings: Findings, noise: ProcessNoise, x: jax.Array) -> None:
     the state.
     """
     signs = np.where(np.indices(x.shape).sum(axis=0) % 2, -1.0, 1.0)
-    states = jnp.stack([sign * size * x for size in SIZES for sign in (1.0, signs)])
+    states = np.stack([sign * size * np.asarray(x) for size in SIZES for sign in (1.0, signs)])
     at_states = jax.vmap(lambda t, x: _diffusion(noise, t, x), (None, 0))
     found = np.asarray(jax.jit(jax.vmap(at_states, (0, None)))(jnp.asarray(TIMES), states))
     findings.require(np.all(np.isfinite(found)), f"{LABEL} is not finite somewhere")

@@ -15,6 +15,7 @@ from iblf_jax.core.families import is_default
 from iblf_jax.core.linalg import inner, matvec
 from iblf_jax.testing._contract import (
     Findings,
+    at_each,
     call_has_shape,
     check_function,
     examine,
@@ -95,8 +96,8 @@ def check_robot(robot: Robot, *, q: ArrayLike | None = None) -> None:
 
         v, u = jnp.asarray(rng.normal(size=(2, n)))
         check_function(findings, outputs, robot, (points[0], v, u))
-        numbers = jax.jit(jax.vmap(_identities, in_axes=(None, 0, None, None)))(robot, points, v, u)
-        _physics(findings, {name: np.asarray(value) for name, value in numbers.items()})
+        identities = jax.jit(_identities)
+        _physics(findings, at_each(lambda q: identities(robot, q, v, u), np.asarray(points)))
 
 
 def _shapes(findings: Findings, robot: Robot, q: jax.Array) -> None:

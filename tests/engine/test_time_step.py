@@ -152,7 +152,7 @@ def steps_of(scenario: ij.Scenario, method: str) -> tuple[Any, Any, list[Any], l
     method = "euler_maruyama" if scenario.process_noise is not None else method
     request = RunRequest.of(scenario, steps=STEPS, method=method)
     folds = metrics.as_folds(None, jnp.float64, scenario)
-    inputs = inputs_of(scenario, folds, jnp.asarray(DT), request, jnp.arange(4.0))
+    inputs = inputs_of(scenario, folds, jnp.asarray(DT, float), request, jnp.arange(4.0))
     batch = Batch.of(inputs, {"initial.dq": scenario.initial.dq[None]}, request.constants)
     carry = jax.jit(lambda: carry_without_linearization(batch, method))()
     step, records = program_of(TimeStep(method, record), batch, carry)

@@ -1,8 +1,8 @@
 """The stated error of loops that round or hold is never below the error, or it is flagged."""
 
 import warnings
-from functools import partial
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -139,18 +139,24 @@ def test_a_loop_whose_codes_are_certain_has_the_error_of_the_open_loop():
 
 
 def linearised(scenario):
-    """A scenario, its start, the derivative there, what grows, and the size of the plant."""
+    """A scenario, its start, the derivative there, what grows, the one-period map, and the size of
+    the plant."""
     scenario = canonical(scenario)
     state = initial_state(scenario)
-    derivative = stability.jacobian(scenario, jnp.zeros(()), state)
-    growth = error_growth.initial_growth(scenario, state, derivative)
-    return scenario, state, derivative, growth, ravel_pytree(integrated_part(state))[0].size
+
+    @jax.jit
+    def of_start(scenario, state):
+        derivative = stability.jacobian(scenario, jnp.zeros(()), state)
+        growth = error_growth.initial_growth(scenario, state, derivative)
+        return derivative, growth, stability.period_map(scenario, state, derivative)
+
+    size = ravel_pytree(integrated_part(state))[0].size
+    return scenario, state, *of_start(scenario, state), size
 
 
 def test_the_bounds_are_those_of_the_worst_and_of_random_rounding_errors():
     """The sums over periods, against some in NumPy, over a run of few periods and a long one."""
-    scenario, state, derivative, growth, plant = linearised(sampled(ENCODER, QUANTISER))
-    Phi = stability.period_map(scenario, state, derivative)
+    scenario, state, derivative, growth, Phi, plant = linearised(sampled(ENCODER, QUANTISER))
     A, B = derivative[:plant, :plant], derivative[:plant, plant : plant + 2]
     by_torque = np.asarray(stability.linear_flow(A, B, scenario.sampling.period))[:, plant:]
     law = np.asarray(derivative[plant:, :2])
@@ -161,24 +167,28 @@ def test_the_bounds_are_those_of_the_worst_and_of_random_rounding_errors():
         terms.append(term[:2])
         term = np.asarray(Phi) @ term
     terms = np.array(terms)
-    found = partial(error_growth._bounds, scenario, growth, state, derivative, Phi)
+
+    @jax.jit
+    def found(periods):
+        given = (scenario, growth, state, derivative, Phi, periods)
+        return *error_growth._bounds(*given), error_growth.bound(*given)
+
     worst = np.abs(terms).sum(axis=2)
-    np.testing.assert_allclose(found(jnp.asarray(20.0))[0], worst[:20].sum(axis=0), rtol=1e-9)
-    rigorous, probable = (np.asarray(x) for x in found(jnp.asarray(5000.0)))
+    np.testing.assert_allclose(found(20.0)[0], worst[:20].sum(axis=0), rtol=1e-9)
+    rigorous, probable, lower = (np.asarray(x) for x in found(5000.0))
     exact = worst[:5000].sum(axis=0)
     assert np.all(rigorous >= exact * (1 - 1e-9)) and np.all(rigorous < 2.0 * exact)
     constant = np.abs(terms.sum(axis=0)).sum(axis=1)
     deviations = np.sqrt((terms**2).sum(axis=(0, 2)))
     likely = np.sqrt(2 * np.log(2 * 2 * 5000 / error_growth.PROBABILITY)) * deviations
     np.testing.assert_allclose(probable, constant + likely, rtol=1e-9)
-    lower = error_growth.bound(scenario, growth, state, derivative, Phi, jnp.asarray(5000.0))
     np.testing.assert_array_equal(lower, np.minimum(rigorous, probable))
 
 
 @pytest.mark.slow
 def test_the_bound_covers_the_longest_run_and_may_be_infinite():
     """Of x' = tau, which forgets no rounding error, it is N times that of a period."""
-    scenario, state, derivative, growth, plant = linearised(sampled(actuator=QUANTISER))
+    scenario, state, derivative, growth, _, plant = linearised(sampled(actuator=QUANTISER))
 
     def bound(derivative, periods):
         Phi = stability.period_map(scenario, state, derivative)

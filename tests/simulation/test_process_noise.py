@@ -1,6 +1,7 @@
 """Process noise: an independent program, known moments, and statistics of the first exit."""
 
 import dataclasses
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -75,22 +76,22 @@ CASES = {
 }
 
 
-def increments(substeps, count, dt):
+def increments(substeps, count):
+    """Of steps of a length that is its argument."""
     noise = process_noise.Additive([[0.3], [0.2]], levels=(1, 2), substeps=substeps)
     key = noise_key(jax.random.PRNGKey(0), 0).astype(float)
-    draw = jax.jit(jax.vmap(lambda step: brownian_increment(link(noise), key, step, dt)))
-    return np.asarray(draw(jnp.arange(count, dtype=jnp.int32)))[..., 0]
+    draw = jax.vmap(partial(brownian_increment, link(noise), key), in_axes=(0, None))
+    return jax.jit(lambda dt: draw(jnp.arange(count, dtype=jnp.int32), dt)[..., 0])
 
 
-@pytest.mark.parametrize("substeps", [1, 4])
-def test_increments_of_steps_are_independent_and_have_their_length_as_variance(substeps):
+def test_increments_of_steps_are_independent_and_have_their_length_as_variance():
     """Those of several substeps are on the path of short steps."""
-    found, count = increments(substeps, 4096, 0.01), 4096
-    pairs = np.concatenate([found[:-1], found[1:]], axis=1)
-    np.testing.assert_allclose(np.cov(pairs.T) / 0.01, np.eye(4), atol=5 * np.sqrt(2 / count))
-    of_substeps = increments(1, 16 * substeps, 0.01).reshape(16, substeps, 2).sum(axis=1)
-    path = increments(substeps, 16, 0.01 * substeps)
-    np.testing.assert_allclose(path, of_substeps, atol=1e-15)
+    one, four = increments(1, 4096), increments(4, 4096)
+    for found in (one(0.01), four(0.01)):
+        pairs = np.concatenate([found[:-1], found[1:]], axis=1)
+        np.testing.assert_allclose(np.cov(pairs.T) / 0.01, np.eye(4), atol=5 * np.sqrt(2 / 4096))
+    of_substeps = np.reshape(one(0.01), (1024, 4, 2)).sum(axis=1)
+    np.testing.assert_allclose(four(0.04)[:1024], of_substeps, atol=1e-15)
 
 
 @pytest.mark.slow

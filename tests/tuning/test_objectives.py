@@ -174,7 +174,7 @@ def test_what_cannot_be_tuned_for_is_rejected():
 
 
 def exact(objective, run):
-    """Each term's and requirement's number, from the samples of a run."""
+    """The number of each term and requirement, from the samples of a run."""
     return np.asarray(jax.jit(folded)((Quantities(objective.quantities),), run)["tuning_exact"])
 
 
@@ -197,23 +197,26 @@ SELECTIONS += [([True, False, True], [0, 2]), (np.array([False, True, False]), [
 SELECTIONS += [(None, [0, 1, 2])]
 
 
-@pytest.mark.parametrize(("joints", "expected"), SELECTIONS, ids=str)
-def test_joints_selects_joints_everywhere(joints, expected, three_joints):
+def test_joints_selects_joints_everywhere(three_joints):
     """Whole numbers are indices, never weights; against NumPy on the samples."""
-    o, run = ij.objectives, three_joints
-    iae = ij.metrics.Tracking(), "iae"
-    parts = o.tracking(joints=joints) + o.effort(joints=joints) + o.metric(*iae, joints=joints)
-    parts += o.peak_torque_below(5.0, joints=joints) + o.error_below(0.1, joints=joints)
-    parts += o.margin_above(0.01, joints=joints)
-    tau, e1 = (np.abs(np.asarray(x))[:, expected] for x in (run.tau, run.e1))
-    inside = np.minimum(run.q - run.lower, run.upper - run.q)[:, expected]
-    found = exact(parts, run)
-    np.testing.assert_allclose(found[3:], [tau.max(), e1.max(), -np.min(inside)], rtol=1e-10)
-    # The integrals are those of a run in which the other joints stand still.
-    chosen = np.isin(np.arange(3), expected).astype(float)
-    others = dataclasses.replace(run, e=run.e * chosen, tau=run.tau * chosen)
-    separate = exact(o.tracking() + o.effort() + o.metric(*iae), others)
-    np.testing.assert_allclose(found[:3], separate, rtol=1e-10)
+    o, run, iae = ij.objectives, three_joints, (ij.metrics.Tracking(), "iae")
+    terms, requirements = [], []
+    for joints, _ in SELECTIONS:
+        of = {"joints": joints}
+        terms += [o.tracking(**of), o.effort(**of), o.metric(*iae, **of)]
+        requirements += [o.peak_torque_below(5.0, **of), o.error_below(0.1, **of)]
+        requirements += [o.margin_above(0.01, **of)]
+    integrals, peaks = exact(sum(terms[1:] + requirements, terms[0]), run).reshape(2, -1, 3)
+    tau, e, q, lower, upper = map(np.asarray, (run.tau, run.e, run.q, run.lower, run.upper))
+    for (joints, chosen), found, largest in zip(SELECTIONS, integrals, peaks, strict=True):
+        inside = np.minimum(q - lower, upper - q)[:, chosen]
+        expected = [*(np.abs(x[:, chosen]).max() for x in (tau, e[:, 0])), -np.min(inside)]
+        np.testing.assert_allclose(largest, expected, rtol=1e-10, err_msg=str(joints))
+        # The integrals are those of a run in which the other joints stand still.
+        some = np.isin(np.arange(3), chosen).astype(float)
+        others = dataclasses.replace(run, e=e * some, tau=tau * some)
+        expected = exact(o.tracking() + o.effort() + o.metric(*iae), others)
+        np.testing.assert_allclose(found, expected, rtol=1e-10, err_msg=str(joints))
 
 
 @pytest.mark.slow

@@ -11,17 +11,15 @@ from scipy.interpolate import make_interp_spline
 
 import iblf_jax as ij
 from iblf_jax import disturbances, references
+from iblf_jax.core.taylor import in_time
 from iblf_jax.simulation import closed_loop
 
 TWO_LINK = ij.presets.customary_two_link()
 
 
 def derivatives(function, order):
-    """A function of time with its first `order` derivatives, by nested jvp."""
-    functions = [function]
-    for _ in range(order):
-        functions.append(lambda t, f=functions[-1]: jax.jvp(f, (t,), (jnp.ones_like(t),))[1])
-    return jax.jit(lambda t: [f(t) for f in functions])
+    """A function of time with its first `order` derivatives."""
+    return jax.jit(lambda t: in_time(function, t, order))
 
 
 TIMES = (0.5, 1.0, 2.2, 3.0, 4.5)
@@ -30,7 +28,8 @@ POINTS = np.asarray([[0.0, 0.1], [0.4, 0.3], [0.2, 0.8], [0.6, 0.4], [0.5, 0.5]]
 
 def test_spline_is_the_quintic_of_scipy_and_rests_outside():
     spline = references.WaypointSpline(TIMES, POINTS)
-    at, places = derivatives(spline.position, 2), [spline.position(t) for t in (0.0, *TIMES, 20.0)]
+    at = derivatives(spline.position, 2)
+    places = [at(t)[0] for t in (0.0, *TIMES, 20.0)]
     np.testing.assert_allclose(places, POINTS[[0, 0, 1, 2, 3, 4, 4]], atol=1e-12)
     for t, point in ((0.0, POINTS[0]), (0.5, POINTS[0]), (4.5, POINTS[-1]), (20.0, POINTS[-1])):
         np.testing.assert_allclose(at(t), [point, [0, 0], [0, 0]], atol=1e-9)
