@@ -88,8 +88,8 @@ def bands(
       ValueError: not a Study, or invalid quantiles.
     """
     _check(study)
-    figure, panels = _grid(study.scenario.n, 2.4)
     data = study.bands(quantiles, runs=runs, exclude_failed=exclude_failed)
+    figure, panels = _grid(study.scenario.n, 2.4)
     for joint, axes in enumerate(panels):
         _draw_bands(axes, data, joint, study)
     _style.set_heading(figure, [_bands_title(data)])
@@ -310,9 +310,9 @@ def study_overview(study: Study, *, runs: int = 512) -> Figure:
     _check(study)
     n = study.scenario.n
     drawn = statistics.scalar_samples(study.samples)
-    figure, panels = _grid(n + 1 + len(drawn), 2.3)
     data = study.bands(runs=runs)
     margins = statistics.worst_joint(study.metrics, "margin")
+    figure, panels = _grid(n + 1 + len(drawn), 2.3)
     for joint in range(n):
         _draw_bands(panels[joint], data, joint, study)
     _draw_histogram(panels[n], study, "margin", margins, 40)

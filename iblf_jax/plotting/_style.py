@@ -215,7 +215,12 @@ def _checked_place(figure: Any, ax: Any) -> Figure | SubFigure | list[Axes] | No
         return figure
     if figure is not None:
         raise checks.fail("figure, ax", "both", "one of them", "Panels belong to their figure.")
-    panels = list(np.ravel(ax))
+    if isinstance(ax, np.ndarray):
+        panels = list(ax.flat)
+    elif isinstance(ax, list | tuple):
+        panels = list(ax)
+    else:
+        panels = [ax]
     if not panels or not all(isinstance(axes, Axes) for axes in panels):
         remedy = "Such as the second value of plt.subplots()."
         raise checks.fail("ax", ax, "a matplotlib Axes, or one for each panel", remedy)

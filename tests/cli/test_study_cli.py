@@ -145,7 +145,7 @@ cli.entry()
 @pytest.mark.parametrize(
     ("kind", "change", "message"),
     [
-        ("study", ("[study]", "[sweep]"), "sweep: got an unknown key"),
+        ("study", ("[study]", "[sweep]"), "sweep: got a table, expected none in a file"),
         ("study", ("runs = 300", "rums = 300"), "study.rums"),
         ("study", ("duration = 0.02", ""), "run.duration"),
         ("study", ('method = "euler"', "record_every = 2"), "run.record_every"),
