@@ -267,8 +267,9 @@ def _refuse_stiff_friction(arm: Arm, q: np.ndarray, file: Path) -> None:
         "--robot",
         str(file),
         f"a robot whose friction a time step of {step:g} s resolves",
-        f"At rest the joint {arm.joints[worst]} has {slope[worst]:.3g} N m s/rad on"
-        f" {1 / mobility[worst]:.2g} kg m^2, a decay of {decay[worst]:.2g} 1/s. Either give the"
+        f"At rest the joint {arm.joints[worst]} has {slope[worst]:.3g} N m s/rad (damping +"
+        f" friction/friction_width) on {1 / mobility[worst]:.2g} kg m^2, a decay of"
+        f" {decay[worst]:.2g} 1/s. Either give the"
         " option --rotor-inertia, with which the simulated robot has the inertia of a rotor there,"
         " or correct <dynamics damping, friction>, or name a --tip before it.",
     )
