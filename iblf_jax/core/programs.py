@@ -111,7 +111,8 @@ class Programs:
     def of(self, function: Callable) -> list[Any]:
         """What is kept of a function."""
         with self._lock:
-            return [kept for key, kept in self._kept.items() if key[0] is function]  # type: ignore[index]
+            keys = [key for key in self._kept if key[0] is function]  # type: ignore[index]
+            return [self._kept[key] for key in keys]
 
 
 class StructuredFunction:

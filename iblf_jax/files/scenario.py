@@ -333,12 +333,12 @@ def from_dict(
     """
     try:
         others = set(other_tables)
+        data = {key: x for key, x in as_table(data, "file").items() if key not in others}
         for table, command in COMMANDS.items():
-            if table in data and table not in others:
+            if table in data:
                 remedy = f"The command `iblf-jax {command}` reads files with it."
                 expected = "none in a file of this kind"
                 raise checks.fail(table, checks.Words("a table"), expected, remedy)
-        data = {key: x for key, x in as_table(data, "file").items() if key not in others}
         if "scenario" in data:
             data, folder = _with_scenario_read(data, folder)
         if "preset" in data:

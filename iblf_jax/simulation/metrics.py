@@ -867,9 +867,10 @@ def metric_units(folds: Sequence[Fold], scenario: Scenario) -> tuple[tuple[str, 
 
 def _class_with(name: object) -> str:
     """The remedy for something in place of a fold, such as the name of a result."""
-    for cls in Fold.__subclasses__():
+    classes = Fold.__subclasses__() if isinstance(name, str) else []
+    for cls in classes:
         units = vars(cls).get("units")  # a property where it depends on the fold
-        if isinstance(name, str) and isinstance(units, dict) and name in units:
+        if isinstance(units, dict) and name in units:
             return f"ij.metrics.{cls.__name__}() returns it."
     return "Such as ij.metrics.Margin(); ij.metrics.standard() returns the usual ones."
 

@@ -362,15 +362,11 @@ def _resolved(scenario: Scenario, path: str, full: str) -> tuple[list[str | int]
 
 def _known_joints(scenario: Scenario, full: str) -> str:
     """The remedy for a path whose last index would be the name of a joint, if there were one."""
-    try:
-        *_, field, last = parse(full)
-        before = full.removesuffix(f"[{last}]").removesuffix(f"[{json.dumps(last)}]")
-        value = resolve(scenario, before)[1]
-    except (LookupError, ValueError, AttributeError):
+    leaf, _ = _split_at_joint(scenario, full)
+    if not leaf:
         return ""
+    field = parse(leaf)[-1]
     names = component_names(scenario.plant)
-    if not isinstance(last, RowName) or jnp.shape(value) != (len(names),):
-        return ""
     entries = ", ".join(f"{field}[{i}] ({name})" for i, name in enumerate(names))
     return f"There are {entries}."
 
@@ -380,20 +376,27 @@ def _with_joint_number(scenario: Scenario, full: str) -> str:
 
     Paths that have a meaning of their own keep it: keys of dicts of modules, and rows of links.
     """
+    leaf, name = _split_at_joint(scenario, full)
+    if not leaf:
+        return full
+    joints = component_names(scenario.plant)
+    return f"{leaf}[{joints.index(name)}]" if joints.count(name) == 1 else full
+
+
+def _split_at_joint(scenario: Scenario, full: str) -> tuple[str, str]:
+    """The path of a leaf with an entry for each joint, and the name that is its index; two empty
+    texts for any other path.
+    """
     try:
         last = parse(full)[-1]
         if not isinstance(last, RowName):
-            return full
+            return "", ""
+        leaf = full.removesuffix(f"[{last}]").removesuffix(f"[{json.dumps(last)}]")
+        value = resolve(scenario, leaf)[1]
         joints = component_names(scenario.plant)
-        if joints.count(last) != 1:
-            return full
-        field = full.removesuffix(f"[{last}]").removesuffix(f"[{json.dumps(last)}]")
-        value = resolve(scenario, field)[1]
     except (LookupError, ValueError, AttributeError):
-        return full
-    if jnp.shape(value) == (len(joints),):
-        return f"{field}[{joints.index(last)}]"
-    return full
+        return "", ""
+    return (leaf, last) if jnp.shape(value) == (len(joints),) else ("", "")
 
 
 def with_parameters(scenario: Scenario, values: Mapping[str, Any]) -> Scenario:

@@ -40,7 +40,13 @@ from iblf_jax.engine import CompiledBatch, block_size, blocks_in_flight, wait_un
 from iblf_jax.studies.dataset import DRAWN
 from iblf_jax.studies.draws import CaseInputs
 from iblf_jax.studies.options import LocalExecutor
-from iblf_jax.studies.study_setup import PreparedStudy, SharedInputs, StudyProgram, drawn_leaves
+from iblf_jax.studies.study_setup import (
+    PreparedStudy,
+    SharedInputs,
+    StudyProgram,
+    bytes_of,
+    drawn_leaves,
+)
 
 
 class BlockResults(NamedTuple):
@@ -89,8 +95,7 @@ def traced(prepared: PreparedStudy, inputs: CaseInputs) -> Any:
 
 def case_bytes(prepared: PreparedStudy) -> float:
     """Memory that the results of one case take [bytes]."""
-    leaves = jax.tree.leaves(result_shapes(prepared))
-    return sum(x.size * x.dtype.itemsize for x in leaves) / block_size()
+    return bytes_of(result_shapes(prepared)) / block_size()
 
 
 def _without_inadmissible(admissible: jax.Array, x: jax.Array) -> jax.Array:

@@ -170,7 +170,7 @@ def prepare(
     inputs = case_inputs(np.zeros(block_size(), int), options.runs, points, designed)
     varied, drawn, _ = jax.eval_shape(partial(drawn_leaves, targets), shared, inputs)
     if in_memory and options.runs >= MANY_RUNS:
-        bytes_each = _bytes_of(drawn) / block_size() + _bytes_of_metrics(scenario, folds)
+        bytes_each = bytes_of(drawn) / block_size() + _bytes_of_metrics(scenario, folds)
         checks.fits_memory("runs", options.runs, bytes_each)
     batch = compile_batch(request, scenario, varied, folds, dt)
     program = StudyProgram(targets, batch)
@@ -185,8 +185,9 @@ def _bytes_of_metrics(scenario: Scenario, folds: Sequence[Fold]) -> int:
         sample = evaluate(scenario, start, initial_state(scenario))[1]
         return [fold.finish(fold.init(sample)) for fold in folds]
 
-    return _bytes_of(jax.eval_shape(metrics, scenario))
+    return bytes_of(jax.eval_shape(metrics, scenario))
 
 
-def _bytes_of(shapes: Any) -> int:
+def bytes_of(shapes: Any) -> int:
+    """Memory that arrays of these shapes and types take [bytes]."""
     return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(shapes))
