@@ -129,10 +129,6 @@ class RobustPassivity:
     width: ij.Leaf = ij.leaf("1", sign="nonnegative")
     uses_observer: ClassVar[bool] = False
 
-    def init(self, q, dq, context):
-        """No state."""
-        return ()
-
     def command(self, t, q, dq, f_hat, context, state):
         """The torque."""
         tube, model = context.tube(t), context.model

@@ -129,10 +129,6 @@ class PowerOfE2:
     K2: Any = ij.leaf("N m s/rad", sign="positive")
     c: Any = ij.leaf("N m", sign="positive")
 
-    def init(self, q, dq, context):
-        """No state."""
-        return ()
-
     def command(self, t, q, dq, f_hat, context, state):
         """The torque."""
         tube, model = context.tube(t), context.model

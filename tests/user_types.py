@@ -110,9 +110,6 @@ class Push(ij.disturbances.Disturbance):
 class Sensor(ij.sensors.RobotSensor):
     draws: ClassVar[int] = 0
 
-    def init(self, q: Array, dq: Array, period: Array) -> ij.sensors.State:
-        return ()
-
     def measure(
         self, q: Array, dq: Array, normal: Array, period: Array, state: ij.sensors.State
     ) -> tuple[ij.sensors.Measurement, ij.sensors.State]:

@@ -293,10 +293,6 @@ class InputLimits(actuators.Actuator):
     lower: ij.Leaf = ij.leaf(INPUT)
     upper: ij.Leaf = ij.leaf(INPUT)
 
-    def init(self, tau):
-        """No state."""
-        return ()
-
     def deliver(self, command, dq, state):
         """The clipped command."""
         limited = (command < self.lower) | (command > self.upper)

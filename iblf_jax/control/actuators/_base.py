@@ -80,9 +80,11 @@ class Actuator(TimeVarying):
         """
         return jnp.zeros_like(command)
 
-    @abc.abstractmethod
     def init(self, tau: jax.Array) -> State:
-        """The state in which the actuator delivers the torque `tau`, (n,) [N m]."""
+        """The state in which the actuator delivers the torque `tau`, (n,) [N m]; `()` for one
+        without a state.
+        """
+        return ()
 
     @abc.abstractmethod
     def deliver(self, command: jax.Array, dq: jax.Array, state: State) -> Delivered:

@@ -53,10 +53,6 @@ class DeadZone(Actuator):
         """The width slope (upper - lower)."""
         return self.slope * (self.upper - self.lower)
 
-    def init(self, tau: jax.Array) -> tuple[()]:
-        """No state."""
-        return ()
-
     def deliver(self, command: jax.Array, dq: jax.Array, state: tuple[()]) -> Delivered:
         """The torque of a command outside the zone; 0 inside it."""
         above = jnp.maximum(command - self.upper, 0.0)

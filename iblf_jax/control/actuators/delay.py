@@ -86,10 +86,6 @@ class Delay(Actuator):
         """The time at which the first command arrives, (1,) [s]."""
         return jnp.atleast_1d(self.delay)
 
-    def init(self, tau: jax.Array) -> tuple[()]:
-        """No state; the loop keeps the commands."""
-        return ()
-
     def deliver(self, command: jax.Array, dq: jax.Array, state: tuple[()]) -> Delivered:
         """The command that the loop passes, which is delayed already."""
         return Delivered(command, jnp.zeros(command.shape, bool), ())

@@ -44,10 +44,6 @@ class Fault(Actuator):
         """`time`, (1,) [s]."""
         return jnp.atleast_1d(self.time)
 
-    def init(self, tau: jax.Array) -> tuple[()]:
-        """No state."""
-        return ()
-
     def deliver(self, command: jax.Array, dq: jax.Array, state: tuple[()]) -> Delivered:
         """The torque with loss and bias; `at(t)` leaves them out before the fault."""
         tau = self.effectiveness * command + self.bias

@@ -13,10 +13,6 @@ from iblf_jax.core.pytree import component
 class Ideal(Actuator):
     """The applied torque equals the command, without delay.  Source: none; the baseline."""
 
-    def init(self, tau: jax.Array) -> tuple[()]:
-        """No state."""
-        return ()
-
     def deliver(self, command: jax.Array, dq: jax.Array, state: tuple[()]) -> Delivered:
         """The command itself."""
         return Delivered(command, jnp.zeros(command.shape, bool), ())

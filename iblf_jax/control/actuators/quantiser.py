@@ -53,10 +53,6 @@ class Quantiser(Actuator):
         """The distance of the command to the nearest limit between two levels, (n,) [N m]."""
         return 0.5 * self.step - jnp.abs(rounded(command, self.step) - command)
 
-    def init(self, tau: jax.Array) -> tuple[()]:
-        """No state."""
-        return ()
-
     def deliver(self, command: jax.Array, dq: jax.Array, state: tuple[()]) -> Delivered:
         """The nearest level."""
         return Delivered(rounded(command, self.step), jnp.zeros(command.shape, bool), ())

@@ -94,9 +94,11 @@ class Sensor(AnySensor):
         """The levels that it measures, counted from 1; None for all."""
         return None
 
-    @abc.abstractmethod
     def init(self, x: jax.Array, period: jax.Array) -> State:
-        """State before the first sample, given x, (r, n), there and the period, () [s]."""
+        """State before the first sample, given x, (r, n), there and the period, () [s]; `()` for a
+        sensor without a state.
+        """
+        return ()
 
     @abc.abstractmethod
     def measure(
@@ -118,11 +120,11 @@ class RobotSensor(AnySensor):
     The levels from the third on of a plant with such a sensor are measured without error.
     """
 
-    @abc.abstractmethod
     def init(self, q: jax.Array, dq: jax.Array, period: jax.Array) -> State:
         """State before the first sample, given q [rad] and dq [rad/s] there and the period, ()
-        [s].
+        [s]; `()` for a sensor without a state.
         """
+        return ()
 
     @abc.abstractmethod
     def measure(
@@ -192,9 +194,11 @@ class LevelSensor(AnySensor):
 
     levels = 1
 
-    @abc.abstractmethod
     def init_level(self, x: jax.Array, period: jax.Array) -> State:
-        """State before the first sample, given the level there, (n,), and the period, () [s]."""
+        """State before the first sample, given the level there, (n,), and the period, () [s]; `()`
+        for a sensor without a state.
+        """
+        return ()
 
     @abc.abstractmethod
     def measure_level(
@@ -222,11 +226,11 @@ class Velocity(Part):
         """Warnings about the values of the fields at the period, () [s]."""
         return []
 
-    @abc.abstractmethod
     def init(self, y: jax.Array, dq: jax.Array, period: jax.Array) -> State:
         """State before the first sample, for a joint that arrives at y [rad] with the velocity
-        dq [rad/s].
+        dq [rad/s]; `()` for a velocity without a state.
         """
+        return ()
 
     @abc.abstractmethod
     def estimate(

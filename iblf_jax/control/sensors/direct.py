@@ -39,10 +39,6 @@ class Direct(LevelSensor):
         """The same without resolution."""
         return dataclasses.replace(self, resolution=None)
 
-    def init_level(self, x: jax.Array, period: jax.Array) -> tuple[()]:
-        """No state."""
-        return ()
-
     def measure_level(
         self, x: jax.Array, normal: jax.Array, period: jax.Array, state: tuple[()]
     ) -> tuple[jax.Array, tuple[()]]:

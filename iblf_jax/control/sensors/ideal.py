@@ -16,10 +16,6 @@ class Ideal(RobotSensor):
 
     draws: ClassVar[int] = 0
 
-    def init(self, q: jax.Array, dq: jax.Array, period: jax.Array) -> tuple[()]:
-        """No state."""
-        return ()
-
     def measure(
         self, q: jax.Array, dq: jax.Array, normal: jax.Array, period: jax.Array, state: tuple[()]
     ) -> tuple[Measurement, tuple[()]]:

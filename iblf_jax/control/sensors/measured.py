@@ -24,10 +24,6 @@ class Measured(Velocity):
     noise: Leaf = leaf(VELOCITY, sign="nonnegative", default=0.0)
     draws: ClassVar[int] = 1
 
-    def init(self, y: jax.Array, dq: jax.Array, period: jax.Array) -> tuple[()]:
-        """No state."""
-        return ()
-
     def estimate(
         self, y: jax.Array, dq: jax.Array, normal: jax.Array, period: jax.Array, state: tuple[()]
     ) -> tuple[jax.Array, tuple[()]]:

@@ -23,10 +23,6 @@ class Unmeasured(LevelSensor):
     draws: ClassVar[int] = 0
     is_measured: ClassVar[bool] = False
 
-    def init_level(self, x: jax.Array, period: jax.Array) -> tuple[()]:
-        """No state."""
-        return ()
-
     def measure_level(
         self, x: jax.Array, normal: jax.Array, period: jax.Array, state: tuple[()]
     ) -> tuple[jax.Array, tuple[()]]:

@@ -59,10 +59,6 @@ class DockingProgramme:
     uses_observer = False
     gains = ()
 
-    def init(self, x, context):
-        """The law has no state: the left side counts as soon as it holds, and then it keeps."""
-        return ()
-
     def command(self, t, x, d_hat, context, state):
         """The thrust."""
         (radial, along), v = x[0], x[1]

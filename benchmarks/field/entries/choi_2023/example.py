@@ -69,10 +69,6 @@ class CruiseProgramme:
     uses_observer = False
     gains = ()
 
-    def init(self, x, context):
-        """The law has no state."""
-        return ()
-
     def command(self, t, x, d_hat, context, state):
         """The wheel force."""
         v, mass, natural = x[1], context.model.mass, context.model.drift(t, x)[1]

@@ -58,10 +58,6 @@ class Programme(ij.controllers.Law):
     uses_observer = False
     gains = ()
 
-    def init(self, x, context):
-        """The law has no state."""
-        return ()
-
     def command(self, t, x, d_hat, context, state):
         """The force."""
         e, v = x[0] - TARGET, x[1]

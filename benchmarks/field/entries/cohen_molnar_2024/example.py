@@ -50,10 +50,6 @@ class ReducedOrderBarrier:
         k0 = self.sigma * jax.nn.softplus(-h0(model, q) / (self.sigma * square)) * slope
         return h0(model, q) - 0.5 / self.mu * (dq - k0) @ (model.mass_matrix(q) @ (dq - k0))
 
-    def init(self, q, dq, context):
-        """No state."""
-        return ()
-
     def command(self, t, q, dq, f_hat, context, state):
         """The filtered damping torque."""
         model = context.model

@@ -59,10 +59,6 @@ class InputLimit:
     includes_e2 = True
     gains = ("a",)
 
-    def init(self, x, context):
-        """The law has no state."""
-        return ()
-
     def command(self, t, x, d_hat, context, state):
         """The voltage."""
         tube = context.tube(t)

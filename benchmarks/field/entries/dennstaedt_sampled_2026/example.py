@@ -69,10 +69,6 @@ class SampledFunnel:
     uses_observer = False
     gains = ()
 
-    def init(self, q, dq, context):
-        """The law has no state."""
-        return ()
-
     def command(self, t, q, dq, f_hat, context, state):
         """The force."""
         tube = context.tube(t)

@@ -71,10 +71,6 @@ class Published:
         w = BOUND**2 * (BOUND**2 + z**2) / room**2
         return -(smoothed(n * w, powers(n) / w - tube.dq_d) + 2.0) / g1, n * w
 
-    def init(self, x, context):
-        """The law has no state."""
-        return ()
-
     def command(self, t, x, d_hat, context, state):
         """The input v = g2 u."""
         g1 = gain(t, x)[0]

@@ -82,10 +82,6 @@ class CruiseControl:
     uses_observer = False
     gains = ()
 
-    def init(self, q, dq, context):
-        """The law has no state."""
-        return ()
-
     def command(self, t, q, dq, f_hat, context, state):
         """The acceleration."""
         x, v = leader(t)

@@ -42,10 +42,6 @@ class ExogenousStates:
         gaps = 1.0 - ((jnp.stack([q, tube.q_d]) - Q_MEAN) / Q_HALF) ** 2
         return (gaps[0] / gaps[1] * tube.dq_d - V_MEAN) / V_HALF
 
-    def init(self, q, dq, context):
-        """No state."""
-        return ()
-
     def command(self, t, q, dq, f_hat, context, state):
         """The torque."""
         tube, model = context.tube(t), context.model

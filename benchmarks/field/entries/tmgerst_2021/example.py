@@ -61,10 +61,6 @@ class ElasticFilter:
     filtered: bool = ij.static(default=True)
     receives_x, has_slack, uses_observer, gains = True, True, False, ()
 
-    def init(self, x, context):
-        """The law has no state."""
-        return ()
-
     def command(self, t, x, d_hat, context, state):
         """The torque of the motors."""
         a, jerk, f, M = derivatives(context.model, x, self.wrong)
