@@ -153,7 +153,7 @@ ADVICE = {
 TASK = "zhang_yan_2024"
 """The task of the laws with the same budget of tuning: the arm of the table."""
 LIMIT = 1.0
-"""The limit of the effort that is shown, in efforts of the published law."""
+"""The limit of the effort that is shown, in efforts of the law of the entry."""
 OWN = "own"
 """The factor of a law that no factor gives the effort of the first one; its gains are its own."""
 SLOW = "error, encoder and 10 ms [mrad]"
@@ -333,7 +333,7 @@ def same_budget(tuned: dict[str, Any]) -> list[str]:
         " more where a single search came near the best gains, and looks further where it finds no"
         " gains (the column *runs* has both numbers). It"
         " minimises the RMS error of the entire run under an effort of"
-        f" {tuned['published']['effort']:.3g} N m, that of the published law at the published"
+        f" {tuned['own']['effort']:.3g} N m, that of the paper's law at the published"
         " gains, most of which belongs to the start; so does most of the error. The last columns"
         " have the same gains with a longer period and exact measurements, and with masses that"
         " the model does not have: they are not tuned for it. "
@@ -341,7 +341,7 @@ def same_budget(tuned: dict[str, Any]) -> list[str]:
         "",
         table(rows),
         "",
-        "*published law* is `Backstepping(Integral)` as printed. Only these laws have been tuned"
+        "*law of the entry* is `Backstepping(Integral)` as printed. Only these laws have been tuned"
         " so; [the same for other tasks](../field_equal_budget.md), with curves over the effort,"
         f" is another page. Measured by `{tuned['command']}`, {machine['date']}: iblf_jax"
         f" {machine['iblf_jax']}, JAX {machine['jax']}, Python {machine['python']}, commit"

@@ -87,7 +87,7 @@ def corrections(entry: Entry, evidence: dict[str, float]) -> str:
         texts = [x.printed, x.corrected, filled(x.evidence, evidence)]
         texts += [x.edition_of(entry.source), x.contact_in_words]
         rows.append([x.found_in, *map(escaped, texts)])
-    headings = ["error of the", "printed", "corrected", "evidence", "read", "contact"]
+    headings = ["found in the", "printed", "corrected", "evidence", "read", "contact"]
     table = markdown_table(headings, rows)
     return f"{table}\n\nWho could be asked: {escaped(entry.source.contact)}."
 

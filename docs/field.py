@@ -110,7 +110,7 @@ def benchmark_page(found: list[Part]) -> str:
         " [Adding an entry](add_an_entry.md) describes the steps, and [the tasks](tasks.md) are"
         " files that programs in any language can run." + checked({part.name for part in found}),
         f"On {compared} of the {len(found)} tasks [laws are compared with the same budget of"
-        f" tuning]({field_budget.NAME}.md), the published law among them.",
+        f" tuning]({field_budget.NAME}.md), the law of the entry among them.",
         "## Entries",
         summary(found),
         works_without_entry(found),
@@ -212,7 +212,7 @@ def of_other_programs(part: Part) -> str:
     words = (
         f"Results of other programs on {part.link}, files that `check.py --result` accepted. They"
         " have no common budget of tuning. The numbers are those at the rows of the files: errors"
-        " of the second half of the run, and the effort as a share of that of the published law."
+        " of the second half of the run, and the effort as a share of that of the law of the entry."
     )
     headings = ["law (external)", *numbers, "left", "SHA-256 of the file", "date"]
     return f"{words}\n\n{markdown_table(headings, rows)}"

@@ -13,7 +13,7 @@ from typing import Any
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 sys.path += [str(BENCHMARKS), str(BENCHMARKS / "field")]
 
-from entry import PUBLISHED, RESULTS
+from entry import OWN, RESULTS
 from entry_tables import escaped, markdown_table
 from equal_budget import (
     BUDGET,
@@ -45,10 +45,12 @@ REMARKS = {
     "choi_2023": "The task was added after the results of the others, because it has limits of the"
     " input and a constraint. Its publication wants a speed of 24 m/s, and no distance beyond that"
     " of the constraint: the reference, 25.2 m behind the leading car, is one that the entry"
-    " assumes for other laws. The published law is not designed for this error, and its speed of"
+    " assumes for other laws. The law of the entry is not designed for this error, and its speed of"
     " 24 m/s, which is not tuned, limits its effort.",
 }
 """Task -> what a reader of its ranks has to know."""
+AT_END = 0.01
+"""Distance to the end of a range, as a share of the gain, within which a gain is at the end."""
 WIDE = 10.0
 """Largest ratio of the numbers of a linear axis."""
 
@@ -70,14 +72,20 @@ def in_words(found: dict[str, dict[str, Any]]) -> str:
     added = sum(law in LATER.get(name, ()) for name, one in found.items() for law in one["laws"])
     kept = sum(map(len, orders))
     near = sum(rank == 1 for order in orders for rank in order.values())
+    results_and_orders = zip(found.values(), orders, strict=True)
+    ranked = [result["laws"][law] for result, order in results_and_orders for law in order]
+    robust = sum(not words_of(law["robustness"]) for law in ranked)
+    at_end = sum(bool(gains_at_the_end(law, 1.0)) for law in ranked)
+    ends = f"; {at_end} of the {kept} have a gain at the end of its range" if at_end else ""
     chosen = sum(name in found for name in TASKS)
     later = f" and on {len(found) - chosen} added later" if len(found) > chosen else ""
     of_laws = f" ({added} added after the results of the others)" if added else ""
     return (
         f"of {laws} pairs of a task and a tuned law{of_laws}, on {chosen} of the {len(TASKS)} tasks"
-        f" chosen before the results{later}, {kept} keep the effort of the published law, the"
-        f" bounds and the constraints, and {near} of these are within {100 * TIE:g} % of the"
-        " smallest error of their task"
+        f" chosen before the results{later}, {kept} keep the effort of the law of the"
+        f" entry, the bounds and the constraints, {robust} of these also with the parameters,"
+        f" periods and noise of the page, and {near} of the {kept} are within {100 * TIE:g} % of"
+        f" the smallest error of their task{ends}"
     )
 
 
@@ -102,7 +110,7 @@ def page(found: dict[str, dict[str, Any]]) -> str:
         chosen += f" Chosen, but without a result: {', '.join(lacking)}."
     sections = [
         "# Laws with the same budget of tuning",
-        "Each law of a task is tuned with the same budget, the published one among them, and the"
+        "Each law of a task is tuned with the same budget, that of the entry among them, and the"
         " result is a curve of its error against its effort. One command computes a task:",
         "```bash\npython benchmarks/field/equal_budget.py --task zhang_yan_2024\n```",
         "`--laws` takes other laws of the package, and `--task` any entry of the"
@@ -110,10 +118,12 @@ def page(found: dict[str, dict[str, Any]]) -> str:
         "## What is equal, and what is not",
         "\n".join(f"- {line}" for line in method()),
         "## Which laws keep what",
-        "Each cell has the rank of a law by its error, under the effort of the published law. A"
-        " dash is a law that found no gains which keep this effort, the bounds and the constraints;"
-        " an empty cell is one that is not in the task. Ranks of different tasks have different"
-        " laws beside them, so they are not averaged.",
+        "Each cell has the rank of a law by its error, under the effort of the law of the"
+        " entry. A dash is a law that found no gains which keep this effort, the bounds and the"
+        " constraints; an empty cell is one that is not in the task. A cross (×) marks gains that"
+        " do not keep bounds or constraints in a run with the parameters, periods or noise below,"
+        " and a plus (+) a gain at the end of its range, beyond which the error might be smaller. Ranks of different"
+        " tasks have different laws beside them, so they are not averaged.",
         f"Together {in_words(found)}.",
         overview(found),
         *(section(name, result) for name, result in found.items()),
@@ -127,8 +137,8 @@ def method() -> list[str]:
     periods = ", ".join(f"{1e3 * period:g}" for period in PERIODS)
     return [
         "**Gains**: two or three of each law, named in its table, each within a factor of"
-        f" {RANGE:g} of its start. A gain may have a number for each component. The published law"
-        " starts at its published gains, the others at its rates (`task_laws.py`).",
+        f" {RANGE:g} of its start. A gain may have a number for each component. The law of the"
+        " entry starts at its own gains, the others at its rates (`task_laws.py`).",
         f"**Budget**: for each limit of the effort `ij.tune` has {BUDGET.values} points without"
         f" derivatives, and {BUDGET.starts} searches of at most {BUDGET.iterations} steps with"
         " them. A search that has converged ends, one whose best gains a single start came near"
@@ -137,7 +147,7 @@ def method() -> list[str]:
         "**Objective**: the RMS error of the first level, over all components and the entire run."
         " Error and effort are those of the same time.",
         "**Effort**: the RMS input above the one that balances gravity, or above the steady input"
-        f" of a plant. Its limits are {numbers} times that of the published law with the published"
+        f" of a plant. Its limits are {numbers} times that of the law of the entry with its own"
         f" gains. The start, which is {100 * START:g} % of the run, and the rest are stated apart.",
         "**Task**: bounds of all levels and constraints are requirements of the tuning. Limits of"
         " the input clip the command of every law. Tasks without them have no such limit.",
@@ -157,14 +167,15 @@ def method() -> list[str]:
         " golestani\\_2022 and zhang\\_2022, were left out for their time: plants of three"
         " components take 100 s of a processor for each law. The limits of the effort, the range of"
         " the gains and the weights among them were chosen after a trial on liu\\_2018, in which no"
-        " law kept half of the effort, and one law kept no limit without its weight. The"
-        f" {100 * TIE:g} % of the rank were chosen after the results, from the differences below.",
+        " law kept half of the effort, and one law kept no limit without its weight. The law of"
+        " mcilvanna\\_2024 got its weight later: without it the error was the same under all"
+        f" limits. The {100 * TIE:g} % of the rank were chosen after the results, from the differences below.",
         "**Rank**: one more than the number of laws whose error is smaller by more than"
         f" {100 * TIE:g} %, among those that keep the limit of the effort, the bounds and the"
         " constraints. Smaller differences are those of the search: on liu\\_2018 the published law"
         " ends 4 % below its row if its weight is not tuned, and Integral and Log, whose slopes"
         " differ by a factor of 2, give one law up to a weight.",
-        "**Figures**: the grey line is the effort of the published law with the published"
+        "**Figures**: the grey line is the effort of the law of the entry with its own"
         " gains, and the star its error. A bar is the range of the errors of the gains under"
         " this effort on other plants, with periods and with noise. A cross is a law of which"
         " some of these runs do not keep the bounds.",
@@ -187,11 +198,33 @@ def overview(found: dict[str, dict[str, Any]]) -> str:
                 cells.append("")
                 continue
             order = ranks(result)
-            cells.append(str(order[law]) if law in order else "–")
+            cells.append(_rank(order[law], result["laws"][law]) if law in order else "–")
         taken = [cell for cell in cells if cell]
         kept = sum(cell != "–" for cell in taken)
         rows.append([_narrow(law), f"{kept} of {len(taken)}", *cells])
     return markdown_table(["law", "kept", *map(escaped, found)], rows)
+
+
+def _rank(rank: int, law: dict[str, Any]) -> str:
+    """A rank with what its reader has to know."""
+    left = " ×" if words_of(law["robustness"]) else ""
+    return str(rank) + left + (" +" if gains_at_the_end(law, 1.0) else "")
+
+
+def words_of(robust: dict[str, Any]) -> list[str]:
+    """What the runs on other plants, with periods and with noise do not keep."""
+    values = [*robust["masses"].values(), *robust["periods"].values(), *robust["noise"]]
+    return [value for value in values if isinstance(value, str)]
+
+
+def gains_at_the_end(law: dict[str, Any], level: float) -> list[str]:
+    """The gains of a law that end within `AT_END` of an end of their range under a limit."""
+    found = []
+    for path, values in _row(law, level).get("gains", {}).items():
+        logs = (abs(math.log(x / y)) for x, y in zip(values, law["gains"][path], strict=True))
+        if max(logs) > math.log(RANGE) - AT_END:
+            found.append(path)
+    return found
 
 
 def _narrow(law: str) -> str:
@@ -215,8 +248,8 @@ def section(name: str, result: dict[str, Any]) -> str:
             rows.append(["–", _narrow(law), row["left"], *[""] * 5])
             continue
         rows.append([str(order[law]), _narrow(law), *(_number(row[key]) for key in numbers)])
-    own = result["published"]
-    rows.append(["", "published gains", *(_number(own[key]) for key in numbers)])
+    own = result["own"]
+    rows.append(["", "gains of the entry", *(_number(own[key]) for key in numbers)])
     machine = result["machine"]
     where = (
         f"`{result['command']}`: {result['processor_seconds']:.0f} s of {machine['processor']},"
@@ -230,10 +263,11 @@ def section(name: str, result: dict[str, Any]) -> str:
             f"![{description(result)}]({NAME}_{name}.png)",
             under_one(result, at_one),
             markdown_table(headings, rows),
-            "Error under each limit of the effort, in efforts of the published law:",
+            "Error under each limit of the effort, in efforts of the law of the entry. A plus (+)"
+            " marks a gain that ends at an end of its range under one of them:",
             fronts(result, laws),
-            f"Error [{length}] of the gains under the effort of the published law, on other plants,"
-            " with periods and with noise:",
+            f"Error [{length}] of the gains under the effort of the law of the entry, on other"
+            " plants, with periods and with noise:",
             robustness(result, laws),
             where,
         ]
@@ -241,9 +275,9 @@ def section(name: str, result: dict[str, Any]) -> str:
 
 
 def under_one(result: dict[str, Any], at_one: dict[str, dict[str, Any]]) -> str:
-    """Between which numbers the errors under the effort of the published law are."""
+    """Between which numbers the errors under the effort of the law of the entry are."""
     errors = [row["error"] for row in at_one.values() if not row["left"]]
-    words = f"Under the effort of the published law {len(errors)} of {len(at_one)} laws"
+    words = f"Under the effort of the law of the entry {len(errors)} of {len(at_one)} laws"
     if not errors:
         return f"{words} keep what the task has:"
     low, high = _number(min(errors)), _number(max(errors))
@@ -253,6 +287,7 @@ def under_one(result: dict[str, Any], at_one: dict[str, dict[str, Any]]) -> str:
 def task_in_words(name: str, result: dict[str, Any]) -> str:
     """What the task has, and which laws are not in it."""
     text = f"[The entry](gallery/{name}.md); {result['duration']:g} s."
+    text += f" The law of the entry: {escaped(result['own_law'])}."
     if result["input_limits"]:
         limits = "; ".join(f"{low:g} to {high:g}" for low, high in result["input_limits"])
         text += f" Limits of the input: {limits} {result['units'][1]}."
@@ -283,7 +318,11 @@ def fronts(result: dict[str, Any], laws: list[str]) -> str:
     for law in laws:
         one = result["laws"][law]
         cells = [_number(row.get("error", "–")) for row in one["front"]]
-        gains = ", ".join(f"`{path.removeprefix('controller.')}`" for path in one["gains"])
+        ends = {path for row in one["front"] for path in gains_at_the_end(one, row["level"])}
+        gains = ", ".join(
+            f"`{path.removeprefix('controller.')}`{' (+)' * (path in ends)}"
+            for path in one["gains"]
+        )
         runs = sum(row["points"] for row in one["front"])
         slopes = sum(row["derivatives"] for row in one["front"])
         rows.append([_narrow(law), gains, *cells, f"{runs} + {slopes}"])
@@ -335,16 +374,22 @@ def figure(result: dict[str, Any]) -> Figure:
     height = 3.6 + 0.12 * len(result["laws"])
     drawn = Figure(figsize=(7.2, height), layout="constrained")
     axes = drawn.add_subplot()
-    others = [law for law in result["laws"] if law != PUBLISHED]
+    others = [law for law in result["laws"] if law != OWN]
     for law in result["laws"]:
         style = {"color": "black", "marker": "o", "ms": 9, "mfc": "none", "ls": "--", "zorder": 3}
-        if law != PUBLISHED:
+        if law != OWN:
             i, n = others.index(law), len(COLOURS)
             style = {"color": COLOURS[i % n], "marker": MARKERS[(i + i // n) % n], "ms": 5}
         _draw(axes, law, result["laws"][law], style)
-    own = result["published"]
+    own = result["own"]
     axes.plot(
-        own["effort"], own["error"], "*", color="none", mec="black", ms=14, label="published gains"
+        own["effort"],
+        own["error"],
+        "*",
+        color="none",
+        mec="black",
+        ms=14,
+        label="gains of the entry",
     )
     axes.axvline(own["effort"], color="0.7", lw=0.8, zorder=0)
     if _is_wide(axes.dataLim.intervalx):
@@ -384,9 +429,9 @@ def description(result: dict[str, Any]) -> str:
     """What the figure shows, in words."""
     order = ranks(result)
     first = min(order, key=order.__getitem__) if order else "no law"
-    first = f"the {PUBLISHED}" if first == PUBLISHED else first
+    first = f"the {OWN}" if first == OWN else first
     return (
-        f"RMS error against effort of {len(result['laws'])} laws; under the effort of the published"
-        f" law {first} has the smallest error of {len(order)}. Bars: range on other plants, with"
-        " periods and noise; crosses: some of these runs do not keep the bounds"
+        f"RMS error against effort of {len(result['laws'])} laws; under the effort of the law of"
+        f" the entry {first} has the smallest error of {len(order)}. Bars: range on other plants,"
+        " with periods and noise; crosses: some of these runs do not keep the bounds"
     )

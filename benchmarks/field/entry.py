@@ -31,8 +31,9 @@ RESULTS = FOLDER / "results"
 CHECKS = FOLDER / "checks"
 TEMPLATE = FOLDER / "template"
 
-PUBLISHED = "published law"
-"""The law whose effort is the unit of the limits, in the results of `equal_budget.py`."""
+OWN = "law of the entry"
+"""The law of an entry's `scenario`, whose effort is the unit of the limits, in the results of
+`equal_budget.py`; `Entry.law_in_words` says whose law it is."""
 FAMILIES = ("robot", "flexible joint", "drive", "vessel", "vehicle", "strict feedback")
 METHODS = ("barrier", "prescribed performance", "constrained")
 READ = {
@@ -194,6 +195,8 @@ class Entry:
     not_reproduced: NotReproduced
     family: str = _one_of(FAMILIES)
     method: str = _one_of(METHODS)
+    law: str = ""
+    """Which law `scenario` has, where it is not the published one."""
     printed: tuple[Printed, ...] = ()
     corrected: tuple[Correction, ...] = ()
     missing: tuple[Missing, ...] = ()
@@ -201,6 +204,12 @@ class Entry:
     claims: tuple[Claim, ...] = ()
     input_limits: tuple[InputLimit, ...] = ()
     """One for each component, or one for all."""
+
+    @property
+    def law_in_words(self) -> str:
+        """Which law `scenario` has."""
+        of_source = "law of a program of others" if self.source.read == "secondary" else ""
+        return self.law or of_source or "published law"
 
 
 class Reproduction(NamedTuple):

@@ -3,7 +3,7 @@
     python benchmarks/field/equal_budget.py --task NAME [NAME ...] [--laws LAW ...] [--quick]
         [--minutes M]
 
-Every law of a task, the published one among them, is tuned with the same budget (`BUDGET`): two or
+Every law of a task, that of the entry among them, is tuned with the same budget (`BUDGET`): two or
 three of its gains (`GAINS`), the same objective, the same limits of the effort, the same ranges.
 `BUDGET` has the numbers of one search: a search that has converged ends, one whose best gains a
 single start came near begins once more around them, and one without gains that keep the
@@ -13,7 +13,7 @@ requirements looks further.  The result has the runs that each law took.
     subject to  the RMS input above the steady input, of the entire run, <= a limit of the effort,
                 the bounds and the constraints of the task
 
-The limits are `LEVELS` times the effort of the published law with the published gains.  Limits of
+The limits are `LEVELS` times the effort of the law of the entry with its own gains.  Limits of
 the input that the task has act on every law: its command is clipped.  A law that finds no gains
 which keep limit, bounds and constraints has no error at that limit.  Gains that were found under a
 smaller limit count under a larger one too.
@@ -50,7 +50,7 @@ import entry
 import jax.numpy as jnp
 import numpy as np
 from _timing import machine
-from entry import PUBLISHED
+from entry import OWN
 from run_numbers import Numbers, measured
 from task_laws import Task, first_sentence, laws_of, scaled_parameters, task_of, uncertain_of
 
@@ -72,7 +72,7 @@ TASKS = (
     "shaw_cortez_2022",
 )
 """The tasks that the page has, chosen before their results: three plants in strict-feedback form
-and three arms with two joints, of at most 30,000 steps, whose published law has two gains or three.
+and three arms with two joints, of at most 30,000 steps, whose own law has two gains or three.
 One has limits of the input and a constraint.  Plants of three components take 100 s of a processor
 for each law, most of it to compile."""
 OF_ROBOTS = (
@@ -94,7 +94,7 @@ OF_CHAINS = tuple(
         "no bounds",
     )
 )
-"""The laws beside the published one, chosen before any result; `--laws` takes any of `laws_of`."""
+"""The laws beside that of the entry, chosen before any result; `--laws` takes any of `laws_of`."""
 LATER = {
     "zhang_yan_2024": (
         "TerminalSlidingMode",
@@ -134,14 +134,14 @@ OF_WRAPPERS = {
 """Law around another one -> its gain that is tuned, before two of the law inside."""
 OF_ENTRIES = {
     "golestani_2022": ("kd", "c"),
-    "mcilvanna_2024": ("k[0]", "k[1]"),
+    "mcilvanna_2024": ("k[0]", "k[1]", "weight"),
     "cao_2021": ("k1", "k2"),
     "choi_2023": ("clf_rate", "rate"),
     "pourmohammad_2023": ("Kp", "Kd", "K0"),
 }
-"""Entry -> gains of a published law that its script defines."""
+"""Entry -> gains of a law that its script defines."""
 LEVELS = (0.7, 1.0, 1.4, 2.0, 2.8)
-"""Limits of the effort, in efforts of the published law."""
+"""Limits of the effort, in efforts of the law of the entry."""
 BUDGET = ij.tuning.Effort(values=128, starts=4, iterations=15)
 """Of each limit: points without derivatives, searches with them, and steps of each."""
 SMALL = ij.tuning.Effort(values=8, starts=1, iterations=2)
@@ -174,27 +174,30 @@ QUICK_DURATION = 0.2
 # ---------------------------------------------------------------------------- tuning
 
 
-def gains_of(name: str, law: Any, published: bool) -> tuple[str, ...]:
+def gains_of(name: str, law: Any, own: bool) -> tuple[str, ...]:
     """Paths of the gains of a law that are tuned, two or three; empty if it has not so many."""
     found = GAINS.get(type(law), ())
     if type(law) in OF_WRAPPERS:
         found = (OF_WRAPPERS[type(law)], *GAINS.get(type(unwrapped(law)), ())[:2])
-    if published:
+    if own:
         found = OF_ENTRIES.get(name, found)
     return tuple(f"controller.{gain}" for gain in found)
 
 
-def tunables(scenario: ij.Scenario, paths: tuple[str, ...]) -> list[Any]:
-    """The gains with their ranges."""
+def starts_of(scenario: ij.Scenario, paths: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """Path -> value of the gain from which its range is."""
     known = {one.path: np.asarray(one.value) for one in ij.parameters(scenario)}
-    found = []
+    found = {}
     for path in paths:
         leaf, _, index = path.partition("[")
-        value = known[leaf]
-        if index:
-            value = value[int(index[:-1])]
-        found.append(ij.tunable(path, value / RANGE, value * RANGE))
+        found[path] = known[leaf][int(index[:-1])] if index else known[leaf]
     return found
+
+
+def tunables(scenario: ij.Scenario, paths: tuple[str, ...]) -> list[Any]:
+    """The gains with their ranges."""
+    starts = starts_of(scenario, paths)
+    return [ij.tunable(path, value / RANGE, value * RANGE) for path, value in starts.items()]
 
 
 def objective_of(fold: Numbers, limit: float, level: float) -> Any:
@@ -307,39 +310,39 @@ def numbers_of(task: Task, made: entry.Reproduction) -> Numbers:
 
 
 def chosen_laws(name: str, task: Task) -> tuple[str, ...]:
-    """The names of the laws beside the published one on the task of an entry."""
+    """The names of the laws beside that of an entry on its task."""
     first = OF_CHAINS if plants.is_chain(task.scenario.plant) else OF_ROBOTS
     return (*first, *LATER.get(name, ()))
 
 
 def laws_on(
     task: Task,
-    published: Any,
+    own: Any,
     names: tuple[str, ...],
     reasons: dict[str, str],
     uncertain: tuple[str, ...] = (),
 ) -> dict[str, Any]:
-    """Name -> law and its parts, or why it does not apply; without the published law."""
+    """Name -> law and its parts, or why it does not apply; without the law of the entry."""
     found = laws_of(task, uncertain)
     if unknown := sorted(set(names) - set(found)):
         raise entry.EntryError([f"--laws: {unknown} are unknown; choose from {sorted(found)}"])
     laws = {name: reasons.get(name, found[name]) for name in names}
-    structure = jax.tree.structure(published)
+    structure = jax.tree.structure(own)
     for name, choice in laws.items():
         if not isinstance(choice, str) and jax.tree.structure(choice.law) == structure:
-            laws[name] = "it is the published law with other gains"
+            laws[name] = "it is the law of the entry with other gains"
     return laws
 
 
 def scenarios_of(
     task: Task, names: tuple[str, ...], made: entry.Reproduction
 ) -> tuple[dict[str, ij.Scenario], dict[str, str]]:
-    """Name -> scenario of each law that applies, the published one first; and name -> why another
+    """Name -> scenario of each law that applies, that of the entry first; and name -> why another
     one does not.
     """
-    scenarios, reasons = {PUBLISHED: task.scenario}, {}
-    published, uncertain = task.scenario.controller, uncertain_of(made)
-    for name, choice in laws_on(task, published, names, made.not_applicable, uncertain).items():
+    scenarios, reasons = {OWN: task.scenario}, {}
+    own, uncertain = task.scenario.controller, uncertain_of(made)
+    for name, choice in laws_on(task, own, names, made.not_applicable, uncertain).items():
         if isinstance(choice, str):
             reasons[name] = choice
             continue
@@ -367,7 +370,7 @@ def compare(
     """The result of a task, with the laws that begin within some minutes.
 
     Raises:
-      EntryError: the published law has no two gains.
+      EntryError: the law of the entry has no two gains.
     """
     began, end = time.process_time(), time.monotonic() + 60.0 * minutes
     contents = entry.load(folder)
@@ -383,7 +386,7 @@ def compare(
     scenarios, reasons = scenarios_of(task, chosen, made)
     laws = {}
     for name, scenario in scenarios.items():
-        paths = gains_of(folder.name, scenario.controller, name == PUBLISHED)
+        paths = gains_of(folder.name, scenario.controller, name == OWN)
         if len(paths) not in (2, 3):
             reasons[name] = "it has no two or three gains in GAINS or OF_ENTRIES"
             continue
@@ -398,10 +401,11 @@ def compare(
             continue
         robust = robustness(found[1.0], task, fold, uncertain) if 1.0 in found else None
         seconds = round(time.process_time() - used, 1)
-        laws[name] = {"gains": paths, "front": rows, "robustness": robust, "seconds": seconds}
+        starts = {path: np.ravel(x).tolist() for path, x in starts_of(scenario, paths).items()}
+        laws[name] = {"gains": starts, "front": rows, "robustness": robust, "seconds": seconds}
         print(f"{folder.name}: {name}: {seconds} s of a processor", flush=True)
-    if PUBLISHED in reasons:
-        raise entry.EntryError([f"the published law cannot be tuned: {reasons[PUBLISHED]}"])
+    if OWN in reasons:
+        raise entry.EntryError([f"the law of the entry cannot be tuned: {reasons[OWN]}"])
     return {
         "title": contents.title,
         "machine": machine(),
@@ -414,7 +418,8 @@ def compare(
         "input_limits": [[x.lower, x.upper] for x in contents.input_limits],
         "constraints": list(made.constraints),
         "uncertain": list(uncertain),
-        "published": own,
+        "own_law": contents.law_in_words,
+        "own": own,
         "laws": laws,
         "not_applicable": reasons,
     }

@@ -5,7 +5,7 @@
 A task is the plant, the reference, the bounds, the disturbance, the start, the limits and the
 measured quantities of an entry, without its law.  Its functions are straight-line programs of
 numbers, which are traced from the parts of the entry's scenario (`kernels.scalar_program`).  The
-CSV file has a trajectory under the published law.  `tasks/README.md` describes the format,
+CSV file has a trajectory under the law of the entry.  `tasks/README.md` describes the format,
 `tasks/schema.json` states it for programs, and `tasks/read_task.py` and `tasks/read_task.m` read
 it.
 

@@ -35,7 +35,7 @@ def test_every_law_of_a_task_has_two_or_three_gains_in_the_same_range(name):
     published = task.scenario.controller
     chosen, uncertain = equal_budget.chosen_laws(name, task), ("plant.mass",)
     choices = equal_budget.laws_on(task, published, chosen, {}, uncertain)
-    scenarios = {equal_budget.PUBLISHED: task.scenario} | {
+    scenarios = {equal_budget.OWN: task.scenario} | {
         law: ij.with_parts(task.scenario, controller=one.law, **one.parts)
         for law, one in choices.items()
         if not isinstance(one, str)
@@ -43,7 +43,7 @@ def test_every_law_of_a_task_has_two_or_three_gains_in_the_same_range(name):
     assert len(scenarios) >= 5
     for law, scenario in scenarios.items():
         controller = scenario.controller
-        paths = equal_budget.gains_of(name, controller, law == equal_budget.PUBLISHED)
+        paths = equal_budget.gains_of(name, controller, law == equal_budget.OWN)
         assert len(paths) in (2, 3), law
         assert len(set(paths)) == len(paths), law
         for one in equal_budget.tunables(scenario, paths):
@@ -56,7 +56,7 @@ def test_a_law_that_is_the_published_one_has_no_second_row():
     task, names = a_task("zhang_yan_2024"), ("ComputedTorque", "PDGravity")
     law = task_laws.laws_of(task, ())["ComputedTorque"].law
     found = equal_budget.laws_on(task, law, names, {"PDGravity": "no gravity"})
-    assert found["ComputedTorque"] == "it is the published law with other gains"
+    assert found["ComputedTorque"] == "it is the law of the entry with other gains"
     assert found["PDGravity"] == "no gravity"
     with pytest.raises(entry.EntryError, match=r"--laws: \['no law'\] are unknown"):
         equal_budget.laws_on(task, law, ("no law",), {})
@@ -157,12 +157,12 @@ def test_the_quick_comparison(tmp_path, monkeypatch, capsys):
     assert equal_budget.main() == 1
     assert "no_entry_2000: failed: there is no entry.toml" in capsys.readouterr().out
     result = json.loads((tmp_path / "liu_2018.json").read_text())
-    assert set(result["laws"]) == {equal_budget.PUBLISHED, law}
-    published = result["laws"][equal_budget.PUBLISHED]
+    assert set(result["laws"]) == {equal_budget.OWN, law}
+    published = result["laws"][equal_budget.OWN]
     for row in filter(lambda row: row["level"] >= 1.0, published["front"]):
-        limit = row["level"] * result["published"]["effort"]
+        limit = row["level"] * result["own"]["effort"]
         assert row["left"] == "" and row["effort"] <= 1.001 * limit
-        assert row["error"] <= result["published"]["error"] * (1.0 + 1e-9)
+        assert row["error"] <= result["own"]["error"] * (1.0 + 1e-9)
     assert set(published["robustness"]) == {"masses", "periods", "noise"}
     assert len(published["robustness"]["noise"]) == equal_budget.SEEDS
     check_page({"liu_2018": result})
@@ -186,7 +186,7 @@ def test_a_result_of_the_repository_keeps_what_the_page_says(path):
             if row["left"]:
                 assert "error" not in row, name
                 continue
-            limit = row["level"] * result["published"]["effort"]
+            limit = row["level"] * result["own"]["effort"]
             assert row["effort"] <= limit * (1.0 + equal_budget.TOLERANCE), name
             errors.append(row["error"])
         assert errors == sorted(errors, reverse=True), name

@@ -49,10 +49,11 @@ def smoothed(n, h):
 
 @ij.component
 class Published:
-    """The laws of the model, by name."""
+    """The laws of the model, by name; its weight of V_1 is 1."""
 
     k: ij.Leaf = ij.leaf("1", shape=(2,))
     kind: str = ij.static()
+    weight: ij.Leaf = ij.leaf("1", sign="positive", default=1.0)
     gains = ("k",)
     uses_observer = False
     receives_x = True
@@ -82,7 +83,7 @@ class Published:
         if self.kind == "fixed time":
             inner = -smoothed(z2, powers(z2) - rate)
         free = jnp.zeros(z2.shape, bool)
-        v = inner - 2.0 - g1 * slope
+        v = inner - 2.0 - self.weight * g1 * slope
         return ij.controllers.Command(v, value, 0.5 * z2**2, free, free), ()
 
 
