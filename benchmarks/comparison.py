@@ -55,6 +55,8 @@ class Comparison(NamedTuple):
     beside: dict[str, Callable[[float], str]] = {}  # noqa: RUF012 - a constant
     """Column -> words for its value, which the row states as well, because the number alone would
     mislead."""
+    has_ratio: bool = True
+    """Whether both programs compute the same task with errors of one size."""
 
 
 ENVIRONMENT = ("commit", "iblf_jax", "jax", "python", "processor", "cores", "peers")
@@ -94,6 +96,7 @@ COMPARISONS = (
             "the same loop in plain JAX": LOOP | {"row": "textbook"},
             "diffrax with the same method": LOOP | {"row": "diffrax"},
         },
+        {"steps": " in {:,.0f} steps".format},
     ),
     Comparison(
         "one run of 20 s, called from Python; RK4 at 0.5 ms, and LSODA with steps of its own that"
@@ -104,7 +107,7 @@ COMPARISONS = (
         "less",
         {"row": "native, user's call, 0.5 ms"},
         {"SciPy LSODA, relative tolerance 1e-6": {"row": "LSODA, compiled field"}},
-        {ERROR: error_in_words},
+        {ERROR: lambda error: f", {error_in_words(error)}"},
     ),
     Comparison(
         "65,536 closed loops of the paper's arm, H200",
@@ -124,6 +127,7 @@ COMPARISONS = (
         "more",
         ARM_ON_CPU | {"row": "native, standard metrics"},
         {"MuJoCo `rollout`": ARM_ON_CPU | {"row": "MuJoCo rollout, plant alone"}},
+        has_ratio=False,
     ),
     Comparison(
         "iiwa 14 with a PD law and gravity compensation, which all three compute, H200",
@@ -148,7 +152,7 @@ COMPARISONS = (
             "SLSQP with exact derivatives": {"search": "SLSQP, exact slopes"},
             "CMA-ES": {"search": "CMA-ES"},
         },
-        {"rollouts to 0.5 %": "{:.0f} rollouts to 0.5 % above the best".format},
+        {"rollouts to 0.5 %": ", {:.0f} rollouts to 0.5 % above the best".format},
     ),
     Comparison(
         "failure probability of 1e-6, 50 variables, by subset simulation",
@@ -158,7 +162,7 @@ COMPARISONS = (
         "less",
         RARE | {"estimator": "subset"},
         {"OpenTURNS": RARE | {"estimator": "OpenTURNS, subset"}},
-        {"covered": "{:.0%} of the 95 % intervals are right".format},
+        {"covered": ", {:.0%} of the 95 % intervals are right".format},
     ),
 )
 
@@ -185,9 +189,13 @@ def beside(comparison: Comparison, conditions: Conditions) -> str:
         in_words(value_of(comparison, conditions, column))
         for column, in_words in comparison.beside.items()
     ]
-    if not values:
-        values = [error_in_words(error) for error in errors_of(comparison.benchmark, conditions)]
-    return "".join(f", {value}" for value in values)
+    of_ours, errors = (
+        errors_of(comparison.benchmark, one) for one in (comparison.ours, conditions)
+    )
+    values += [f", {error_in_words(error)}" for error in errors]
+    if of_ours and not errors:
+        values.append(", its error was not measured")
+    return "".join(values)
 
 
 def in_short(comparison: Comparison, conditions: Conditions) -> str:
@@ -237,8 +245,10 @@ def row(comparison: Comparison) -> str:
     """A row of the table."""
     others = []
     for name, conditions in comparison.others.items():
-        value, times = in_short(comparison, conditions), words(ratio(comparison, name))
-        others.append(f"{name}: {value} ({times}){beside(comparison, conditions)}")
+        value = in_short(comparison, conditions)
+        if comparison.has_ratio:
+            value += f" ({words(ratio(comparison, name))})"
+        others.append(f"{name}: {value}{beside(comparison, conditions)}")
     ours = words(value_of(comparison, comparison.ours))
     cells = [
         comparison.task,
@@ -274,7 +284,8 @@ def table() -> str:
     lines = [*head, *map(row, shown)]
     lines += [
         "",
-        "The errors of the first and the third row are those of `benchmarks/errors.py`."
+        "The errors of the first and the third row are those of `benchmarks/errors.py`. A row whose"
+        " programs compute different tasks has no ratio."
         f" {environment([*(x.benchmark for x in shown), 'errors'])}",
     ]
     if removed:
@@ -296,10 +307,11 @@ def three_numbers() -> str:
         number = f"{words(value_of(chosen, chosen.ours))} {chosen.unit}"
         other = in_short(chosen, conditions) + beside(chosen, conditions)
         described = text.format(ours=beside(chosen, chosen.ours), other=other)
-        described = described.replace("largest error", "error")  # a narrow column
+        # A narrow column.
+        described = re.sub(" in [0-9,]+ steps", "", described).replace("largest error", "error")
         lines.append(f"- [**{number}**](benchmarks.md): {described}")
     for worse in COMPARISONS:
-        if worse.benchmark in withdrawn.BENCHMARKS:
+        if worse.benchmark in withdrawn.BENCHMARKS or not worse.has_ratio:
             continue
         names = " and ".join(name for name in worse.others if ratio(worse, name) < 1.0)
         if names:

@@ -65,6 +65,8 @@ def before_the_script(entry: Entry, made: Reproduction) -> list[str]:
         parts += ["## Corrected", corrections(entry, made.evidence)]
     if entry.missing:
         parts += ["## Missing in the source", _records(entry.missing, ["quantity", "assumed here"])]
+    if entry.chosen:
+        parts += ["## Chosen by this entry", _records(entry.chosen, ["quantity", "chosen here"])]
     if entry.published:
         parts += ["## Published and reached", published(entry, made.reached)]
     if entry.claims:

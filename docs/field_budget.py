@@ -122,8 +122,8 @@ def page(found: dict[str, dict[str, Any]]) -> str:
         " entry. A dash is a law that found no gains which keep this effort, the bounds and the"
         " constraints; an empty cell is one that is not in the task. A cross (×) marks gains that"
         " do not keep bounds or constraints in a run with the parameters, periods or noise below,"
-        " and a plus (+) a gain at the end of its range, beyond which the error might be smaller. Ranks of different"
-        " tasks have different laws beside them, so they are not averaged.",
+        " and a plus (+) a gain at the end of its range, beyond which the error might be smaller."
+        " Ranks of different tasks have different laws beside them, so they are not averaged.",
         f"Together {in_words(found)}.",
         overview(found),
         *(section(name, result) for name, result in found.items()),
@@ -169,7 +169,8 @@ def method() -> list[str]:
         " the gains and the weights among them were chosen after a trial on liu\\_2018, in which no"
         " law kept half of the effort, and one law kept no limit without its weight. The law of"
         " mcilvanna\\_2024 got its weight later: without it the error was the same under all"
-        f" limits. The {100 * TIE:g} % of the rank were chosen after the results, from the differences below.",
+        f" limits. The {100 * TIE:g} % of the rank were chosen after the results, from the"
+        " differences below.",
         "**Rank**: one more than the number of laws whose error is smaller by more than"
         f" {100 * TIE:g} %, among those that keep the limit of the effort, the bounds and the"
         " constraints. Smaller differences are those of the search: on liu\\_2018 the published law"

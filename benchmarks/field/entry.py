@@ -135,8 +135,8 @@ class Correction:
 
 
 @dataclasses.dataclass(frozen=True)
-class Missing:
-    """What the source does not state."""
+class Assumed:
+    """What the source does not state, or what an entry chooses otherwise or in addition."""
 
     quantity: str
     assumed: str
@@ -199,7 +199,10 @@ class Entry:
     """Which law `scenario` has, where it is not the published one."""
     printed: tuple[Printed, ...] = ()
     corrected: tuple[Correction, ...] = ()
-    missing: tuple[Missing, ...] = ()
+    missing: tuple[Assumed, ...] = ()
+    """What the publication or the program needs and what was read does not state."""
+    chosen: tuple[Assumed, ...] = ()
+    """What this entry has otherwise, needs for laws of others, or has not read."""
     published: tuple[Published, ...] = ()
     claims: tuple[Claim, ...] = ()
     input_limits: tuple[InputLimit, ...] = ()

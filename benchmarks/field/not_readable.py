@@ -64,6 +64,6 @@ NOT_READABLE = (
     Work(
         "M. M. Nicotra, E. Garone, IEEE Control Systems Magazine 38 (2018) 89-107 (explicit"
         " reference governor), and its examples of robot arms",
-        ("bemporad_mosca_1998",),
+        ("bemporad_2003",),
     ),
 )

@@ -360,6 +360,8 @@ def test_the_article_counts_the_entries():
     corrected = sum(bool(x.corrected) for x in entries)
     assert f"{lacking} of {len(NAMES)} published examples lack at least one" in article
     assert f"{corrected} have a correction" in article
+    of_others = sum(x.source.read == "secondary" for x in entries)
+    assert f"{of_others} of these by others than the authors" in article
 
 
 def test_the_page_of_an_entry_has_the_numbers_that_decide_its_claims():

@@ -133,10 +133,3 @@ holds = {
     "the obstacle is avoided": bool(min(h[free].min(), h[stuck].min()) >= 0.0),
     "B stays positive with a relative degree of 2": bool(B[free].min() > 0.0),
 }
-evidence = {
-    "stuck": distance[stuck][750],
-    "speed": np.linalg.norm(np.asarray(runs[stuck].x)[750, 1]),
-    "h_stuck": h[stuck][750],
-    "free": distance[free][750],
-    "h_free": h[free].min(),
-}
