@@ -695,6 +695,8 @@ class Search:
             size = max(1e-3, abs(objective))
             points = np.concatenate([z[None], points_near(box, z, reach, rng)])
             here, *nearby = self._points_at(points)
+            if not here.is_finite:  # the incumbent was found by a value
+                break
             valid = [
                 (x, point) for x, point in zip(points[1:], nearby, strict=True) if point.is_finite
             ]

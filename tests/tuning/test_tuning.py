@@ -448,6 +448,16 @@ def test_the_gradients_of_points_around_a_kink_decide_whether_it_is_an_optimum(s
         np.testing.assert_allclose(search.state.incumbent_z, [0.0, 1.0, 0.0], atol=0.01)
 
 
+def test_an_incumbent_whose_derivatives_overflow_is_no_optimum_at_a_kink():
+    """It was found by a value; a start that has converged near it leads to the examination."""
+    beside = np.array([[0.06, 1.3, 0.0]])
+    evaluate = evaluator_of(roof(np.nan), beside)
+    search = Search(evaluate, SQP(), beside)
+    search.consider_values(beside, evaluate(beside).value)
+    search.history["evaluations"] = [0]
+    assert not search._holds_at_kink()
+
+
 def test_a_feasible_point_without_derivatives_is_never_lost():
     points = np.stack([np.full(3, -3.0), CENTRE])
     evaluate = evaluator_of(ring(-0.01), points[:1])
