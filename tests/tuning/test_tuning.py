@@ -450,8 +450,13 @@ def test_the_gradients_of_points_around_a_kink_decide_whether_it_is_an_optimum(s
 
 def test_an_incumbent_whose_derivatives_overflow_is_no_optimum_at_a_kink():
     """It was found by a value; a start that has converged near it leads to the examination."""
+
+    def overflowing(z):
+        value, *others = roof(1.0)(z)
+        return Derivatives(value, *(np.full_like(x, np.nan) for x in others))
+
     beside = np.array([[0.06, 1.3, 0.0]])
-    evaluate = evaluator_of(roof(np.nan), beside)
+    evaluate = evaluator_of(overflowing, beside)
     search = Search(evaluate, SQP(), beside)
     search.consider_values(beside, evaluate(beside).value)
     search.history["evaluations"] = [0]
