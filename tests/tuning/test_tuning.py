@@ -304,6 +304,16 @@ def test_a_region_that_has_collapsed_is_no_optimum(sign):
     assert sign < 0 or np.all(np.abs(state.z) < 1e-3)
 
 
+def test_a_start_ends_where_slopes_are_so_large_that_products_of_them_overflow():
+    def chattering(z):
+        found = two_pieces(5.0)(z)
+        return found._replace(piece_gradients=1e305 * found.piece_gradients)
+
+    with np.errstate(over="raise"):
+        state = steps_of_sqp(chattering, [0.3, -0.7], 3, 1e-8, Constraints.of((2,), (0.0,), 2))
+    assert state.done and state.z.tolist() == [0.3, -0.7]
+
+
 @pytest.mark.parametrize("size", [1.0, 1e-6])
 def test_limits_that_cannot_be_kept_are_broken_as_little_as_can_be(size):
     """The circle and z0 > 1.5, another requirement: between them the sum of both is least at the
