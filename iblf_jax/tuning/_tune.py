@@ -34,11 +34,11 @@ from iblf_jax.tuning.parameters import Tunable, in_units, names_of, values_at
 from iblf_jax.tuning.problem import TuningProblem
 from iblf_jax.tuning.result import (
     AT_KINK,
-    FEW_STARTS_NEAR,
     INFEASIBLE,
     NO_GRADIENT,
     NOT_FOUND_FEASIBLE,
     STUCK,
+    UNCONFIRMED,
     TuneResult,
     TuneSetup,
 )
@@ -369,8 +369,8 @@ def _outcome(search: Search, stopped: str) -> Outcome:
             # Without phases the search itself minimised the violation.
             is_minimised = search.strategy is None or search.state.repair_ended
             stopped = INFEASIBLE if is_minimised and found.hold else NOT_FOUND_FEASIBLE
-        elif found.hold and search.reached_by_few_starts:
-            stopped = FEW_STARTS_NEAR
+        elif found.hold and search.is_unconfirmed:
+            stopped = UNCONFIRMED
         elif found.at_kink:
             stopped = AT_KINK
         else:
@@ -386,7 +386,7 @@ def _tried(search: Search) -> tuple[str, ...]:
     """What a search in phases did, in words; empty for a search without phases."""
     if search.strategy is None:
         return ()
-    valleys, reached, confirming = search.state.valleys.tolist()
+    valleys, reached, confirming, below = search.state.valleys.tolist()
     starts = search.strategy.starts
     lines = []
     if search.state.unresolved:
@@ -406,6 +406,8 @@ def _tried(search: Search) -> tuple[str, ...]:
             f" in {valleys} {noun} when they ended or were dropped, {reached} in the best one, and"
             f" {confirming} within {100 * SAME_OBJECTIVE:g} % of the best objective"
         )
+    if below:
+        lines.append(f"{below} of them had a lower objective then and broke a requirement")
     phase = search.state.phase
     if phase == REPAIR or search.state.repair_ended:
         least = float(search.state.incumbent_key[0])
@@ -484,8 +486,8 @@ def _continued(
     if search.is_violated:
         return None
     found = _outcome(search, stopped)
-    if outcome.stopped == FEW_STARTS_NEAR and found.stopped in ("converged", AT_KINK):
-        return found._replace(stopped=FEW_STARTS_NEAR)
+    if outcome.stopped == UNCONFIRMED and found.stopped in ("converged", AT_KINK):
+        return found._replace(stopped=UNCONFIRMED)
     return found
 
 

@@ -36,9 +36,10 @@ LARGE_CHANGE = 100.0
 AT_KINK = "converged at a kink: the slope of a requirement jumps from one peak to another here"
 """`TuneResult.stopped` where the conditions of an optimum hold only if the gradients of peaks at
 nearby gains are added."""
-FEW_STARTS_NEAR = "an optimum that few starts came near: better ones may exist"
-"""`TuneResult.stopped` where the conditions of an optimum hold as for "converged", and fewer than a
-third of many starts came within 0.5 % of the objective."""
+UNCONFIRMED = "an optimum that the starts do not confirm: better ones may exist"
+"""`TuneResult.stopped` where the conditions of an optimum hold as for "converged", and of many
+starts fewer than a third came within 0.5 % of the objective, or one ended below it and broke a
+requirement there."""
 STUCK = "the solver ended at gains where the conditions of an optimum do not hold"
 """`TuneResult.stopped` where the solver has converged by its own criterion at gains that keep the
 requirements, but the conditions of an optimum do not hold."""
@@ -127,7 +128,7 @@ class TuneResult(Result):
     "converged" means that the gains keep the requirements and satisfy the conditions of an optimum
     (`optimality.Conditions.hold`).  "iterations used up" and "no improvement in N steps" mean that
     the gains keep the requirements, but do not satisfy these conditions.  The other values are
-    FEW_STARTS_NEAR, AT_KINK, STUCK, INFEASIBLE, NOT_FOUND_FEASIBLE and NO_GRADIENT of this
+    UNCONFIRMED, AT_KINK, STUCK, INFEASIBLE, NOT_FOUND_FEASIBLE and NO_GRADIENT of this
     module."""
     optimiser: str
     """Name of the solver."""
