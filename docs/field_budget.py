@@ -143,7 +143,8 @@ def method() -> list[str]:
         f" derivatives, and {BUDGET.starts} searches of at most {BUDGET.iterations} steps with"
         " them. A search that has converged ends, one whose best gains a single start came near"
         " begins again around them as long as that helps, and one without gains that keep the"
-        " requirements looks at further points. The runs that each law took therefore differ, and are in its table.",
+        " requirements looks at further points. The runs that each law took therefore differ, and"
+        " are in its table.",
         "**Objective**: the RMS error of the first level, over all components and the entire run."
         " Error and effort are those of the same time.",
         "**Effort**: the RMS input above the one that balances gravity, or above the steady input"
