@@ -329,8 +329,8 @@ def same_budget(tuned: dict[str, Any]) -> list[str]:
     return [
         f"The same arm, for {tuned['duration']:g} s. `ij.tune` has the same budget for each law:"
         f" {budget['points']} points without derivatives and {budget['starts']} searches of at"
-        f" most {budget['steps']} steps with them, of which a law may need fewer. It begins once"
-        " more where a single search came near the best gains, and looks further where it finds no"
+        f" most {budget['steps']} steps with them, of which a law may need fewer. It begins again"
+        " where a single search came near the best gains, and looks further where it finds no"
         " gains (the column *runs* has both numbers). It"
         " minimises the RMS error of the entire run under an effort of"
         f" {tuned['own']['effort']:.3g} N m, that of the paper's law at the published"

@@ -142,8 +142,9 @@ def method() -> list[str]:
         f"**Budget**: for each limit of the effort `ij.tune` has {BUDGET.values} points without"
         f" derivatives, and {BUDGET.starts} searches of at most {BUDGET.iterations} steps with"
         " them. A search that has converged ends, one whose best gains a single start came near"
-        " begins once more around them, and one without gains that keep the requirements looks at"
-        " further points. The runs that each law took therefore differ, and are in its table.",
+        " begins again around them as long as that helps, and one without gains that keep the"
+        " requirements looks at further points. The runs that each law took therefore differ, and"
+        " are in its table.",
         "**Objective**: the RMS error of the first level, over all components and the entire run."
         " Error and effort are those of the same time.",
         "**Effort**: the RMS input above the one that balances gravity, or above the steady input"
@@ -257,6 +258,9 @@ def section(name: str, result: dict[str, Any]) -> str:
         f" {machine['cores']} cores; Python {machine['python']}, jax {machine['jax']}, iblf_jax"
         f" {machine['iblf_jax']}, commit {machine['commit'][:12]}, {machine['date']}."
     )
+    for law, one in result["laws"].items():
+        if "commit" in one:
+            where += f" {escaped(law)}: commit {one['commit'][:12]}, later than the others."
     return "\n\n".join(
         [
             f"## {escaped(result['title'])}",

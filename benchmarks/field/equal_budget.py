@@ -6,8 +6,8 @@
 Every law of a task, that of the entry among them, is tuned with the same budget (`BUDGET`): two or
 three of its gains (`GAINS`), the same objective, the same limits of the effort, the same ranges.
 `BUDGET` has the numbers of one search: a search that has converged ends, one whose best gains a
-single start came near begins once more around them, and one without gains that keep the
-requirements looks further.  The result has the runs that each law took.
+single start came near begins again around them as long as that helps, and one without gains that
+keep the requirements looks further.  The result has the runs that each law took.
 
     minimise    the RMS error |e1| of the entire run
     subject to  the RMS input above the steady input, of the entire run, <= a limit of the effort,
