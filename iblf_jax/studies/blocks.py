@@ -26,16 +26,17 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks, kept_programs, programs
+from iblf_jax.core.caches import memoised
 from iblf_jax.core.devices import default_devices
 from iblf_jax.core.status import Status, flag
-from iblf_jax.core.thread_options import with_options_of_caller
+from iblf_jax.core.thread_options import current_options, with_options_of_caller
 from iblf_jax.engine import CompiledBatch, block_size, blocks_in_flight, wait_until_ready
 from iblf_jax.studies.dataset import DRAWN
 from iblf_jax.studies.draws import CaseInputs
@@ -47,6 +48,9 @@ from iblf_jax.studies.study_setup import (
     bytes_of,
     drawn_leaves,
 )
+
+if TYPE_CHECKING:
+    from jax.tree_util import PyTreeDef
 
 
 class BlockResults(NamedTuple):
@@ -70,27 +74,41 @@ def result_shapes(prepared: PreparedStudy) -> BlockResults:
     inputs = prepared.inputs_of(np.arange(block_size()))
     leaves, structure = jax.tree.flatten((prepared.shared, inputs))
     types = tuple([(x.shape, x.dtype, x.weak_type) for x in map(jax.typeof, leaves)])
+    # What decides the types of the results besides those of the inputs.
+    options = tuple(current_options().values())
+    return _shapes_of_results(prepared.program, structure, types, options)
+
+
+@memoised(64)
+def _shapes_of_results(
+    program: StudyProgram, structure: PyTreeDef, types: tuple, options: tuple
+) -> BlockResults:
+    """`result_shapes` for arguments of a structure and of types, under some options of JAX."""
 
     def shapes() -> BlockResults:
-        found = traced(prepared, inputs).out_info
+        arguments = [
+            jax.ShapeDtypeStruct(shape, dtype, weak_type=weak) for shape, dtype, weak in types
+        ]
+        found = traced(program, *jax.tree.unflatten(structure, arguments)).out_info
         return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), found)
 
-    return kept_programs.computed_once(shapes, result_shapes, prepared.program, structure, types)
+    return kept_programs.computed_once(shapes, result_shapes, program, structure, types)
 
 
-def traced(prepared: PreparedStudy, inputs: CaseInputs) -> Any:
+def traced(program: StudyProgram, shared: SharedInputs, inputs: CaseInputs) -> Any:
     """The trace of the program of a block, which is that of `run_blocks`.
 
     Args:
-      prepared: what to run.
-      inputs: those of a block.
+      program: what to run.
+      shared: what all runs share, or its shapes and types.
+      inputs: those of a block, or their shapes and types.
     """
 
     def by(batch: CompiledBatch) -> Any:
-        program = prepared.program._replace(batch=batch)
-        return _execute.trace(prepared.shared, inputs, program=program, record_every=None)
+        by_batch = program._replace(batch=batch)
+        return _execute.trace(shared, inputs, program=by_batch, record_every=None)
 
-    return prepared.program.batch.first_that_works(by)
+    return program.batch.first_that_works(by)
 
 
 def case_bytes(prepared: PreparedStudy) -> float:
@@ -159,27 +177,28 @@ def run_blocks(
     devices = devices[: len(first_blocks)]
     copies = [jax.device_put(prepared.shared, device) for device in devices]
 
-    def compute(execute: partial, block: int, device: int) -> tuple[Any, int]:
-        """The results of a block on the device of this number, and the bytes that it took."""
+    def compute(execute: partial, block: int, device: int) -> Any:
+        """The results of a block on the device of this number."""
         cases = np.arange(block * size, (block + 1) * size)
         inputs = jax.device_put(prepared.inputs_of(cases), devices[device])
         out = execute(copies[device], inputs)
         wait_until_ready(out)
-        return jax.tree.map(np.asarray, out), sum(x.nbytes for x in jax.tree.leaves((inputs, out)))
+        return jax.tree.map(np.asarray, out)
 
-    def first_of(batch: CompiledBatch) -> tuple[partial, Any, int]:
-        """The program of blocks by a batch, and what `compute` returns of the first block."""
+    def first_of(batch: CompiledBatch) -> tuple[partial, Any]:
+        """The program of blocks by a batch, and the results of the first block."""
         program = prepared.program._replace(batch=batch)
         execute = partial(_execute, program=program, record_every=record_every)
         if len(devices) > 1:
             inputs = prepared.inputs_of(np.arange(size))
             _compile(execute, copies, [jax.device_put(inputs, device) for device in devices])
-        return execute, *compute(execute, first_blocks[0], 0)
+        return execute, compute(execute, first_blocks[0], 0)
 
     # The first block runs before the others: it compiles the program, on the scan if the executor
     # fails, and gives the bytes of one.
-    execute, first, bytes_taken = prepared.program.batch.first_that_works(first_of)
+    execute, first = prepared.program.batch.first_that_works(first_of)
     yield first_blocks[0], first
+    bytes_taken = bytes_of((prepared.inputs_of(np.arange(size)), first))
     in_flight = blocks_in_flight(here.chunk, here.memory, bytes_taken, len(devices))
     # Each block in flight has a thread, which draws, starts or copies results while the block of
     # another thread is integrated.
@@ -191,9 +210,9 @@ def run_blocks(
             waiting.append((block, pool.submit(compute_in_pool, block, k % len(devices))))
             if len(waiting) == in_flight:
                 block, future = waiting.popleft()
-                yield block, future.result()[0]
+                yield block, future.result()
         for block, future in waiting:
-            yield block, future.result()[0]
+            yield block, future.result()
     finally:
         pool.shutdown(cancel_futures=True)
 

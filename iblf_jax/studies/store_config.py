@@ -84,7 +84,7 @@ def _digest(prepared: PreparedStudy) -> str:
     """
     inputs = prepared.inputs_of(np.arange(block_size()))
     try:
-        return program_digest(traced(prepared, inputs))
+        return program_digest(traced(prepared.program, prepared.shared, inputs))
     except CallsPythonError as error:
         return f"calls Python by {error}, {secrets.token_hex(8)}"
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -126,6 +125,10 @@ def drawn_leaves(
     return jax.lax.optimization_barrier(jax.vmap(draw_case)(inputs))
 
 
+_shapes_of_draws = jax.jit(drawn_leaves, static_argnums=0)
+"""`drawn_leaves`, which JAX traces once for all studies of one structure."""
+
+
 def prepare(
     scenario: Scenario,
     perturbations: Mapping[str, Perturbation],
@@ -168,7 +171,7 @@ def prepare(
     )
     points = dict(points or {})
     inputs = case_inputs(np.zeros(block_size(), int), options.runs, points, designed)
-    varied, drawn, _ = jax.eval_shape(partial(drawn_leaves, targets), shared, inputs)
+    varied, drawn, _ = _shapes_of_draws.eval_shape(targets, shared, inputs)
     if in_memory and options.runs >= MANY_RUNS:
         bytes_each = bytes_of(drawn) / block_size() + _bytes_of_metrics(scenario, folds)
         checks.fits_memory("runs", options.runs, bytes_each)
