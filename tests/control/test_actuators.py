@@ -15,7 +15,7 @@ import iblf_jax as ij
 from iblf_jax.certificates.claims.theorem import THEOREM
 from iblf_jax.core.status import Status
 from iblf_jax.simulation.closed_loop import LoopState, evaluate
-from iblf_jax.simulation.delays import STAGES, arriving
+from iblf_jax.simulation.delays import STAGES, PieceCommands, arriving, with_step
 
 LOOP = Loop(corrected=True, K2=np.full(2, 4.0), kf=np.full(2, 4.0))
 SLOW = ij.with_parameters(
@@ -188,6 +188,15 @@ def test_a_long_run_in_float32_has_the_delay_of_a_short_one():
         found = arriving(ij.astype(scenario, "float32"), "rk4", dt, jnp.float32(number), commands)
         assert not found.is_whole
         np.testing.assert_allclose(found.shift, 0.55, rtol=1e-5)
+    # Of a step that jumps divide, a line between its ends is kept.
+    rows = np.float32([[1.0, 9.0, 9.0, 9.0], [9.0, 9.0, 9.0, 3.0], [9.0, 9.0, 9.0, 9.0]])
+    pieces = [
+        PieceCommands(found.start, 0.4 * dt, i < 2, [jnp.full(2, x) for x in row])
+        for i, row in enumerate(rows)
+    ]
+    kept = jax.jit(lambda: with_step(commands + 5.0, "rk4", found, pieces))()
+    np.testing.assert_allclose(kept[0], np.outer([1.0, 2.0, 2.0, 3.0], [1.0, 1.0]), rtol=1e-6)
+    assert kept.shape == commands.shape and np.all(kept[1:] == 5.0)
 
 
 def study_of(low, high):

@@ -2,6 +2,7 @@
 
 import chain_cases
 import independent_chains as other
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -173,3 +174,30 @@ def test_the_input_jumps_where_the_last_error_is_zero():
     state, t = initial_state(scenario), jnp.asarray(0.2)
     sample = evaluate(scenario, t, state)[1]
     np.testing.assert_allclose(surfaces(scenario, t, state), sample.e[-1], rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_a_derivation_by_sympy_gives_the_same_input():
+    import independent_sympy as derived  # SymPy takes long to import
+
+    def rows(t, x):
+        drift, gain = derived.drift_and_gain(x[:, 0], jnp.cos, jnp.sin, jnp.exp)
+        return jnp.stack(drift)[:, None], jnp.stack(gain)[:, None]
+
+    functions = (lambda t, x: rows(t, x)[0]), (lambda t, x: rows(t, x)[1])
+    sides = map(derived.sides, range(derived.ORDER))
+    case = ij.Scenario(
+        plant=plants.StrictFeedback(*functions, n=1, order=derived.ORDER),
+        reference=references.Sinusoid(offset=0.0, amplitude=0.5),
+        bounds=[ij.Bounds(*(bounds.Sinusoid(*side) for side in pair)) for pair in sides],
+        controller=law(k=derived.K, barriers=(MAPPING,) * 3, c=derived.C, weights=derived.WEIGHTS),
+        initial=ij.Initial(x=[[0.1], [0.0], [0.0]]),
+    )
+    rng = np.random.default_rng(3)
+    command = jax.jit(lambda t, x: case.controller.command(t, x, 0.0 * x, case.context, ())[0])
+    for _ in range(20):
+        t = rng.uniform(0.0, 10.0)
+        x = rng.uniform([-0.7, -2.0, -8.0], [0.7, 2.0, 8.0])
+        found = command(jnp.asarray(t), jnp.asarray(x)[:, None])
+        alphas = [found.alpha[0], found.alpha_higher[0, 0], found.tau[0]]
+        np.testing.assert_allclose(alphas, derived.derived_input(t, x), rtol=1e-9)

@@ -1,8 +1,9 @@
 """Every member of every family fits its contract; and the checkers notice members that do not
 (test_testing.py).
 
-The default run checks one instance of every class, the first that `members.py` lists, some of them
-without derivatives; CI checks all of them.
+The default run checks one instance of every class, the first that `members.py` lists: shapes and
+types only in the families whose numbers are dear, and derivatives nowhere but where they are cheap.
+With the mark `members`, CI checks every instance completely.
 """
 
 import pytest
@@ -10,7 +11,7 @@ from members import FAMILIES, FOLDS, further
 
 import iblf_jax as ij
 from iblf_jax import metrics
-from iblf_jax.testing import _contract, laws
+from iblf_jax.testing import _contract, laws, observers, plants
 
 LONG = {"arm"}
 """Compiles for ten seconds."""
@@ -21,11 +22,21 @@ BEFORE_A_RELEASE = {
 }
 """Further members of a class that compile long; another member of the class is in the default
 run."""
-RUN = {"adaptive_rbf", "with_drive"}
-"""Laws whose closed loop is in the default run: with a state, and around another law with a plant
-of its own.  A closed loop takes a third of a check; `test_programs_of_members.py` runs that of
-every law, and `test_time_step.py` makes a few steps of it."""
-DIFFERENTIATED_BY_CI = {"law", "plant", "observer"}
+FIRST_NUMBER = {
+    "law": (laws, "check_function"),
+    "plant": (plants, "at_each"),
+    "observer": (observers, "check_function"),
+}
+"""Families of which the default run checks shapes and types, and what computes the first number.
+The numbers of laws, plants and observers are those of a few steps in `test_time_step.py`, and of
+independent programs."""
+WITH_NUMBERS = {
+    *("backstepping", "saturated", "computed_torque"),
+    *("driven_pendulum", "strict_feedback", "momentum", "level"),
+}
+"""Members of these families that the default run checks with numbers all the same: a plain one, one
+around another one, and one of each kind of state."""
+DIFFERENTIATED_BY_CI = {*FIRST_NUMBER, "robot", "reference", "barrier"}
 """Families whose derivatives are not in the default run: they take about half of a check."""
 
 
@@ -37,8 +48,10 @@ def of_default_run(family: str) -> list[str]:
 def cases(family: str):
     for name in FAMILIES[family][0]:
         is_later = name not in of_default_run(family) or family in DIFFERENTIATED_BY_CI
-        mark = pytest.mark.release if name in BEFORE_A_RELEASE else pytest.mark.slow
-        yield pytest.param(family, name, marks=[mark] if is_later else [])
+        marks = [pytest.mark.slow, pytest.mark.members]
+        if name in BEFORE_A_RELEASE:
+            marks = [pytest.mark.release]
+        yield pytest.param(family, name, marks=marks if is_later else [])
 
 
 @pytest.mark.parametrize(
@@ -49,15 +62,25 @@ def test_member_fits_its_contract(family, name):
     check(instances[name])
 
 
+def without_derivatives(monkeypatch):
+    for function in ("_slopes", "_same_slopes"):
+        monkeypatch.setattr(_contract, function, lambda *_: None)
+
+
+def stop(*_, **__):
+    raise _contract.StoppedCheckError
+
+
 @pytest.mark.parametrize(
     ("family", "name"),
     [(family, name) for family in sorted(DIFFERENTIATED_BY_CI) for name in of_default_run(family)],
 )
 def test_member_fits_its_contract_apart_from_derivatives(family, name, monkeypatch):
-    for function in ("_slopes", "_same_slopes"):
-        monkeypatch.setattr(_contract, function, lambda *_: None)
-    if family == "law" and name not in RUN:
-        monkeypatch.setattr(laws, "_closed_loop", lambda *_: None)
+    without_derivatives(monkeypatch)
+    # `test_programs_of_members.py` runs the closed loop of every law.
+    monkeypatch.setattr(laws, "_closed_loop", lambda *_: None)
+    if family in FIRST_NUMBER and name not in WITH_NUMBERS:
+        monkeypatch.setattr(*FIRST_NUMBER[family], stop)
     instances, _, check = FAMILIES[family]
     check(instances[name])
 
@@ -84,7 +107,12 @@ class Together(metrics.Fold):
         return {name: value for results in found for name, value in results.items()}
 
 
-def test_metrics_fit_their_contract():
+@pytest.mark.parametrize(
+    "differentiated", [False, pytest.param(True, marks=[pytest.mark.slow, pytest.mark.members])]
+)
+def test_metrics_fit_their_contract(differentiated, monkeypatch):
+    if not differentiated:
+        without_derivatives(monkeypatch)
     together = Together(tuple(FOLDS.values()))
     assert len(together.units) == sum(len(fold.units) for fold in FOLDS.values())
     ij.testing.check_fold(together)

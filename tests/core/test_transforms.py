@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import PAPER, SHORT
+from conftest import SHORT
 from made_up_runs import ALWAYS
 
 import iblf_jax as ij
@@ -247,10 +247,10 @@ def test_where_kernels_cannot_the_scan_differentiates(paper, monkeypatch):
 PARTS = (single_run._initialize, single_run._all_steps, single_run._finalize)
 
 
-def test_new_numbers_do_not_recompile(paper, paper_run, monkeypatch):
+def test_new_numbers_do_not_recompile(paper, short_run, monkeypatch):
     """Once a structure, a length and a method are compiled, every other value runs the same
     program."""
-    ij.simulate(paper, **PAPER)
+    ij.simulate(paper, **SHORT)
     monkeypatch.setattr("iblf_jax.engine.time_step.advance", no_scan)
     before = [part._cache_size() for part in PARTS]
     for changes in (
@@ -260,9 +260,9 @@ def test_new_numbers_do_not_recompile(paper, paper_run, monkeypatch):
         {"initial.q": np.asarray([0.7, 0.6])},
         {"disturbance.phase": 0.5},
     ):
-        assert ij.simulate(ij.with_parameters(paper, changes), **PAPER).ok
+        assert ij.simulate(ij.with_parameters(paper, changes), **SHORT).ok
     for throw in (False, True):
-        ij.simulate(ij.presets.zhang_yan_2024(), **PAPER, throw=throw)
+        ij.simulate(ij.presets.zhang_yan_2024(), **SHORT, throw=throw)
     assert [part._cache_size() for part in PARTS] == before
 
 

@@ -120,7 +120,7 @@ def test_bad_arguments_and_files(short_run, tmp_path):
 def stored(short_run, tmp_path_factory):
     """A netCDF file of two runs, and what it loads as."""
     path = tmp_path_factory.mktemp("stored") / "runs.nc"
-    batch = jax.tree.map(lambda x: jnp.stack([x, x]), short_run)
+    batch = jax.tree.map(lambda x: np.stack([x, x]), short_run)
     ij.save_rollouts({"one": short_run, "two runs": batch}, path)
     return path, load_datasets(path)
 

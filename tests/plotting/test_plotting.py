@@ -33,29 +33,8 @@ def runs(paper, short_run):
     }
 
 
-def texts_of(figure):
-    return [text.get_text() for text in figure.legends[0].get_texts()]
-
-
 @pytest.mark.slow
-def test_the_paper_s_figures_have_their_panels_and_units(runs):
-    figures = plotting.paper_figures(runs)
-    assert list(figures) == [f"figure_{k}" for k in range(1, 7)]
-    labels = [[axes.get_ylabel() for axes in x.axes if axes.get_ylabel()] for x in figures.values()]
-    assert labels == [
-        ["(a) $x_{11}$ [rad]", "(b) $e_{11}$ [rad]"],
-        ["(a) $x_{12}$ [rad]", "(b) $e_{12}$ [rad]"],
-        ["(a) $e_{21}$ [rad/s]", "(b) $e_{22}$ [rad/s]"],
-        [r"(a) $f_{s\_un,1}$ [N m]", r"(b) $f_{s\_un,2}$ [N m]"],
-        [r"(a) $\tau_{1}$ [N m]", r"(b) $\tau_{2}$ [N m]"],
-        ["$x_{12}$ [rad]"],
-    ]
-    for name, figure in figures.items():
-        assert len(figure.axes) == (1 if name == "figure_6" else 4), name
-        assert set(runs) <= {text.split(" ")[0] for text in texts_of(figure)}, name
-        assert figure.axes[-1].get_xlabel() in ("time $t$ [s]", "$x_{11}$ [rad]")
-        assert figure.get_suptitle().startswith(f"Figure {name[-1]}. ")
-        assert "failed" not in figure.get_suptitle()
+def test_the_paper_s_figures_of_a_long_run_magnify_the_transient():
     longer = made_up(chain(2), duration=20.0)
     figures = plotting.paper_figures(longer, note="the arm is assumed")
     for name in ("figure_3", "figure_5"):
@@ -66,7 +45,9 @@ def test_the_paper_s_figures_have_their_panels_and_units(runs):
         assert second.get_position().width == pytest.approx(width, rel=0.05), name
         assert "the transient" in second.get_title()
         assert second.get_xlim()[1] < plotting.velocity_errors(longer).axes[1].get_xlim()[1]
-    assert all("the arm is assumed" in figure.get_suptitle() for figure in figures.values())
+    for name, figure in figures.items():
+        title = figure.get_suptitle()
+        assert title.startswith(f"Figure {name[-1]}. ") and "the arm is assumed" in title
 
 
 def test_what_is_drawn_is_what_the_run_holds(runs):
@@ -146,7 +127,7 @@ def test_a_run_without_finite_numbers_or_of_one_sample_is_drawn(case):
 
 def test_bad_arguments_are_named(tmp_path):
     run = made_up(chain(2))
-    batch = jax.tree.map(lambda x: jnp.stack([x, x]), run)
+    batch = jax.tree.map(lambda x: np.stack([x, x]), run)
     plotting.joint(batch[1])
     film = tmp_path / "a.gif"
     for words, function, *arguments in (
@@ -205,7 +186,7 @@ def test_joints_have_the_names_of_the_robot_s_file():
     figure = run.plot()
     names = ["base_yaw", " _hidden", r"cost\$5\$"]
     assert [axes.get_title() for axes in figure.axes[:3]] == names
-    assert set(names) <= set(texts_of(figure))
+    assert set(names) <= {text.get_text() for text in figure.legends[0].get_texts()}
     drawn(figure)
     assert plotting.torques(run).axes[0].get_ylabel().startswith("base_yaw\n")
     assert "of  _hidden" in plotting.joint(run, 1).get_suptitle()

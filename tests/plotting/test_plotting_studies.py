@@ -7,6 +7,7 @@ import pytest
 import study_cases as cases
 from drawing import drawn, lines_of
 from refused import assert_refused
+from stored_results import stored
 
 from iblf_jax import Status, plotting
 
@@ -45,7 +46,8 @@ def test_heat_maps_show_shares_and_medians(table):
     assert maps[1].get_xlabel() == "controller.K2 [N m s/rad]"
 
 
-def test_bad_figures_are_refused(study, table):
+def test_bad_figures_are_refused(table):
+    study = stored("Study_0")
     for message, draw, *arguments in (
         ("a Study", plotting.bands, table),
         ("margin", plotting.histograms, study, ["speed"]),

@@ -50,26 +50,30 @@ def module_of(path: Path) -> str:
 
 
 @functools.cache
-def imports(source: str, *, at_the_top: bool) -> set[str]:
-    """Full names of what a file imports, at its top only or anywhere; not what only type checkers
-    see."""
-    found: set[str] = set()
+def places_of_imports(source: str) -> list[tuple[str, bool]]:
+    """Full names of what a file imports, each with whether it is at the top; not what only type
+    checkers see."""
+    found: list[tuple[str, bool]] = []
 
-    def visit(node):
+    def visit(node, at_the_top):
         if isinstance(node, ast.Import):
-            found.update(alias.name for alias in node.names)
+            found.extend((alias.name, at_the_top) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, "imports name the package in full"
-            found.update(f"{node.module}.{alias.name}" for alias in node.names)
-        for_types = isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
-        if for_types or (at_the_top and isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)):
+            found.extend((f"{node.module}.{alias.name}", at_the_top) for alias in node.names)
+        if isinstance(node, ast.If) and getattr(node.test, "id", "") == "TYPE_CHECKING":
             return
+        at_the_top = at_the_top and not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
         for child in ast.iter_child_nodes(node):
             if isinstance(child, ast.stmt | ast.ExceptHandler | ast.match_case):
-                visit(child)
+                visit(child, at_the_top)
 
-    visit(ast.parse(source))
+    visit(ast.parse(source), True)
     return found
+
+
+def imports(source: str, *, at_the_top: bool) -> set[str]:
+    return {name for name, is_top in places_of_imports(source) if is_top or not at_the_top}
 
 
 def edges(source: str, *, at_the_top: bool = True) -> set[str]:

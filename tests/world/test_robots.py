@@ -47,9 +47,11 @@ def test_kinetic_and_potential_energy_from_positions(rng):
     masses = np.append(links["mass"], links["payload"])
     speed = (centres(q + 1e-6 * v) - centres(q - 1e-6 * v)) / 2e-6
     kinetic = 0.5 * masses @ np.abs(speed) ** 2 + 0.5 * links["inertia"] @ np.cumsum(v) ** 2
-    assert 0.5 * v @ np.asarray(robot.mass_matrix(q)) @ v == pytest.approx(kinetic, rel=1e-8)
-    assert float(robot.potential(q)) == pytest.approx(9.81 * masses @ centres(q).imag, rel=1e-12)
-    np.testing.assert_allclose(robot.tip(q), [centres(q)[-1].real, centres(q)[-1].imag], atol=1e-12)
+    of_robot = jax.jit(lambda q: (robot.mass_matrix(q), robot.potential(q), robot.tip(q)))
+    inertia, potential, tip = map(np.asarray, of_robot(q))
+    assert 0.5 * v @ inertia @ v == pytest.approx(kinetic, rel=1e-8)
+    assert float(potential) == pytest.approx(9.81 * masses @ centres(q).imag, rel=1e-12)
+    np.testing.assert_allclose(tip, [centres(q)[-1].real, centres(q)[-1].imag], atol=1e-12)
 
 
 @pytest.mark.parametrize("n", [2, 7])

@@ -3,6 +3,7 @@
 import ast
 import collections
 import dataclasses
+import importlib.util
 import itertools
 import json
 import re
@@ -38,7 +39,8 @@ from iblf_jax.deployment.ros2.ros2_control import ros2_control_files
 from iblf_jax.deployment.write_c import Law, generate
 from iblf_jax.simulation.scenario import canonical
 
-setuptools = pytest.importorskip("setuptools", reason="setuptools builds a package")
+if importlib.util.find_spec("setuptools") is None:
+    pytest.skip("setuptools builds a package", allow_module_level=True)
 
 NAME = ros_package.NAME
 JOINTS = ["shoulder", "elbow"]
