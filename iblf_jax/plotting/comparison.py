@@ -82,7 +82,8 @@ def comparison(result: Comparison, joint: int | str = 0, *, zoom: float | None =
     table = figure.subplots(
         3, len(columns), squeeze=False, sharey="row", height_ratios=(1.5, 1.5, 1.0)
     )
-    order, torques = list(result.rollouts), []
+    order = list(result.rollouts)
+    torques: list[tuple[Axes, Curve, np.ndarray]] = []
     for column, (title, curves) in zip(table.T, columns.items(), strict=True):
         column[0].set_title(title)
         _errors(column[0], curves, order, joint, (start, end))
