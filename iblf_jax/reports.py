@@ -64,6 +64,7 @@ img { max-width: 100%; }
 ul.words { padding-left: 1.2rem; overflow-wrap: anywhere; }
 pre { background: var(--faint); padding: 0.8rem; overflow-x: auto; font-size: 0.8rem; }
 .wide { overflow-x: auto; }
+.wide img { max-width: max(100%, 36rem); }  /* on a phone it scrolls, as a table does */
 footer { margin-top: 3rem; opacity: 0.65; font-size: 0.8rem; }"""
 """The design of all reports, which are light or dark as the browser asks for."""
 
@@ -354,7 +355,8 @@ def _other(result: Any) -> Shown:
     scenario = getattr(result, "scenario", None)
     if not isinstance(scenario, Scenario):  # that of a front is a method: one for each point
         scenario = None
-    return Shown(name, _described(result), found, figures, scenario, on_card=len(found))
+    title = re.sub("(?<=[a-z])[A-Z]", lambda letter: f" {letter[0].lower()}", name)
+    return Shown(title, _described(result), found, figures, scenario, on_card=len(found))
 
 
 def _comparison(found: Comparison) -> Shown:
@@ -462,7 +464,7 @@ def _page(parts: Shown, title: str | None) -> str:
         body.append(f"<p>{html.escape(parts.title)}</p>")
     body.append(_lines(parts.words))
     figures = [
-        f"<h2>{html.escape(name)}</h2>{_image(draw(), PAGE_DPI, name)}"
+        f'<h2>{html.escape(name)}</h2><div class="wide">{_image(draw(), PAGE_DPI, name)}</div>'
         for name, draw in parts.figures.items()
     ]
     # The main figure stands before the tables, which may have many lines.

@@ -126,8 +126,11 @@ class Certificate(Result):
     @property
     def headline(self) -> str:
         """The verdict; if it is "fails", the lines that fail, and the claim with weights if it
-        holds.
+        holds; if it is "not applicable", the reason of most of the lines that do not apply.
         """
+        reasons = self._reasons()
+        if self.verdict == NOT_APPLICABLE and reasons:
+            return f"{self.verdict}, because {max(reasons, key=lambda one: len(reasons[one]))}"
         if self.verdict != FAILS:
             return self.verdict
         failing = [f'"{x.name}"' for x in self.lines if x.enters_verdict and x.verdict == FAILS]
@@ -210,9 +213,8 @@ class Certificate(Result):
         """The lines that are informative about this run; `lines` has all."""
         return tuple(line for line in self.lines if line.applies)
 
-    @property
-    def omitted(self) -> str:
-        """How many lines do not apply, and why, in one sentence; "" if all apply."""
+    def _reasons(self) -> dict[str, list[str]]:
+        """Reason -> the lines that do not apply for it."""
         reasons: dict[str, list[str]] = {}
         for line in self.lines:
             if line.applies:
@@ -221,6 +223,12 @@ class Certificate(Result):
             if reason.startswith(OBSERVED_ONLY):
                 reason = reason.removeprefix(OBSERVED_ONLY).removesuffix(")")
             reasons.setdefault(reason, []).append(line.name)
+        return reasons
+
+    @property
+    def omitted(self) -> str:
+        """How many lines do not apply, and why, in one sentence; "" if all apply."""
+        reasons = self._reasons()
         count = sum(map(len, reasons.values()))
         if count == 0:
             return ""

@@ -545,6 +545,9 @@ def _readme_text(project: Project, name: str) -> str:
             f"{last[0]:<46} # {last[1]}",
             "```",
             "",
+            "Without a tuning: `iblf-jax export scenario.toml --out untuned` writes the law with"
+            " the gains of the scenario.",
+            "",
             "| File | Content | Change |",
             "|---|---|---|",
             "| `scenario.toml` | robot, motion, bounds, sampling | the motion, and the bounds"

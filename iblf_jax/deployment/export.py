@@ -407,7 +407,8 @@ def vectors(
     if has_flag(status, FAILED | Status.SAMPLING_TOO_SLOW):
         notices.warn(
             f"the simulated run with this law every {period:g} s: {describe(status)}. The exported"
-            " code is that law; ij.recommended_period(scenario) returns how long a period may be."
+            " code is that law. Make the period shorter (in Python, ij.recommended_period(scenario)"
+            " returns how long it may be)."
         )
     return vectors_of(first, inputs, torques[::CHECK_INTERVAL])
 

@@ -94,6 +94,14 @@ def _explanations(result: Rollout, status: Status, steps: int) -> list[str]:
     violated = [flag for flag in BOUND_EXPLANATIONS if status & flag]
     violated.sort(key=lambda flag: float(result.metrics.get(VIOLATION_TIMES[flag], np.inf)))
     texts = [BOUND_EXPLANATIONS[flag](result) for flag in violated]
+    sampling = result.scenario.sampling
+    if violated and sampling is not None:
+        time = float(result.metrics.get(VIOLATION_TIMES[violated[0]], np.inf))
+        if time < float(sampling.period):
+            texts.append(
+                f"The law had run once until then: sampling.period is {float(sampling.period):g} s."
+                " Make it shorter."
+            )
     singular = ""
     if status & (Status.SINGULAR_GAIN | Status.NOT_FINITE):
         singular = _singular_gain(result)
@@ -270,11 +278,13 @@ def _infinite_slope(result: Rollout) -> str:
 
 
 def _sampling_too_slow(result: Rollout) -> str:
+    period = float(result.scenario.sampling.period)  # type: ignore[union-attr]
     return (
         "The deviation of the loop grows from one period to the next, by"
         f" {growth_in_words(float(result.metrics[RADIUS]))} at the worst of the assessed states of"
-        " this run (another start visits others). Sample faster (ij.recommended_period says how"
-        f" fast){_alternative_remedy(result)}."
+        " this run (another start visits others). Sample faster: sampling.period is"
+        f" {period:g} s (in Python, ij.recommended_period(scenario) returns how long it may"
+        f" be){_alternative_remedy(result)}."
     )
 
 

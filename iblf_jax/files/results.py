@@ -66,6 +66,7 @@ from iblf_jax.files.values import Words, as_table, dotted, known_keys, missing
 from iblf_jax.simulation.closed_loop import initial_state
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.studies.comparison import Comparison
 from iblf_jax.studies.rare_events.result import LikelyFailure
 from iblf_jax.studies.study import Study
 from iblf_jax.studies.study_setup import prepare
@@ -729,7 +730,13 @@ def _restored_failure(stored: dict[str, Any]) -> dict[str, Any]:
     return stored | {"request": request}
 
 
+def _stored_comparison(comparison: Comparison) -> dict[str, Any]:
+    """The runs at equal effort as a dict: what their class adds follows from the reasons."""
+    return _fields_of(comparison) | {"equal_effort": dict(comparison.equal_effort)}
+
+
 CONVERTERS: dict[str, Converter] = {
+    "Comparison": Converter(_stored_comparison, lambda stored: stored),
     "Line": Converter(_fields_of, earlier.fields_of_line),
     "LikelyFailure": Converter(_stored_failure, _restored_failure),
     "Rollout": Converter(_stored_rollout, _restored_rollout),

@@ -10,7 +10,8 @@ not registered with pyplot, so none stays open.
 
 `style="paper"` replaces this by what IEEE and Elsevier ask for: the width of a column or of two, a
 serif font of 8 pt, and no titles, which the caption of a paper has.  `figure_function` adds this
-choice, and that of a figure or of panels to draw into, to every public function.
+choice, and that of a figure or of panels to draw into, to every public function.  Title and legend
+of runs at equal effort name the laws that have none.
 """
 
 from __future__ import annotations
@@ -22,9 +23,10 @@ import io
 import math
 import re
 import textwrap
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
+from types import MappingProxyType
 from typing import Any, TypeVar, cast
 
 import matplotlib
@@ -34,12 +36,14 @@ from matplotlib.backend_bases import RendererBase
 from matplotlib.colors import to_hex, to_rgb, to_rgba
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.gridspec import SubplotSpec
+from matplotlib.lines import Line2D
 from matplotlib.rcsetup import cycler
 from matplotlib.text import Text
 from matplotlib.typing import ColorType
 
 from iblf_jax.core import checks
-from iblf_jax.plotting._curves import Curve
+from iblf_jax.plotting._curves import Curve, escaped
+from iblf_jax.studies.comparison import RunsAtEqualEffort
 
 F = TypeVar("F", bound=Callable)
 
@@ -158,6 +162,9 @@ _PAPER: ContextVar[Paper | None] = ContextVar("paper", default=None)
 _GIVEN: ContextVar[Figure | SubFigure | list[Axes] | None] = ContextVar("figure", default=None)
 """The figure, or the panels, of the user that the next figure is drawn into."""
 
+_MISSING: ContextVar[Mapping[str, str]] = ContextVar("missing", default=MappingProxyType({}))
+"""Law -> why the figure that is made now has no run of it."""
+
 
 def figure_function(function: F) -> F:
     """Decorator of a public function that returns a figure: adds the arguments style, figure and
@@ -174,7 +181,9 @@ def figure_function(function: F) -> F:
     ):
         paper = _checked_style(style)
         given = _checked_place(figure, ax)
-        tokens = _PAPER.set(paper), _GIVEN.set(given)
+        subject = args[0] if args else next(iter(options.values()), None)
+        missing = subject.reasons if isinstance(subject, RunsAtEqualEffort) else {}
+        tokens = _PAPER.set(paper), _GIVEN.set(given), _MISSING.set(missing)
         try:
             with styled():
                 made = function(*args, **options)
@@ -182,6 +191,7 @@ def figure_function(function: F) -> F:
         finally:
             _PAPER.reset(tokens[0])
             _GIVEN.reset(tokens[1])
+            _MISSING.reset(tokens[2])
 
     signature = inspect.signature(function)
     keyword = inspect.Parameter.KEYWORD_ONLY
@@ -614,6 +624,7 @@ def set_title(
         if always or not curve.run.ok:
             named.setdefault(curve.status, []).append(curve.name or "status")
     lines = [title, *(f"{', '.join(names)}: {status}" for status, names in named.items())]
+    lines += [f"{law}: no run at equal effort; {why}" for law, why in _MISSING.get().items()]
     lines += notes
     colour = text_colour()
     if any(curve.failed for curve in curves):
@@ -638,6 +649,7 @@ def set_heading(figure: Figure, lines: Sequence[str], **options: Any) -> None:
 
 def legend_below(figure: Figure, columns: int = 5, of: Sequence[Axes] | None = None) -> None:
     """Puts one legend under a figure, with each label once; into the first of the user's panels.
+    A law without a run at equal effort has an entry without a line.
 
     Args:
       figure: the figure.
@@ -653,6 +665,8 @@ def legend_below(figure: Figure, columns: int = 5, of: Sequence[Axes] | None = N
             entries.setdefault(text, handle)
     if not entries:
         return
+    for law in _MISSING.get():
+        entries[f"{escaped(law)}: no factor"] = Line2D([], [], linestyle="none")
     if isinstance(given, list):
         given[0].legend(entries.values(), entries.keys())
         return

@@ -4,7 +4,8 @@ at equal effort, side by side.
 The error has a logarithmic axis, on which an exponential decay is a straight line whose slope is
 its rate.  The torque is shown for a tenth of that time if the laws differ most there, because its
 transient, 1/K2 against 1/k1, is much shorter.  The titles of the panels state why a window shows
-the start, and the range of the signal after it.
+the start, and the range of the signal after it.  Both torque panels have one axis, which shows the
+torques of all runs without a failure; a panel whose axis clips a torque states its peak.
 """
 
 from __future__ import annotations
@@ -21,11 +22,20 @@ from iblf_jax.plotting._curves import (
     check_class,
     check_joint,
     curves_of,
+    escaped,
     thinned,
 )
 from iblf_jax.plotting._figures import PanelRow, windows, zoom_reason
-from iblf_jax.plotting._panels import Window, draw, quantity_of, range_after, set_limits
+from iblf_jax.plotting._panels import (
+    Window,
+    annotate_clipped_peak,
+    draw,
+    quantity_of,
+    range_after,
+    set_limits,
+)
 from iblf_jax.studies.comparison import Comparison
+from iblf_jax.world import plants
 
 SMALLEST = 1e-5
 """Errors below this, in the unit of the error, are drawn at the lower end of the logarithmic
@@ -73,6 +83,7 @@ def comparison(result: Comparison, joint: int | str = 0, *, zoom: float | None =
         3, len(columns), squeeze=False, sharey="row", height_ratios=(1.5, 1.5, 1.0)
     )
     order = list(result.rollouts)
+    torques: list[tuple[Axes, Curve, np.ndarray]] = []
     for column, (title, curves) in zip(table.T, columns.items(), strict=True):
         column[0].set_title(title)
         _errors(column[0], curves, order, joint, (start, end))
@@ -85,12 +96,24 @@ def comparison(result: Comparison, joint: int | str = 0, *, zoom: float | None =
         if _differ_most_before(shown, joint, TORQUE_SHARE * end):
             torque_end = TORQUE_SHARE * end
             reason = f"first {torque_end:.3g} s: the laws differ most"
-        _torques(column[1], curves, order, torque, (start, torque_end))
+        torques += _torques(column[1], curves, order, torque, (start, torque_end))
         _name_window(column[1], curves, torque, torque_end, reason)
         _settling(column[2], curves, order)
-    table[0, 0].set_ylabel(_style.label("error $|e_1|$", quantity.unit))
-    table[1, 0].set_ylabel(quantity_of(scenario, "tau", joint).label)
-    table[2, 0].set_ylabel(_style.label("settling", "s"))
+    drawn = [y for _, _, y in torques]
+    set_limits(table[1, 0], [curve for _, curve, _ in torques], drawn, [], torque.quantity)
+    for axes in table[1]:
+        own = [(curve, y) for panel, curve, y in torques if panel is axes]
+        curves, samples = (list(x) for x in zip(*own, strict=True))
+        annotate_clipped_peak(axes, curves, samples, torque.quantity, [joint] * len(own))
+    # In a paper the caption says it, which knows the joint only if the figure names it.
+    of_joint = of_worst = ""
+    if _style.in_paper():
+        of_joint = f" of {escaped(plants.components_in_words(scenario.plant)[joint])}"
+        of_worst = f" of the worst {plants.component_noun(scenario.plant)}"
+    table[0, 0].set_ylabel(_style.label(f"error $|e_1|${of_joint}", quantity.unit))
+    tau = torque.quantity
+    table[1, 0].set_ylabel(_style.label(f"{tau.name} {tau.symbol}{of_joint}", tau.unit))
+    table[2, 0].set_ylabel(_style.label(f"settling{of_worst}", "s"))
     figure.align_ylabels(table[:, 0])
     _style.set_title(figure, f"Laws compared: {given[0].joint_label(joint)}", given)
     _style.legend_below(figure, columns=4)
@@ -140,12 +163,14 @@ def _errors(axes: Axes, curves: list[Curve], order: list[str], joint: int, windo
 
 def _torques(
     axes: Axes, curves: list[Curve], order: list[str], row: PanelRow, window: Window
-) -> None:
+) -> list[tuple[Axes, Curve, np.ndarray]]:
+    """The torque of every law; returns what is drawn of each."""
     drawn = []
     for curve in curves:
-        drawn.append(draw(axes, curve, "tau", row.joint, window, **_law_style(curve, order)))
+        y = draw(axes, curve, "tau", row.joint, window, **_law_style(curve, order))
+        drawn.append((axes, curve, y))
     _style.time_axis(axes, window)
-    set_limits(axes, curves, drawn, [], row.quantity)
+    return drawn
 
 
 def _settling(axes: Axes, curves: list[Curve], order: list[str]) -> None:

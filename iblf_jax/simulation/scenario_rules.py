@@ -29,7 +29,7 @@ from iblf_jax.core import checks, modules, programs
 from iblf_jax.core.families import is_default
 from iblf_jax.core.modules import NUMBERS
 from iblf_jax.core.pytree import field_values, layers, unwrapped
-from iblf_jax.core.units import as_text
+from iblf_jax.core.units import as_text, of_component
 from iblf_jax.simulation.initial import Initial
 from iblf_jax.simulation.levels import disturbance_torque, has_speed_limits, start_levels
 from iblf_jax.simulation.sampling import Sampling
@@ -40,7 +40,7 @@ from iblf_jax.world.plants import Plant
 from iblf_jax.world.process_noise import ProcessNoise
 from iblf_jax.world.references import Reference
 from iblf_jax.world.robots import Robot
-from iblf_jax.world.robots._base import mass_matrix_at
+from iblf_jax.world.robots._base import mass_matrix_at, warn_of_degrees
 
 if TYPE_CHECKING:
     from iblf_jax.simulation.scenario import Scenario
@@ -707,12 +707,27 @@ def _check_gains(name: str, gains: np.ndarray, x: jax.Array, without_dq: str) ->
             raise checks.fail(f"{name}.gain(t, x)[{i}]", matrix, expected, remedy + without_dq)
 
 
+def _warn_of_degrees(plant: Plant, limits: tuple[np.ndarray, np.ndarray]) -> None:
+    """Warns of bounds of angles that seem to be degrees."""
+    unit, robot = plants.units_of(plant)[0], plant.robot
+    kinds = None if robot is None else robot.kinds
+    turns = np.array(
+        [
+            of_component(unit, i) == "rad" and (kinds is None or kinds[i] == "revolute")
+            for i in range(plant.n)
+        ]
+    )
+    lower, upper = (np.where(turns, limit, np.inf) for limit in limits)
+    warn_of_degrees(plants.components_in_words(plant), lower, upper)
+
+
 def check_start(scenario: Scenario) -> None:
     """Raises ValueError for a start outside its bounds or too fast, or a mass matrix there that is
-    not positive definite.
+    not positive definite; warns of bounds that seem to be degrees.
     """
     at = jax.tree.map(np.asarray, _initial_values(scenario))
     plant, model, *_ = scenario.loop
+    _warn_of_degrees(plant, at.limits)
     check(START, Start(scenario, plants.components_in_words(plant), at))
     if not plant.is_robot:
         _check_levels(scenario)

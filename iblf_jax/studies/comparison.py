@@ -7,6 +7,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -152,6 +153,26 @@ def _is_closest_at_start(run: Rollout) -> bool:
     return np.allclose(found, (margin, 1.0 - np.max(np.abs(xi))), rtol=1e-6, atol=0.0)
 
 
+class RunsAtEqualEffort(dict[str, Rollout]):
+    """Law -> run at the first law's effort.  A law without a factor is missing, and an index and
+    figures say why.
+    """
+
+    def __init__(self, runs: Mapping[str, Rollout], reasons: Mapping[str, str]) -> None:
+        super().__init__(runs)
+        self.reasons = reasons
+
+    def __missing__(self, law: object) -> Rollout:
+        if law in self.reasons:
+            raise KeyError(
+                f"{law!r} has no run at equal effort, because no factor was found: "
+                f"{self.reasons[str(law)]}. `rollouts` has its run at the gains given; give the law"
+                " other gains, or compare at the effort of another law by making that the first one"
+            )
+        remedy = f"there are {', '.join(self)}" if self else "`compare` had equal_effort=False"
+        raise KeyError(f"no run of {law!r} at equal effort; {remedy}")
+
+
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Comparison(Result):
     """Several laws on one scenario.  Prints as two tables, each with what is equal in it."""
@@ -159,8 +180,8 @@ class Comparison(Result):
     rollouts: dict[str, Rollout]
     """Law -> run at the gains it has."""
     equal_effort: dict[str, Rollout]
-    """Law -> run at the first law's effort; without the laws for which there is no factor.  The
-    `scenario` of the run has the law with the scaled gains."""
+    """Law -> run at the first law's effort; without the laws for which there is no factor, of which
+    an index and figures say why.  The `scenario` of the run has the law with the scaled gains."""
     factors: dict[str, float]
     """Law -> the factor of its gains at equal effort; NaN where none was found."""
     reasons: dict[str, str]
@@ -172,6 +193,10 @@ class Comparison(Result):
     law."""
     settling: Settling = dataclasses.field(default_factory=Settling)
     """The metric of the settling times, with their tolerance."""
+
+    def __post_init__(self) -> None:
+        runs = RunsAtEqualEffort(self.equal_effort, self.reasons)
+        object.__setattr__(self, "equal_effort", runs)
 
     @property
     def nearest(self) -> dict[str, tuple[float, float]]:

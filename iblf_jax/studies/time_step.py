@@ -206,6 +206,7 @@ def warn_of_sampling(status: np.ndarray, radii: np.ndarray | None) -> None:
     notices.warn(
         f"The law is sampled too slowly in {slow.sum()} of {status.size} runs: the deviation of the"
         f" loop grows from one period to the next, by {growth_in_words(float(radii[worst]))} at"
-        f" the worst of the assessed states (run {worst}). Sample faster:"
-        " ij.recommended_period(study.replay(i).scenario) says how fast for run i."
+        f" the worst of the assessed states (run {worst}). Make sampling.period [s] shorter (in"
+        " Python, ij.recommended_period(study.replay(i).scenario) returns how long it may be in"
+        " run i)."
     )

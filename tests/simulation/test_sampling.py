@@ -252,11 +252,16 @@ def test_the_radius_is_that_of_the_map():
 @pytest.mark.slow
 def test_what_is_sampled_too_slowly_says_so():
     assert ij.simulate(sampled(PAPER, 2e-3), duration=0.5, dt=5e-4).ok
-    for bad in (sampled(PAPER, 2e-3, 2e-3), sampled(PAPER, 4e-3)):
-        with pytest.warns(ij.engine.simulate.SimulationWarning, match="recommended_period"):
+    for bad, words in (
+        (sampled(PAPER, 2e-3, 2e-3), r"sampling.period is 0.002 s \(in Python, ij.recommended_"),
+        (sampled(PAPER, 4e-3), r"sampling.period is 0.004 s \("),
+    ):
+        with pytest.warns(ij.engine.simulate.SimulationWarning, match=words):
             run = ij.simulate(bad, duration=0.5, dt=5e-4)
         flags = Status.SAMPLING_TOO_SLOW | Status.BOUND_VIOLATED
         assert Status(int(run.status)) & flags == flags
+    with pytest.warns(match="had run once until then: sampling.period is 0.5 s. Make it shorter"):
+        ij.simulate(sampled(PAPER, 0.5), duration=0.5, dt=5e-4)
     assert ij.recommended_period(PAPER) == 5e-4 and ij.recommended_period(SLOW) > 1e-3
 
 

@@ -3,11 +3,13 @@
 import dataclasses
 import json
 import math
+import re
 
 import jax.numpy as jnp
 import numpy as np
 import plant_cases
 import pytest
+from matplotlib.text import Text
 
 import iblf_jax as ij
 from iblf_jax import barriers, cli, controllers
@@ -54,6 +56,28 @@ def test_effort_text_and_table_are_those_of_the_runs(comparison):
 
 
 @pytest.mark.slow
+def test_a_figure_for_print_shows_every_torque_and_names_the_joint(comparison):
+    """Of smaller torques at equal effort, too: both panels have one axis."""
+    smaller = {
+        name: dataclasses.replace(run, tau=0.1 * run.tau)
+        for name, run in comparison.equal_effort.items()
+    }
+    runs = dict(comparison.rollouts)
+    found = dataclasses.replace(comparison, rollouts=runs, equal_effort=smaller)
+    figure = found.plot(joint=1, style="paper")
+    torques = figure.axes[2]
+    assert torques.get_ylabel() == r"torque $\tau$ of joint 1 [N m]"
+    low, high = torques.get_ylim()
+    shown = np.concatenate([line.get_ydata() for line in torques.get_lines()])
+    assert low < shown.min() < 0.3 * low and shown.max() < high
+    for law in ("log", "pd"):  # A failed run does not set the axis, and its peak is written.
+        failed = dataclasses.replace(runs[law], status=np.int32(Status.BOUND_VIOLATED))
+        runs[law] = dataclasses.replace(failed, tau=30.0 * failed.tau)
+    texts = [text.get_text() for text in found.plot(style="paper").axes[2].texts]
+    assert len(texts) == 1 and re.fullmatch(r"peak .[\d.]+ N m", texts[0])
+
+
+@pytest.mark.slow
 def test_laws_by_name_take_the_gains_the_observer_and_the_limit_of_the_scenario():
     gains = {"controller.k1": [1.5, 2.5], "controller.K2": 15.0}
     scenario = ij.with_parameters(ij.presets.zhang_yan_2024_saturated(), gains)
@@ -86,7 +110,7 @@ def test_a_metric_replaces_the_standard_one_of_its_class(comparison):
 
 
 @pytest.mark.slow
-def test_failed_runs_and_laws_of_a_users_own_are_named():
+def test_failed_runs_and_laws_of_a_users_own_are_named(tmp_path, monkeypatch):
     laws = {"good": "integral", "weak": controllers.PDGravity(Kp=0.01, Kd=0.01)}
     moving = dataclasses.replace(SCENARIO, initial=ij.Initial(q=0.8, dq=[1.0, 1.0]))
     comparison = ij.compare(moving, laws, **RUN)
@@ -100,6 +124,20 @@ def test_failed_runs_and_laws_of_a_users_own_are_named():
     assert list(comparison.rollouts) == ["Backstepping(Tan)", "Bang", "Bang 2"]
     assert "no gains to scale" in comparison.reasons["Bang"]
     assert "no gains (Bang, Bang 2)" in repr(comparison)
+    monkeypatch.setitem(controllers.MEMBERS, "bang", Bang)
+    loaded = ij.load(comparison.save(tmp_path / "compared"))
+    for equal in (comparison.equal_effort, loaded.equal_effort):
+        with pytest.raises(
+            KeyError, match=r"'Bang' has no run at equal effort.* no gains to scale"
+        ):
+            equal["Bang"]
+        with pytest.raises(KeyError, match="no run of 'PD' at equal effort; there are Back"):
+            equal["PD"]
+    for style in ("screen", "paper"):
+        figure = ij.plotting.joint(loaded.equal_effort, style=style)
+        named = [text.get_text() for text in figure.legends[0].get_texts()]
+        assert named[-2:] == ["Bang: no factor", "Bang 2: no factor"]
+    assert "no factor" not in str(ij.plotting.joint(loaded.rollouts).findobj(Text))
 
 
 @pytest.mark.slow

@@ -9,6 +9,7 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from arm_cases import ARMS, dynamics_of, without_constraints
@@ -19,6 +20,7 @@ from refused import assert_refused
 from scipy.spatial.transform import Rotation
 
 import iblf_jax as ij
+from iblf_jax.simulation.scenario_rules import check_start
 
 mujoco = pytest.importorskip("mujoco")
 SOLID = (
@@ -572,6 +574,32 @@ def test_repair_mends_and_lists(name, file):
     M = computed(arm.mass_matrix, np.full(arm.n, 0.3))
     assert np.linalg.eigvalsh(M)[0] > 0
     assert jax.tree.structure(jax.tree.map(lambda x: x, arm)) == jax.tree.structure(arm)
+
+
+def test_a_warning_names_ranges_and_bounds_that_seem_to_be_degrees(file, recwarn):
+    """Not ranges in metres, those that mean none, and two turns."""
+    ends = {
+        "revolute": (-170, 90),
+        "wrist": (-12.5, 12.5),
+        "none": (-1e9, 1e9),
+        "prismatic": (0, 90),
+    }
+    parts, last = [link("base", "")], "base"
+    for name, (low, high) in ends.items():
+        limit = f'<limit lower="{low}" upper="{high}" effort="7" velocity="1"/>'
+        kind = "prismatic" if name == "prismatic" else "revolute"
+        parts += [link(f"of {name}"), joint(name, last, f"of {name}", kind, limit)]
+        last = f"of {name}"
+    ij.robots.load(file(robot(*parts)))
+    (loaded,) = recwarn
+    assert "joint revolute: the range from -170 to 90 rad" in str(loaded.message)
+    assert "write -2.967 and 1.571 (numpy.deg2rad converts)." in str(loaded.message)
+    recwarn.clear()
+    ninety = ij.bounds.Constant(jnp.array([0.9, 90.0]))
+    bounds = ij.Bounds(lower=ij.bounds.Constant(0.1), upper=ninety)
+    check_start(ij.with_parts(ij.presets.zhang_yan_2024(), bounds=bounds))
+    (typed,) = recwarn
+    assert "joint 1: the range from 0.1 to 90 rad" in str(typed.message)
 
 
 ALSO = "0.01 -0.02 0.03"

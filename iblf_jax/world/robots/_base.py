@@ -15,14 +15,16 @@ or a recursion writes its own.
 from __future__ import annotations
 
 import abc
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Sequence
 from typing import Any, ClassVar, NamedTuple, Self, TypeGuard, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
-from iblf_jax.core import checks, programs
+from iblf_jax.core import checks, notices, programs
 from iblf_jax.core.attributes import attributes, has_members
 from iblf_jax.core.disk_cache import keep_programs
 from iblf_jax.core.families import adopt, attribute
@@ -38,6 +40,36 @@ class Limits(NamedTuple):
 
     lower: jax.Array
     upper: jax.Array
+
+
+MOST_TURNS = 2
+"""Turns to one side that hardly any robot makes; as degrees, the numbers beyond them up to
+`MOST_TURNS` turns are common limits.  Larger ones mean "no limit" in files of robots."""
+
+
+def warn_of_degrees(names: Sequence[str], lower: ArrayLike, upper: ArrayLike) -> None:
+    """Warns of ranges whose numbers seem to be degrees: an end is beyond two turns in rad, and
+    within two turns in degrees.
+
+        4 pi < |end| <= 720
+
+    Args:
+      names: the components in words, such as "joint elbow", (n,).
+      lower, upper: the ends of their ranges, (n,); infinite where they are no angles in rad.
+    """
+    ends = np.stack([np.asarray(lower, float), np.asarray(upper, float)], axis=-1)
+    suspect = (np.abs(ends) > MOST_TURNS * 2 * math.pi) & (np.abs(ends) <= MOST_TURNS * 360)
+    found = np.flatnonzero(np.any(suspect, axis=-1))
+    if not found.size:
+        return
+    first, *others = found
+    low, high = ends[first]
+    also = f" The same is true of {', '.join(names[i] for i in others)}." if others else ""
+    notices.warn(
+        f"{names[first]}: the range from {low:g} to {high:g} rad seems to be in degrees, as it"
+        f" extends beyond {MOST_TURNS} turns. Limits and bounds of angles are in rad: write"
+        f" {math.radians(low):.4g} and {math.radians(high):.4g} (numpy.deg2rad converts).{also}"
+    )
 
 
 class Dynamics(TimeVarying):

@@ -38,7 +38,7 @@ from iblf_jax.core.attributes import attributes
 from iblf_jax.core.linalg import sums_from, sums_to, symmetric
 from iblf_jax.core.pytree import Leaf, component, leaf, static
 from iblf_jax.world.robots import spatial
-from iblf_jax.world.robots._base import Limits, Robot, broadcast_fields
+from iblf_jax.world.robots._base import Limits, Robot, broadcast_fields, warn_of_degrees
 from iblf_jax.world.robots.payload import Payload
 
 KINDS = ("revolute", "prismatic")
@@ -204,6 +204,11 @@ class Arm(Robot):
                 "Such as Payload(mass=1.5, centre=[0, 0, 0.1]).",
             )
         self._check_names(n)
+        if checks.is_concrete((self.lower, self.upper)):
+            turns = np.array([kind == "revolute" for kind in self.kinds])
+            names = [f"joint {name}" for name in self.joints]
+            lower, upper = (np.where(turns, end, np.inf) for end in self.limits)
+            warn_of_degrees(names, lower, upper)
 
     def _check_names(self, n: int) -> None:
         defaults = {

@@ -70,7 +70,7 @@ def load(
     Returns:
       An Arm, with the names of links and joints, limits, damping, friction, armature, efforts and
       speeds of the file; its `limits`, `effort` and `speed` are infinite where the file has none
-      (an MJCF has no speeds).
+      (an MJCF has no speeds).  A warning names the joints whose limits seem to be degrees.
 
     Raises:
       ValueError: a fault of the file or the chain; the message names the element and the
