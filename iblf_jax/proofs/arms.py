@@ -228,12 +228,14 @@ class SampledArmRate(OfStructure):
         rate = rate + arm_held.bias_addition(at.parts, numbers.weight, at.errors, at.f_tilde)
         zero, limits, u = jnp.zeros_like(at.f_tilde), at.parts.torque_limits, torque_of(at)
         rates = arm_held.rates_at(at.parts, at.errors, at.f_tilde, cut_of(at))
-        found = []
-        for D, L in [(zero, zero), *arm_held.differences_of_ages(at.parts, rates)]:
+        ages = [(zero, zero), *arm_held.differences_of_ages(at.parts, rates)]
+        D, L = (jnp.stack(rows) for rows in zip(*ages, strict=True))
+        if limits is not None:
             # A limit cuts the command u + D of the sample.
-            difference = D if limits is None else D + cut(u + D, limits)
-            found.append(addition(at, numbers.weight, difference, L))
-        return infinite_unless_defined(rate + jnp.max(jnp.stack(found)), u)
+            D = D + cut(u + D, limits)
+        # The program of all ages in turn would be several times as long.
+        found = jax.vmap(lambda D, L: addition(at, numbers.weight, D, L))(D, L)
+        return infinite_unless_defined(rate + jnp.max(found), u)
 
 
 class ArmTorqueExcess(OfStructure):

@@ -16,7 +16,7 @@ import numpy as np
 from jax.tree_util import PyTreeDef
 
 from iblf_jax.control import observers
-from iblf_jax.core import checks
+from iblf_jax.core import checks, programs
 from iblf_jax.proofs.parameters import Uncertain
 from iblf_jax.proofs.periods import shifted
 from iblf_jax.proofs.support import check_level
@@ -305,6 +305,6 @@ class LevelSetProblem(abc.ABC):
         )
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(programs.jit, static_argnums=0, options=programs.SHORTEST_TO_COMPILE)
 def _at_points(function: Callable, points: jax.Array, constants: list[jax.Array]) -> jax.Array:
     return jax.vmap(function, (0, None))(points, constants)
