@@ -59,8 +59,8 @@ def warn_of_degrees(names: Sequence[str], lower: ArrayLike, upper: ArrayLike) ->
     """
     ends = np.stack([np.asarray(lower, float), np.asarray(upper, float)], axis=-1)
     suspect = (np.abs(ends) > MOST_TURNS * 2 * math.pi) & (np.abs(ends) <= MOST_TURNS * 360)
-    found = np.flatnonzero(np.any(suspect, axis=-1))
-    if not found.size:
+    found = np.flatnonzero(np.any(suspect, axis=-1)).tolist()
+    if not found:
         return
     first, *others = found
     low, high = ends[first]
