@@ -1,7 +1,7 @@
 """The task of an entry, and the laws of the package at its scales.
 
-The laws of robots are those of `benchmarks/laws.py`.  Their gains follow from the rate of the
-published law, and their boxes and limits from the published run; `equal_budget.py` tunes them.
+The laws of robots are those of `benchmarks/laws.py`.  Their gains follow from the rate of the law
+of the entry, and their boxes and limits from its run; `equal_budget.py` tunes them.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Task(NamedTuple):
     duration: float
     dt: float
     rate: float
-    """Gain of the first level of the published law, or 2 [1/s]."""
+    """Gain of the first level of the law of the entry, or 2 [1/s]."""
     half_width: np.ndarray
     """Half the least distance of the bounds over the published run, (n,)."""
     levels: np.ndarray
@@ -227,7 +227,7 @@ def numbers_of(
 ) -> dict[str, Any]:
     """Gains and boxes of a law of robots at the scales of a task, field by field.
 
-    Rates are those of the published law, and ten times as fast for the second level.  Torques per
+    Rates are those of the law of the entry, and ten times as fast for the second level.  Torques per
     speed are rates times the diagonal of the mass matrix at the start.  A barrier has the weight
     with which its torque near e1 = 0 is K2 k1 e1.
     """
