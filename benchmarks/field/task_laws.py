@@ -227,9 +227,9 @@ def numbers_of(
 ) -> dict[str, Any]:
     """Gains and boxes of a law of robots at the scales of a task, field by field.
 
-    Rates are those of the law of the entry, and ten times as fast for the second level.  Torques per
-    speed are rates times the diagonal of the mass matrix at the start.  A barrier has the weight
-    with which its torque near e1 = 0 is K2 k1 e1.
+    Rates are those of the law of the entry, and ten times as fast for the second level.  Torques
+    per speed are rates times the diagonal of the mass matrix at the start.  A barrier has the
+    weight with which its torque near e1 = 0 is K2 k1 e1.
     """
     rate, length, speed = task.rate, task.half_width, task.levels[1]
     damping = 10.0 * rate * inertia
