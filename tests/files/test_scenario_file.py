@@ -40,7 +40,7 @@ OF_FUNCTIONS = (
 OWN_NUMBERS = (
     *("plant ", "sensor ", "actuator ", "process_noise ", "robot arm", "reference ellipse"),
     *("region half_space_of_the_elbow", "region sphere_inside"),
-    "law barrier_backstepping_matrices",
+    *("law backstepping_corrected_log", "law barrier_backstepping_matrices"),
 )
 """Families and members with conditions besides signs, which random bits do not fulfil."""
 OWN_NUMBERS_OF_LAW = (
