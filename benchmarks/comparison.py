@@ -96,7 +96,7 @@ COMPARISONS = (
             "the same loop in plain JAX": LOOP | {"row": "textbook"},
             "diffrax with the same method": LOOP | {"row": "diffrax"},
         },
-        {"steps": " in {:,.0f} steps".format},
+        {"steps": "in {:,.0f} steps".format},
     ),
     Comparison(
         "one run of 20 s, called from Python; RK4 at 0.5 ms, and LSODA with steps of its own that"
@@ -107,7 +107,7 @@ COMPARISONS = (
         "less",
         {"row": "native, user's call, 0.5 ms"},
         {"SciPy LSODA, relative tolerance 1e-6": {"row": "LSODA, compiled field"}},
-        {ERROR: lambda error: f", {error_in_words(error)}"},
+        {ERROR: error_in_words},
     ),
     Comparison(
         "65,536 closed loops of the paper's arm, H200",
@@ -152,7 +152,7 @@ COMPARISONS = (
             "SLSQP with exact derivatives": {"search": "SLSQP, exact slopes"},
             "CMA-ES": {"search": "CMA-ES"},
         },
-        {"rollouts to 0.5 %": ", {:.0f} rollouts to 0.5 % above the best".format},
+        {"rollouts to 0.5 %": "{:.0f} rollouts to 0.5 % above the best".format},
     ),
     Comparison(
         "failure probability of 1e-6, 50 variables, by subset simulation",
@@ -162,7 +162,7 @@ COMPARISONS = (
         "less",
         RARE | {"estimator": "subset"},
         {"OpenTURNS": RARE | {"estimator": "OpenTURNS, subset"}},
-        {"covered": ", {:.0%} of the 95 % intervals are right".format},
+        {"covered": "{:.0%} of the 95 % intervals are right".format},
     ),
 )
 
@@ -192,10 +192,10 @@ def beside(comparison: Comparison, conditions: Conditions) -> str:
     of_ours, errors = (
         errors_of(comparison.benchmark, one) for one in (comparison.ours, conditions)
     )
-    values += [f", {error_in_words(error)}" for error in errors]
+    values += map(error_in_words, errors)
     if of_ours and not errors:
-        values.append(", its error was not measured")
-    return "".join(values)
+        values.append("its error was not measured")
+    return "".join(f", {value}" for value in values)
 
 
 def in_short(comparison: Comparison, conditions: Conditions) -> str:
@@ -308,7 +308,7 @@ def three_numbers() -> str:
         other = in_short(chosen, conditions) + beside(chosen, conditions)
         described = text.format(ours=beside(chosen, chosen.ours), other=other)
         # A narrow column.
-        described = re.sub(" in [0-9,]+ steps", "", described).replace("largest error", "error")
+        described = re.sub(", in [0-9,]+ steps", "", described).replace("largest error", "error")
         lines.append(f"- [**{number}**](benchmarks.md): {described}")
     for worse in COMPARISONS:
         if worse.benchmark in withdrawn.BENCHMARKS or not worse.has_ratio:

@@ -213,10 +213,14 @@ def _rank(rank: int, law: dict[str, Any]) -> str:
     return str(rank) + left + (" +" if gains_at_the_end(law, 1.0) else "")
 
 
+def further_runs(robust: dict[str, Any]) -> list[Any]:
+    """The errors on other plants, with periods and with noise, or what a run does not keep."""
+    return [*robust["masses"].values(), *robust["periods"].values(), *robust["noise"]]
+
+
 def words_of(robust: dict[str, Any]) -> list[str]:
-    """What the runs on other plants, with periods and with noise do not keep."""
-    values = [*robust["masses"].values(), *robust["periods"].values(), *robust["noise"]]
-    return [value for value in values if isinstance(value, str)]
+    """What these runs do not keep."""
+    return [value for value in further_runs(robust) if isinstance(value, str)]
 
 
 def gains_at_the_end(law: dict[str, Any], level: float) -> list[str]:
@@ -420,8 +424,7 @@ def _draw(axes: Any, name: str, law: dict[str, Any], style: dict[str, Any]) -> N
     axes.plot(x, y, lw=1.2, label=label, **style)
     if law["robustness"] is None:
         return
-    found = law["robustness"]
-    values = [*found["masses"].values(), *found["periods"].values(), *found["noise"]]
+    values = further_runs(law["robustness"])
     errors = [value for value in values if isinstance(value, float)]
     at = _row(law, 1.0)
     if errors:

@@ -128,8 +128,7 @@ class Certificate(Result):
         """The verdict; if it is "fails", the lines that fail, and the claim with weights if it
         holds; if it is "not applicable", the reason of most of the lines that do not apply.
         """
-        reasons = self._reasons()
-        if self.verdict == NOT_APPLICABLE and reasons:
+        if self.verdict == NOT_APPLICABLE and (reasons := self._reasons()):
             return f"{self.verdict}, because {max(reasons, key=lambda one: len(reasons[one]))}"
         if self.verdict != FAILS:
             return self.verdict

@@ -371,11 +371,10 @@ class Search:
         gains 14 and 18 of 32 starts of two seeds came near an optimum 2.5 % above the best one.
         Two and three others ended below it, at an excess of 0.03.
         """
-        if self.strategy is None:
+        if self.strategy is None or self.strategy.starts <= FEW_STARTS:
             return False
-        if self.state.valleys[3] > 0:
-            return self._reached_by_fewer_than(np.inf)
-        return self._reached_by_fewer_than(CONFIRMING_SHARE * self.strategy.starts)
+        is_below = bool(self.state.valleys[3] > 0)
+        return is_below or self._reached_by_fewer_than(CONFIRMING_SHARE * self.strategy.starts)
 
     def _reached_by_fewer_than(self, count: float) -> bool:
         if self.strategy is None or self.strategy.starts <= FEW_STARTS:
